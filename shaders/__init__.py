@@ -1,0 +1,1 @@
+"""GLSL sources, one file a stage; see viewer.gl.programs for how they are read."""

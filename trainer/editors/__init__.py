@@ -1,0 +1,1 @@
+"""Image editors: views in, edited views out."""

@@ -1,0 +1,55 @@
+"""What the window shows, as frozen data: panel, keys, scripts and files change it, the engine draws it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from progdf.compose import Gains
+
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ViewCamera:
+    """Where one looks from: a turntable around `pivot`, or a free flight with the same numbers.
+
+    Args:
+        pivot: what the camera turns around, world units
+        distance: from the pivot to the eye, world units, > 0
+        azimuth: degrees around `up`
+        elevation: degrees above the plane normal to `up`, −90..90
+        fov_y: vertical field of view, degrees
+        up: unit vector that is up in the picture
+        mode: "orbit" or "fly"
+    """
+
+    pivot: Vec3 = (0.0, 0.0, 0.0)
+    distance: float = 5.0
+    azimuth: float = 0.0
+    elevation: float = 15.0
+    fov_y: float = 45.0
+    up: Vec3 = (0.0, 1.0, 0.0)
+    mode: str = "orbit"
+
+
+@dataclass(frozen=True)
+class LayerState:
+    """One layer row: which .gdf (by its place in the engine's list), and how much of it."""
+
+    gdf: int
+    name: str
+    strength: float = 0.0
+    enabled: bool = True
+    gains: Gains = Gains()
+
+
+@dataclass(frozen=True)
+class ViewState:
+    """Everything that decides the picture, and nothing else."""
+
+    camera: ViewCamera = ViewCamera()
+    layers: tuple[LayerState, ...] = ()
+    blend: str = "normalised"
+    background: Vec3 = (1.0, 1.0, 1.0)
+    overlay: bool = False
+    panel: bool = True
