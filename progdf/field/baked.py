@@ -37,7 +37,7 @@ class AttributeBases:
         ranks = self.rest.shape[0]
         if tuple(self.rest.shape[1:]) != (members, width) or tuple(self.step.shape) != (ranks, width):
             raise ValueError(
-                f"rest {list(self.rest.shape)}, step {list(self.step.shape)} do not fit {list(self.full.shape)}"
+                f"rest {list(self.rest.shape)} or step {list(self.step.shape)} does not fit full"
             )
         if self.coefficients.ndim != 2 or self.coefficients.shape[1] != 1 + ranks:
             raise ValueError(f"coefficients is {list(self.coefficients.shape)}, expected [S, {1 + ranks}]")
