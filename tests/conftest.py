@@ -1,0 +1,83 @@
+"""Fixtures that several test files share: the real data where it is present, and golden screenshots."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+SCREENSHOTS = Path(__file__).parent / "screenshots"
+LEVELS = 2  # of 255: the last bits of a software GPU differ between processors
+
+Compare = Callable[[str, np.ndarray], None]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--regenerate-screenshots",
+        action="store_true",
+        help="write the golden screenshots instead of comparing",
+    )
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real scenes and odd files kept beside the checkout (or named by PROGDF_TEST_DATA); absent: skip."""
+    folder = Path(os.environ.get("PROGDF_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real test data at {folder}")
+    return folder
+
+
+@pytest.fixture
+def screenshot(request: pytest.FixtureRequest) -> Compare:
+    """`screenshot(name, image)`: image [H,W,3], float 0..1 or uint8, against tests/screenshots/NAME.png."""
+    regenerate: bool = request.config.getoption("--regenerate-screenshots")
+
+    def compare(name: str, image: np.ndarray) -> None:
+        found = _uint8(image)
+        golden = SCREENSHOTS / f"{name}.png"
+        if regenerate:
+            golden.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(found).save(golden, optimize=True)
+            return
+        if not golden.exists():
+            pytest.fail(
+                f"there is no golden {golden.name}; make it with --regenerate-screenshots, and look at it"
+            )
+        expected = np.asarray(Image.open(golden).convert("RGB"))
+        if expected.shape != found.shape:
+            _write_difference(name, expected, found)
+            pytest.fail(f"{name}: the picture is {found.shape}, its golden {expected.shape}")
+        difference = np.abs(expected.astype(int) - found.astype(int)).max(axis=-1)
+        if difference.max(initial=0) > LEVELS:
+            _write_difference(name, expected, found)
+            pytest.fail(
+                f"{name}: {int((difference > LEVELS).sum())} pixels differ by more than {LEVELS}/255 "
+                f"(largest {int(difference.max())}); see screenshots/diff/{name}.png"
+            )
+
+    return compare
+
+
+def _uint8(image: np.ndarray) -> np.ndarray:
+    if image.dtype == np.uint8:
+        return image[..., :3]
+    return np.round(np.clip(image[..., :3], 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _write_difference(name: str, expected: np.ndarray, found: np.ndarray) -> None:
+    """Golden, found and eight times their difference side by side."""
+    panels = [expected, found]
+    if expected.shape == found.shape:
+        amplified = np.abs(expected.astype(int) - found.astype(int)) * 8
+        panels.append(np.clip(amplified, 0, 255).astype(np.uint8))
+    height = max(panel.shape[0] for panel in panels)
+    padded = [np.pad(panel, ((0, height - panel.shape[0]), (0, 4), (0, 0))) for panel in panels]
+    folder = SCREENSHOTS / "diff"
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate(padded, axis=1)).save(folder / f"{name}.png")
