@@ -1,0 +1,168 @@
+"""The geometry of a `ViewCamera`: where the eye is, what is right and up in the picture, what frames a scene.
+
+Everything here is plain float64 arithmetic on tuples: exact at the poles, since the picture's right axis comes
+from the azimuth and not from a cross product with the view direction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.camera import Camera, intrinsics
+
+from .state import Vec3, ViewCamera
+
+FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the camera frames: a centre and the radius of the bulk around it, world units, radius > 0."""
+
+    centre: Vec3 = (0.0, 0.0, 0.0)
+    radius: float = 1.0
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Unit vectors of the picture in the world: right, up, and back (from the pivot to the eye)."""
+
+    right: Vec3
+    up: Vec3
+    back: Vec3
+
+
+def dot(a: Vec3, b: Vec3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def along(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
+    """origin + Σ length · direction"""
+    x, y, z = origin
+    for length, direction in steps:
+        x, y, z = x + length * direction[0], y + length * direction[1], z + length * direction[2]
+    return x, y, z
+
+
+def unit(v: Vec3, otherwise: Vec3) -> Vec3:
+    """`v` made one long; `otherwise` where it has no direction."""
+    largest = max(abs(c) for c in v)
+    if not (0.0 < largest < math.inf) or any(math.isnan(c) for c in v):
+        return otherwise
+    x, y, z = (c / largest for c in v)
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def front(up: Vec3) -> Vec3:
+    """Where the eye stands at azimuth 0, elevation 0: +Z for y-up, −Z for y-down, −Y for z-up, +Y for z-down.
+
+    So a y-down scene (COLMAP, most trained splats) is met from the side its cameras looked from.
+    """
+    largest = max(range(3), key=lambda i: abs(up[i]))
+    sign = math.copysign(1.0, up[largest])
+    facing: Vec3 = ((0.0, 0.0, sign), (0.0, 0.0, sign), (0.0, -sign, 0.0))[largest]
+    return unit(along(facing, (-dot(facing, up), up)), (1.0, 0.0, 0.0))
+
+
+def axes(camera: ViewCamera) -> Axes:
+    """The picture's axes; an unusable `up` counts as +Y."""
+    up = unit(camera.up, (0.0, 1.0, 0.0))
+    ahead = front(up)
+    side = cross(up, ahead)
+    azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
+    cos_a, sin_a, cos_e, sin_e = (
+        math.cos(azimuth),
+        math.sin(azimuth),
+        math.cos(elevation),
+        math.sin(elevation),
+    )
+    level = along((0.0, 0.0, 0.0), (cos_a, ahead), (sin_a, side))
+    zero = (0.0, 0.0, 0.0)
+    return Axes(
+        right=along(zero, (cos_a, side), (-sin_a, ahead)),
+        up=along(zero, (cos_e, up), (-sin_e, level)),
+        back=along(zero, (sin_e, up), (cos_e, level)),
+    )
+
+
+def eye(camera: ViewCamera) -> Vec3:
+    """The eye's position in world units."""
+    return along(camera.pivot, (camera.distance, axes(camera).back))
+
+
+def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
+    """The pinhole camera of a picture of this size in pixels (a zero-sized window counts as one pixel)."""
+    width, height = max(width, 1), max(height, 1)
+    picture, position = axes(camera), eye(camera)
+    rows = np.array([picture.right, picture.up, picture.back], dtype=np.float64)
+    rows[1:] *= -1.0  # OpenCV axes: y down, z forward
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rows
+    viewmat[:3, 3] = -rows @ np.array(position)
+    return Camera(
+        torch.from_numpy(viewmat).float(),
+        intrinsics(math.radians(camera.fov_y), width, height),
+        width,
+        height,
+    )
+
+
+def facing(camera: ViewCamera, back: Vec3) -> ViewCamera:
+    """The same pivot and distance, seen along −`back` (any length): azimuth and elevation that give it."""
+    up = unit(camera.up, (0.0, 1.0, 0.0))
+    direction = unit(back, axes(camera).back)
+    ahead = front(up)
+    height = max(-1.0, min(1.0, dot(direction, up)))
+    level = along(direction, (-height, up))
+    azimuth = camera.azimuth  # straight up or down: the azimuth is free, so it stays
+    if dot(level, level) > 1e-18:
+        azimuth = math.degrees(math.atan2(dot(level, cross(up, ahead)), dot(level, ahead)))
+    # atan2 keeps the accuracy near the poles that asin would lose
+    elevation = math.degrees(math.atan2(height, math.sqrt(dot(level, level))))
+    return replace(camera, azimuth=azimuth, elevation=elevation)
+
+
+def with_up(camera: ViewCamera, up: Vec3) -> ViewCamera:
+    """Another up axis, the eye and the pivot where they are (the picture only rolls upright)."""
+    back = axes(camera).back
+    return facing(replace(camera, up=unit(up, camera.up)), back)
+
+
+def look_from(camera: ViewCamera, position: Vec3, pivot: Vec3) -> ViewCamera:
+    """The eye at `position`, looking at `pivot`; the direction stays where the two coincide."""
+    back = (position[0] - pivot[0], position[1] - pivot[1], position[2] - pivot[2])
+    turned = facing(replace(camera, pivot=pivot), back)
+    return replace(turned, distance=max(math.dist(position, pivot), 1e-9))
+
+
+def bounds_of(means: NDArray[np.float32]) -> Bounds:
+    """Median centre and 97th-percentile radius of finite centres [N,3]: stray far Gaussians do not count."""
+    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
+    if not len(finite):
+        return Bounds()
+    centre = np.median(finite, axis=0)
+    radius = float(np.quantile(np.linalg.norm(finite - centre, axis=1), 0.97))
+    x, y, z = (float(c) for c in centre)
+    return Bounds((x, y, z), min(max(radius, 1e-6), FARTHEST))
+
+
+def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, with the sphere `bounds` filling the smaller side of the picture.
+
+    Args:
+        aspect: width / height of the picture
+    """
+    half = math.radians(camera.fov_y) / 2
+    if 0.0 < aspect < 1.0:
+        half = math.atan(math.tan(half) * aspect)
+    return replace(camera, pivot=bounds.centre, distance=1.05 * bounds.radius / math.sin(half))
