@@ -1,7 +1,7 @@
-"""The geometry of a `ViewCamera`: where the eye is, what is right and up in the picture, what frames a scene.
+"""The geometry of a `ViewCamera`: where the eye is, where right and up are, what frames a scene.
 
-Everything here is plain float64 arithmetic on tuples: exact at the poles, since the picture's right axis comes
-from the azimuth and not from a cross product with the view direction.
+Plain float64 arithmetic on tuples, exact at the poles: the picture's right axis comes from the azimuth, not from
+a cross product with the view direction.
 """
 
 from __future__ import annotations

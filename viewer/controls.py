@@ -1,0 +1,186 @@
+"""What the hand does to the camera, as pure functions, and the table of bindings, as data.
+
+Pixels are window coordinates at 1× (the caller divides by the UI scale), angles degrees, lengths world units.
+No function ever returns a camera that is not finite: a move that would leave the numbers is not made.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from .state import Vec3, ViewCamera
+from .turntable import FARTHEST, along, axes, eye, look_from, unit
+
+DEGREES_PER_PIXEL = 0.3
+ZOOM_PER_STEP = 0.12  # of the distance, per wheel step
+DOLLY_PER_PIXEL = 0.005
+FLY_RADII_PER_SECOND = 0.6
+CLOSEST, WIDEST = 1e-4, 1e4  # of the scene's radius: how near to and far from the pivot the eye goes
+
+
+def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
+    """Turn around the pivot so that the scene follows the hand; stops at the poles."""
+    elevation = max(-90.0, min(90.0, camera.elevation + DEGREES_PER_PIXEL * dy))
+    azimuth = _wrapped(camera.azimuth - DEGREES_PER_PIXEL * dx)
+    return _checked(replace(camera, azimuth=azimuth, elevation=elevation), camera)
+
+
+def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
+    """Turn the head where the eye stands (fly mode): right looks right, down looks down."""
+    turned = orbit(camera, dx, dy)
+    position = eye(camera)
+    return _checked(replace(turned, pivot=along(position, (-camera.distance, axes(turned).back))), camera)
+
+
+def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
+    """Slide the view so that what lies at the pivot's depth stays under the cursor.
+
+    Args:
+        height: of the picture in the same pixels as dx and dy
+    """
+    per_pixel = 2.0 * camera.distance * math.tan(math.radians(camera.fov_y) / 2) / max(height, 1.0)
+    picture = axes(camera)
+    pivot = along(camera.pivot, (-dx * per_pixel, picture.right), (dy * per_pixel, picture.up))
+    return _checked(replace(camera, pivot=pivot), camera)
+
+
+def zoom(camera: ViewCamera, steps: float, radius: float) -> ViewCamera:
+    """Wheel: steps > 0 goes nearer, in proportion to the distance.
+
+    Args:
+        radius: of the scene, world units; bounds the distance
+    """
+    factor = math.exp(max(-50.0, min(50.0, -ZOOM_PER_STEP * steps))) if math.isfinite(steps) else 1.0
+    return _checked(replace(camera, distance=_within(camera.distance * factor, radius)), camera)
+
+
+def dolly(camera: ViewCamera, dy: float, radius: float) -> ViewCamera:
+    """Drag: down goes away, up goes nearer, in proportion to the distance."""
+    return zoom(camera, -dy * DOLLY_PER_PIXEL / ZOOM_PER_STEP, radius)
+
+
+def fly(
+    camera: ViewCamera,
+    right: float,
+    up: float,
+    ahead: float,
+    seconds: float,
+    radius: float,
+    pace: float = 1.0,
+) -> ViewCamera:
+    """Move eye and pivot together, at a speed in proportion to the scene.
+
+    Args:
+        right, up, ahead: −1, 0 or 1 from the keys; up is the scene's up, ahead is where one looks
+        seconds: since the last step; a stall counts as a tenth of a second at most
+        radius: of the scene, world units
+        pace: 10 with Shift, 0.1 with Alt
+    """
+    wish = unit((right, up, ahead), (0.0, 0.0, 0.0))
+    length = FLY_RADII_PER_SECOND * radius * pace * max(0.0, min(seconds, 0.1))
+    picture = axes(camera)
+    steps = (
+        (length * wish[0], picture.right),
+        (length * wish[1], unit(camera.up, (0.0, 1.0, 0.0))),
+        (-length * wish[2], picture.back),
+    )
+    return _checked(replace(camera, pivot=along(camera.pivot, *steps)), camera)
+
+
+def pivot_on(camera: ViewCamera, point: Vec3, radius: float) -> ViewCamera:
+    """Double click: the eye stays, the view turns to `point`, which becomes the pivot."""
+    turned = look_from(camera, eye(camera), point)
+    return _checked(replace(turned, distance=_within(turned.distance, radius)), camera)
+
+
+def toggle_fly(camera: ViewCamera) -> ViewCamera:
+    """Orbit ↔ fly; the picture does not move."""
+    return replace(camera, mode="orbit" if camera.mode == "fly" else "fly")
+
+
+def _within(distance: float, radius: float) -> float:
+    return max(CLOSEST * radius, min(WIDEST * radius, distance))
+
+
+def _wrapped(degrees: float) -> float:
+    return (degrees + 180.0) % 360.0 - 180.0 if math.isfinite(degrees) else degrees
+
+
+def _checked(new: ViewCamera, old: ViewCamera) -> ViewCamera:
+    numbers = (*new.pivot, new.distance, new.azimuth, new.elevation)
+    fits = all(math.isfinite(v) and abs(v) <= FARTHEST for v in numbers) and new.distance > 0.0
+    return new if fits else old
+
+
+@dataclass(frozen=True)
+class Drag:
+    """A mouse drag on the picture. `mode`: only in this camera mode; empty is both."""
+
+    button: str
+    modifier: str
+    does: str
+    mode: str = ""
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key: modifiers in the order Ctrl, Shift, Alt, then the key's name. `repeats` while held."""
+
+    chord: str
+    action: str
+    help: str
+    repeats: bool = False
+
+
+DRAGS = (
+    Drag("left", "", "orbit"),
+    Drag("middle", "", "orbit"),
+    Drag("middle", "Shift", "pan"),
+    Drag("middle", "Ctrl", "dolly"),
+    Drag("right", "", "look", mode="fly"),
+    Drag("right", "", "pan"),
+)
+
+FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
+"""Physical keys (their places on a US keyboard) → right, up, ahead."""
+
+HELD_ORIGINAL = "\\"
+NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
+
+KEYS = (
+    *(Key(str(i), f"focus:{i}", "focus layer 1–9" if i == 1 else "") for i in range(1, 10)),
+    *(Key(f"Shift+{i}", f"toggle:{i}", "show or hide layer 1–9" if i == 1 else "") for i in range(1, 10)),
+    *(
+        Key(f"{held}{arrow}", f"nudge:{sign * step:g}", help_, repeats=True)
+        for held, step in NUDGES
+        for arrow, sign, help_ in (
+            ("Left", -1, ""),
+            ("Right", 1, f"strength ±{100 * step:g} %"),
+            ("Down", -1, ""),
+            ("Up", 1, ""),
+        )
+    ),
+    Key("H", "hide", "show or hide the focused layer"),
+    Key("Escape", "unfocus", "focus no layer"),
+    Key("Ctrl+Z", "undo", "undo", repeats=True),
+    Key("Ctrl+Shift+Z", "redo", "redo", repeats=True),
+    Key("Ctrl+Y", "redo", "", repeats=True),
+    Key("V", "fly", "orbit or fly"),
+    Key("F", "frame", "frame the focused layer, or all"),
+    Key("Shift+F", "home", "home"),
+    Key("F1", "help", "this list"),
+    Key("F2", "picture", "save the picture as PNG"),
+    Key("Shift+F2", "window_picture", "save the whole window as PNG"),
+    Key("F10", "overlay", "timings"),
+    Key("F11", "full_screen", "full screen"),
+    Key("F12", "panel", "hide the panel"),
+)
+
+
+def drag_for(button: str, modifier: str, mode: str) -> str | None:
+    """What a drag does, or None where nothing is bound. `modifier`: "", "Shift", "Ctrl" or "Alt"."""
+    for drag in DRAGS:
+        if drag.button == button and drag.modifier == modifier and drag.mode in ("", mode):
+            return drag.does
+    return None
