@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.ply import load_ply, save_ply
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "Gaussians", "__version__"]
+__all__ = ["Camera", "Gaussians", "__version__", "load_ply", "save_ply"]

@@ -1,0 +1,53 @@
+"""Files that are whole or absent: written beside their place, renamed when they are complete."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from progdf.errors import ProgdfError
+
+
+@contextmanager
+def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
+
+        with written_whole("scene.ply") as beside:
+            beside.write_bytes(…)
+
+    Raises:
+        ProgdfError: the folder does not exist, or `path` is a folder.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise ProgdfError(f"{target} is a folder; give the name of a file in it")
+    if not target.parent.is_dir():
+        raise ProgdfError(f"the folder {target.parent} does not exist; make it first")
+    # the suffix stays, as some writers (Pillow, numpy) choose the format by it
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
+    os.close(handle)
+    beside = Path(name)
+    try:
+        beside.chmod(target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask())
+        yield beside
+        os.replace(beside, target)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def open_failure(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
+    """The one line for a file that cannot be opened."""
+    if isinstance(error, FileNotFoundError):
+        return ProgdfError(f"{path} does not exist; check the name and the folder")
+    if isinstance(error, IsADirectoryError) or Path(path).is_dir():
+        return ProgdfError(f"{path} is a folder; give the name of a file in it")
+    return ProgdfError(f"{path} cannot be read ({error.strerror or error}); check its permissions")
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask

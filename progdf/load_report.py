@@ -1,0 +1,113 @@
+"""What a .ply held and what loading it had to repair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LoadReport:
+    """What a .ply held, what was repaired, what was left out. Counts are rows (Gaussians).
+
+    Args:
+        file: the file's name
+        file_bytes: its size
+        format: "binary little-endian", "binary big-endian" or "ascii"
+        count: Gaussians N; loading never drops or adds a row
+        sh_degree: 0..4
+        hidden: rows made invisible because a number was unusable; the next five say which number
+        bad_means: NaN, infinite or beyond ±1e18
+        bad_scales: NaN, infinite or beyond e^40
+        bad_quats: NaN or infinite
+        bad_opacities: NaN
+        bad_colours: NaN or infinite f_dc
+        bad_sh: NaN or infinite f_rest; only the broken coefficients become 0, the row stays visible
+        flat_scales: −inf log-scale (an exactly flat Gaussian), made a very thin one
+        opaque: +inf opacity, made a finite one that looks the same
+        transparent: −inf opacity, made a finite one that looks the same
+        zero_quats: |q| < 1e-6, taken as no rotation
+        scaled_quats: quaternions that were not of unit length and were divided by it
+        ignored_properties: vertex properties that 3DGS does not have
+        ignored_elements: tables other than vertex, with their row counts
+        trailing_bytes: bytes after the last row
+    """
+
+    file: str
+    file_bytes: int
+    format: str
+    count: int
+    sh_degree: int
+    hidden: int = 0
+    bad_means: int = 0
+    bad_scales: int = 0
+    bad_quats: int = 0
+    bad_opacities: int = 0
+    bad_colours: int = 0
+    bad_sh: int = 0
+    flat_scales: int = 0
+    opaque: int = 0
+    transparent: int = 0
+    zero_quats: int = 0
+    scaled_quats: int = 0
+    ignored_properties: tuple[str, ...] = ()
+    ignored_elements: tuple[tuple[str, int], ...] = ()
+    trailing_bytes: int = 0
+
+    @property
+    def repairs(self) -> tuple[str, ...]:
+        """One phrase for each kind of repair that changed what is shown or could be noticed."""
+        reasons = (
+            (self.bad_means, "NaN, infinite or absurd position"),
+            (self.bad_scales, "NaN, infinite or absurd scale"),
+            (self.bad_quats, "NaN or infinite rotation"),
+            (self.bad_opacities, "NaN opacity"),
+            (self.bad_colours, "NaN or infinite colour"),
+        )
+        hidden = ", ".join(f"{_n(rows)} with {what}" for rows, what in reasons if rows)
+        phrases = (
+            (self.hidden, f"made invisible: {hidden}"),
+            (self.bad_sh, "with NaN or infinite SH coefficients, which were set to 0"),
+            (self.flat_scales, "with a log-scale of −inf, made very thin"),
+            (self.opaque, "with an opacity of +inf, made finite and just as opaque"),
+            (self.transparent, "with an opacity of −inf, made finite and just as invisible"),
+            (self.zero_quats, "with a zero quaternion, taken as no rotation"),
+        )
+        return tuple(f"{_rows(rows)} {what}" for rows, what in phrases if rows)
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """One phrase for each part of the file that was not used."""
+        phrases = []
+        if self.ignored_properties:
+            phrases.append(f"properties {', '.join(self.ignored_properties)}")
+        phrases += [f"element '{name}' ({_n(rows)} rows)" for name, rows in self.ignored_elements]
+        if self.trailing_bytes:
+            phrases.append(f"{_n(self.trailing_bytes)} bytes after the last row")
+        return tuple(phrases)
+
+    def lines(self) -> list[str]:
+        """The report for a person, a line per fact."""
+        sh = f"SH degree {self.sh_degree}"
+        if self.sh_degree == 4:
+            sh += " (band 4 is kept, and not shown)"
+        lines = [
+            f"{self.file}: {_rows(self.count)}, {sh}, {self.format}, {_size(self.file_bytes)}",
+            *(f"repaired: {phrase}" for phrase in self.repairs),
+            *(f"ignored: {phrase}" for phrase in self.ignored),
+        ]
+        if self.scaled_quats:
+            lines.append(f"normalised: {_rows(self.scaled_quats)} had a quaternion of another length than 1")
+        return lines
+
+
+def _rows(count: int) -> str:
+    return f"{_n(count)} Gaussian{'' if count == 1 else 's'}"
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
+
+
+def _n(number: int) -> str:
+    """12345 as 12 345."""
+    return f"{number:,}".replace(",", " ")

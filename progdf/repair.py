@@ -1,0 +1,111 @@
+"""Gaussians that can be drawn: every number finite and in range, every row in its place.
+
+What cannot be used is made invisible rather than dropped, because labels and .gdf files count on row indices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians, normalize_quats
+
+LARGEST_MEAN = 1e18
+LARGEST_LOG_SCALE = 40.0
+"""Beyond these a squared distance or a variance overflows float32."""
+
+FLAT_LOG_SCALE = -20.0
+"""In place of −inf: 2e-9, as thin as the thinnest seen in real files."""
+
+OPAQUE_LOGIT = 15.0
+"""In place of +inf: opacity 1 − 3e-7, which no renderer shows differently, yet an edit can still lower it."""
+
+INVISIBLE_LOGIT = -30.0
+"""In place of −inf: opacity 1e-13, far under the 1/255 that every rasteriser skips."""
+
+LEAST_QUAT = 1e-6
+UNIT_TOLERANCE = 1e-6
+"""A quaternion this close to unit length is left alone, so that a saved scene loads bit for bit."""
+
+
+def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
+    """The scene with unusable numbers replaced and quaternions of unit length, and how many rows needed it.
+
+    Tensors that need nothing are passed on, not copied. Keys of the counts are fields of `LoadReport`.
+    """
+    quats, lengths = _unit(scene.quats)
+    counts = {"scaled_quats": int((lengths != 1).sum())}
+    if _all_good(scene, lengths):
+        return replace(scene, quats=quats), counts
+
+    bad_means = ~(scene.means.abs() <= LARGEST_MEAN).all(dim=1)
+    flat = scene.log_scales == -torch.inf
+    bad_scales = ~((scene.log_scales <= LARGEST_LOG_SCALE) | flat).all(dim=1)
+    bad_quats = ~scene.quats.isfinite().all(dim=1)
+    zero_quats = scene.quats.abs().amax(dim=1) < LEAST_QUAT
+    bad_opacities = scene.logit_opacities.isnan()
+    opaque = scene.logit_opacities == torch.inf
+    transparent = scene.logit_opacities == -torch.inf
+    bad_colours = ~scene.sh0.isfinite().all(dim=1)
+    bad_sh = ~scene.shN.flatten(1).isfinite().all(dim=1)
+    hidden = bad_means | bad_scales | bad_quats | bad_opacities | bad_colours
+    counts = {
+        "scaled_quats": int(((lengths != 1) & ~zero_quats & ~bad_quats).sum()),
+        "hidden": int(hidden.sum()),
+        "bad_means": int(bad_means.sum()),
+        "bad_scales": int(bad_scales.sum()),
+        "bad_quats": int(bad_quats.sum()),
+        "bad_opacities": int(bad_opacities.sum()),
+        "bad_colours": int(bad_colours.sum()),
+        "bad_sh": int(bad_sh.sum()),
+        "flat_scales": int((flat.any(dim=1) & ~hidden).sum()),
+        "opaque": int((opaque & ~hidden).sum()),
+        "transparent": int((transparent & ~hidden).sum()),
+        "zero_quats": int(zero_quats.sum()),
+    }
+    good = scene.means[~hidden]
+    # in the middle of the scene, where it changes neither its bounds nor the rig
+    middle = good.median(dim=0).values if len(good) else torch.zeros(3)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    row = hidden[:, None]
+    logits = scene.logit_opacities.clamp(INVISIBLE_LOGIT, OPAQUE_LOGIT)
+    logits = torch.where(opaque | transparent, logits, scene.logit_opacities)
+    repaired = Gaussians(
+        means=torch.where(row, middle, scene.means),
+        quats=torch.where(row | zero_quats[:, None], identity, quats),
+        log_scales=torch.where(row | flat, FLAT_LOG_SCALE, scene.log_scales),
+        logit_opacities=torch.where(hidden, INVISIBLE_LOGIT, logits),
+        sh0=torch.where(row, 0.0, scene.sh0),
+        shN=torch.where(scene.shN.isfinite(), scene.shN, 0.0),
+    )
+    return repaired, counts
+
+
+def _unit(quats: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions of unit length, and the length each was divided by: exactly 1 if left alone. [N]"""
+    lengths = quats.norm(dim=1)
+    lengths = torch.where((lengths - 1).abs() <= UNIT_TOLERANCE, 1.0, lengths)
+    ordinary = (lengths > LEAST_QUAT) & lengths.isfinite()
+    if bool(ordinary.all()):
+        return quats / lengths[:, None], lengths
+    return torch.where((lengths == 1)[:, None], quats, normalize_quats(quats)), lengths
+
+
+def _all_good(scene: Gaussians, lengths: Tensor) -> bool:
+    """Whether nothing at all needs repair; one pass over the data without temporaries."""
+    return (
+        _within(scene.means, -LARGEST_MEAN, LARGEST_MEAN)
+        and _within(scene.log_scales, -torch.inf, LARGEST_LOG_SCALE)
+        and bool((lengths > LEAST_QUAT).all() and lengths.isfinite().all())
+        and all(_within(t, -torch.inf, torch.inf) for t in (scene.logit_opacities, scene.sh0, scene.shN))
+    )
+
+
+def _within(tensor: Tensor, least: float, most: float) -> bool:
+    """Whether every number is finite and in [least, most]; NaN passes through aminmax and fails."""
+    if not tensor.numel():
+        return True
+    low, high = (float(edge) for edge in tensor.aminmax())
+    return least <= low and high <= most and -torch.inf < low and high < torch.inf
