@@ -1,7 +1,7 @@
 """The geometry of a `ViewCamera`: where the eye is, where right and up are, what frames a scene.
 
-Plain float64 arithmetic on tuples, exact at the poles: the picture's right axis comes from the azimuth, not from
-a cross product with the view direction.
+Plain float64 arithmetic on tuples, exact at the poles: the right axis of the picture comes from the azimuth,
+not from a cross product with the view direction.
 """
 
 from __future__ import annotations

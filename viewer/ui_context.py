@@ -1,0 +1,168 @@
+"""The imgui context: fonts, colours, spacing, and one scale for high-density screens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import imgui_bundle
+from imgui_bundle import icons_fontawesome_6 as icons
+from imgui_bundle import imgui
+
+Rgba = tuple[float, float, float, float]
+
+FONT_PX = 15.0  # at 1×
+SMALL_PX = 13.0
+
+
+def _rgb(code: int, alpha: float = 1.0) -> Rgba:
+    return (code >> 16 & 255) / 255, (code >> 8 & 255) / 255, (code & 255) / 255, alpha
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Calm and neutral, so that the picture keeps its colours; one accent."""
+
+    panel: Rgba = _rgb(0x1E2024)
+    card: Rgba = _rgb(0x282B30)
+    card_focused: Rgba = _rgb(0x2F333A)
+    field: Rgba = _rgb(0x383C43)
+    field_hovered: Rgba = _rgb(0x434850)
+    field_active: Rgba = _rgb(0x4C525B)
+    line: Rgba = _rgb(0x3A3E45)
+    text: Rgba = _rgb(0xDEE1E6)
+    dim: Rgba = _rgb(0x9BA1AB)
+    faint: Rgba = _rgb(0x6B717B)
+    accent: Rgba = _rgb(0x5A9CF0)
+    accent_dark: Rgba = _rgb(0x2E5F9E)
+    handle: Rgba = _rgb(0xF2F4F7)
+    error: Rgba = _rgb(0xE8705F)
+    scrim: Rgba = _rgb(0x16181B, 0.86)
+
+
+PALETTE = Palette()
+
+
+class Icon:
+    """Glyphs of the icon font that is merged into the text font."""
+
+    SHOWN = icons.ICON_FA_EYE
+    HIDDEN = icons.ICON_FA_EYE_SLASH
+    UNDO = icons.ICON_FA_ROTATE_LEFT
+    REDO = icons.ICON_FA_ROTATE_RIGHT
+    PICTURE = icons.ICON_FA_CAMERA
+    HELP = icons.ICON_FA_QUESTION
+    HOME = icons.ICON_FA_HOUSE
+    FRAME = icons.ICON_FA_EXPAND
+
+
+@dataclass(frozen=True)
+class Fonts:
+    """Text with icons, and bold text."""
+
+    regular: imgui.ImFont
+    bold: imgui.ImFont
+
+
+class UiContext:
+    """One imgui context. Make it current before drawing; `close` it when done.
+
+    Args:
+        scale: window pixels per design pixel, ≥ 0.5; 1 on an ordinary screen
+    """
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self.context = imgui.create_context()
+        imgui.set_current_context(self.context)
+        io = imgui.get_io()
+        io.set_ini_filename("")  # no imgui.ini left in the user's folder
+        io.set_log_filename("")
+        self.fonts = _load_fonts(io.fonts)
+        self.scale = 0.0
+        self.set_scale(scale)
+
+    def make_current(self) -> None:
+        imgui.set_current_context(self.context)
+
+    def set_scale(self, scale: float) -> None:
+        """Fonts and spacing for this many window pixels per design pixel."""
+        if scale != self.scale:
+            self.scale = scale
+            _apply_style(scale)
+
+    def close(self) -> None:
+        imgui.destroy_context(self.context)
+
+
+def _load_fonts(atlas: imgui.ImFontAtlas) -> Fonts:
+    folder = Path(imgui_bundle.__file__).parent / "assets" / "fonts"
+    regular = atlas.add_font_from_file_ttf(str(folder / "Roboto" / "Roboto-Regular.ttf"), FONT_PX)
+    merged = imgui.ImFontConfig()
+    merged.merge_mode = True
+    merged.glyph_min_advance_x = FONT_PX
+    atlas.add_font_from_file_ttf(str(folder / "Font_Awesome_6_Free-Solid-900.otf"), FONT_PX - 2, merged)
+    bold = atlas.add_font_from_file_ttf(str(folder / "Roboto" / "Roboto-Bold.ttf"), FONT_PX)
+    return Fonts(regular, bold)
+
+
+def _apply_style(scale: float) -> None:
+    style = imgui.get_style()
+    style.font_size_base = FONT_PX
+    style.font_scale_dpi = scale
+    for name, (x, y) in {
+        "window_padding": (12, 10),
+        "frame_padding": (8, 5),
+        "item_spacing": (8, 6),
+        "item_inner_spacing": (6, 4),
+        "cell_padding": (6, 3),
+    }.items():
+        setattr(style, name, imgui.ImVec2(x * scale, y * scale))
+    for name, size in {
+        "frame_rounding": 4,
+        "popup_rounding": 5,
+        "child_rounding": 6,
+        "grab_rounding": 4,
+        "grab_min_size": 10,
+        "scrollbar_size": 10,
+        "scrollbar_rounding": 5,
+        "window_rounding": 0,
+    }.items():
+        setattr(style, name, size * scale)
+    style.window_border_size = style.child_border_size = style.frame_border_size = 0.0
+    style.popup_border_size = 1.0
+    style.hover_stationary_delay, style.hover_delay_normal = 0.3, 0.5
+    p, col = PALETTE, imgui.Col_
+    imgui.style_colors_dark()
+    for slot, colour in {
+        col.window_bg: p.panel,
+        col.child_bg: (0.0, 0.0, 0.0, 0.0),
+        col.popup_bg: p.card,
+        col.border: p.line,
+        col.text: p.text,
+        col.text_disabled: p.dim,
+        col.frame_bg: p.field,
+        col.frame_bg_hovered: p.field_hovered,
+        col.frame_bg_active: p.field_active,
+        col.button: p.field,
+        col.button_hovered: p.field_hovered,
+        col.button_active: p.field_active,
+        col.header: p.field,
+        col.header_hovered: p.field_hovered,
+        col.header_active: p.field_active,
+        col.slider_grab: p.handle,
+        col.slider_grab_active: p.handle,
+        col.check_mark: p.accent,
+        col.separator: p.line,
+        col.scrollbar_bg: (0.0, 0.0, 0.0, 0.0),
+        col.scrollbar_grab: p.field,
+        col.scrollbar_grab_hovered: p.field_hovered,
+        col.scrollbar_grab_active: p.field_active,
+        col.text_selected_bg: p.accent_dark,
+        col.nav_cursor: p.accent,
+    }.items():
+        style.set_color_(slot, imgui.ImVec4(*colour))
+
+
+def u32(colour: Rgba) -> int:
+    """A packed colour for draw lists."""
+    return imgui.get_color_u32(imgui.ImVec4(*colour))
