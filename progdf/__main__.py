@@ -21,6 +21,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench": ("progdf.bench:main", "measure speed against error"),
 }
 
+BENCHES: dict[str, str] = {
+    "rasterize": "progdf.bench_rasterize:tables",
+    "field": "progdf.bench_field:tables",
+    "viewer": "viewer.bench:tables",
+}
+
 
 def _usage() -> str:
     lines = ["usage: progdf COMMAND …   (progdf COMMAND --help tells its options)", ""]

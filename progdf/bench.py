@@ -1,0 +1,112 @@
+"""`progdf bench`: run the benchmarks and print their tables, each speed beside its error."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from progdf.errors import ProgdfError
+from progdf.files import written_whole
+
+BEGIN, END = "<!-- bench {name} -->", "<!-- end {name} -->"
+
+
+@dataclass(frozen=True)
+class Table:
+    """One benchmark's result.
+
+    Args:
+        name: short, for the README's markers and the JSON file
+        title: one line
+        columns: headings, with units
+        rows: one text a column
+        note: what was measured and how, one or two lines
+    """
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """The table as GitHub Markdown, with its title and note."""
+        lines = [f"**{self.title}**", "", "| " + " | ".join(self.columns) + " |"]
+        lines.append("|" + " --- |" * len(self.columns))
+        lines += ["| " + " | ".join(row) + " |" for row in self.rows]
+        if self.note:
+            lines += ["", self.note]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure speed against error; each benchmark interleaves what it compares in one process.
+
+    Args:
+        what: rasterize, field, viewer; all of them when none is named
+        json: also write the tables to this JSON file
+        readme: also put the tables between their markers in this Markdown file
+    """
+
+    what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    json: Path | None = None
+    readme: Path | None = None
+
+
+def machine() -> str:
+    """One line that names the machine, for the tables."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line
+        ]
+        model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {platform.system()}"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the named benchmarks. Raises ProgdfError for a name that does not exist."""
+    from progdf.__main__ import BENCHES  # the front door is the one file that knows all floors
+
+    options = tyro.cli(Options, args=list(argv), prog="progdf bench")
+    for name in options.what:
+        if name not in BENCHES:
+            raise ProgdfError(f"there is no benchmark '{name}'; try one of {', '.join(BENCHES)}")
+    tables: list[Table] = []
+    print(f"{machine()}\n")
+    for name in options.what or tuple(BENCHES):
+        module, function = BENCHES[name].split(":")
+        measure: Callable[[], list[Table]] = getattr(importlib.import_module(module), function)
+        for table in measure():
+            tables.append(table)
+            print(table.markdown() + "\n", flush=True)
+    if options.json:
+        written = {"machine": machine(), "tables": [asdict(table) for table in tables]}
+        with written_whole(options.json) as beside:
+            beside.write_text(json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    if options.readme:
+        filled = put_tables(options.readme.read_text(encoding="utf-8"), tables)
+        with written_whole(options.readme) as beside:
+            beside.write_text(filled, encoding="utf-8")
+    return 0
+
+
+def put_tables(text: str, tables: Sequence[Table]) -> str:
+    """`text` with every table placed between its markers; a table without markers is left out."""
+    for table in tables:
+        begin, end = BEGIN.format(name=table.name), END.format(name=table.name)
+        if begin in text and end in text:
+            head, rest = text.split(begin, 1)
+            tail = rest.split(end, 1)[1]
+            text = f"{head}{begin}\n{table.markdown()}\n{end}{tail}"
+    return text
