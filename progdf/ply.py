@@ -1,8 +1,8 @@
 """3DGS .ply <-> Gaussians.
 
 The file's own words: x y z, f_dc_0..2, f_rest_* (channel-major), opacity (logit), scale_0..2 (log), rot_0..3
-(wxyz). Anything else is not used, and reported. Rows are never dropped, as labels and .gdf files count on their
-indices: an unusable row becomes an invisible Gaussian (see `progdf.repair`).
+(wxyz). Anything else is reported and not used. Rows are never dropped, as labels and .gdf files count on
+their indices: an unusable row becomes an invisible Gaussian (see `progdf.repair`).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
 def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     """Write a 3DGS .ply: binary little-endian float32, properties in the order of the original 3DGS code.
 
-    The file appears whole or not at all. Loading it gives the same bits back if the quaternions have unit length.
+    The file appears whole or not at all. If the quaternions have unit length it loads to the same bits.
 
     Raises:
         ProgdfError: the scene is empty or holds a NaN or an infinity, or the folder does not exist.

@@ -175,8 +175,8 @@ def _check_counts(name: str, header: PlyHeader) -> None:
         if element.count * least > room + slack:
             what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
             raise ProgdfError(
-                f"{name} promises {element.count} {what} of {'at least ' if slack else ''}{least} bytes but has "
-                f"room for {max(room, 0) // least}, so it is cut short or its header is wrong; "
+                f"{name} promises {element.count} {what} of {'at least ' if slack else ''}{least} bytes but "
+                f"has room for {max(room, 0) // least}, so it is cut short or its header is wrong; "
                 f"copy or export it again"
             )
         room -= element.count * least

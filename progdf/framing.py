@@ -1,0 +1,143 @@
+"""How a scene lies in space: where its bulk is, which way is up, whether it can be seen from outside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from progdf.camera import Camera
+
+_SAMPLE = 100_000
+"""Rows that are looked at; a scene with more is sampled evenly."""
+
+_GROUND_HALF_THICKNESS = 0.08
+"""Of the scene's radius: what lies further from the ground plane stands on it (or hangs under it)."""
+
+_LONG_TAIL = 5.0
+_CEILING_COVER = 0.5
+_LEAST_CELLS = 16
+
+
+def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
+    """Centre [3] and radius (> 0) of the bulk of a scene, world units.
+
+    The median of the means, and the distance within which 97 % of them lie: far strays do not count.
+    """
+    means = _sample(scene).means
+    centre = means.median(dim=0).values
+    distances = (means - centre).norm(dim=1)
+    nearest = max(round(0.97 * len(means)), 1)
+    return centre, max(float(distances.kthvalue(nearest).values), 1e-6)
+
+
+def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
+    """The world direction that is up. [3] float32, unit length
+
+    With cameras: the mean of their up directions, as people hold cameras level; if these agree.
+    Without: the axis along which the flat Gaussians face most (floors, tables and the tops of things make the
+    largest part of flat surfaces in a real scene), pointing from the densest plane across it to the side that
+    has more on it. Where nothing decides: −y, the convention of COLMAP and so of most trained scenes.
+    """
+    if cameras:
+        mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
+        if float(mean.norm()) > 0.5:
+            return torch.nn.functional.normalize(mean, dim=0)
+    sample = _sample(scene)
+    centre, radius = scene_sphere(sample)
+    weights, normals = _flatness(sample)
+    facing = weights[:, None] * normals.abs() ** 4
+    axis = int(facing.sum(dim=0).argmax())
+    across = ((sample.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5)
+    counts, edges = torch.histogram(across, bins=60, range=(-1.5, 1.5), weight=facing[:, axis])
+    ground = float(edges[int(counts.argmax())]) + 0.025
+    mass = sample.opacities * _areas(sample)
+    above = float(mass[across > ground + _GROUND_HALF_THICKNESS].sum())
+    below = float(mass[across < ground - _GROUND_HALF_THICKNESS].sum())
+    up = torch.zeros(3)
+    if above == below:
+        up[1] = -1.0
+    else:
+        up[axis] = 1.0 if above > below else -1.0
+    return up
+
+
+def front(up: Tensor) -> Tensor:
+    """The level direction from a scene to someone who looks at its front. [3] -> [3], unit length
+
+    +z for y up, −z for y down (the side the cameras of a COLMAP scene mostly look from), −y for z up. The same as
+    azimuth 0 in the viewer.
+    """
+    largest = int(up.abs().argmax())
+    towards = torch.zeros(3)
+    towards[1 if largest == 2 else 2] = math.copysign(1.0, float(up[largest])) * (
+        -1.0 if largest == 2 else 1.0
+    )
+    level = towards - (towards @ up) * up
+    return torch.nn.functional.normalize(level, dim=0)
+
+
+def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
+    """Whether the scene is probably one to stand inside, which no ring of cameras around it can show.
+
+    Two signs: a ceiling (a slab at the top that covers at least half of the ground plan), or a long tail (the
+    far 3 % begin more than five times as far out as the middle, as in outdoor captures with a background).
+    """
+    sample = _sample(scene)
+    centre, radius = scene_sphere(sample)
+    offsets = sample.means - centre
+    if radius > _LONG_TAIL * float(offsets.norm(dim=1).median().clamp_min(1e-12)):
+        return True
+    ahead = front(up)
+    plan = offsets @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
+    height = offsets @ up
+    low, high = (_quantile(height, q) for q in (0.02, 0.98))
+    cells = _cells(plan)
+    covered = len(torch.unique(cells))
+    ceiling = len(torch.unique(cells[height > high - 0.06 * (high - low)]))
+    return covered >= _LEAST_CELLS and ceiling >= _CEILING_COVER * covered
+
+
+def _cells(plan: Tensor, per_side: int = 8) -> Tensor:
+    """The cell of an 8 × 8 grid over the ground plan that each row falls in. [N,2] -> [N] int64"""
+    low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
+    place = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
+    return place[:, 0] * per_side + place[:, 1]
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values
+
+
+def _sample(scene: Gaussians) -> Gaussians:
+    return scene[:: -(-len(scene) // _SAMPLE)] if len(scene) > _SAMPLE else scene
+
+
+def _areas(scene: Gaussians) -> Tensor:
+    """Area of each Gaussian's two longer axes, the largest per cent cut off so that no giant decides. [N]"""
+    areas = scene.log_scales.sort(dim=1).values[:, 1:].sum(dim=1).exp()
+    return areas.clamp_max(float(_quantile(areas, 0.99)))
+
+
+def _flatness(scene: Gaussians) -> tuple[Tensor, Tensor]:
+    """Visible flat area of each Gaussian, and its normal: the shortest axis. [N], [N,3]"""
+    shortest = scene.log_scales.argmin(dim=1)
+    w, x, y, z = scene.unit_quats.unbind(dim=1)
+    columns = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=1),
+            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=1),
+            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1),
+        ],
+        dim=1,
+    )
+    normals = columns[torch.arange(len(scene)), shortest]
+    ordered = scene.log_scales.sort(dim=1).values
+    flat = 1 - (ordered[:, 0] - ordered[:, 1]).exp()
+    return _areas(scene) * scene.opacities * flat, normals
