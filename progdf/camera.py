@@ -113,8 +113,8 @@ def orbit_rig(
 ) -> list[Camera]:
     """Cameras all around a scene that has none, in order of azimuth.
 
-    Azimuths are even and begin at the front (see `framing.front`); elevations follow the golden ratio over the
-    band, even in area: every n-th camera of the list is spread as evenly as the whole.
+    Azimuths are even and begin at the front (see `framing.front`); elevations follow the golden ratio over
+    the band, even in area: every n-th camera of the list is spread as evenly as the whole.
 
     Args:
         scene: framed by its median centre and 97th-percentile radius, see `scene_sphere`
@@ -122,7 +122,7 @@ def orbit_rig(
         width, height: image size in pixels
         fov_y: vertical field of view, radians
         up: world direction that is up, [3]; None guesses it, see `guess_up`
-        elevations: lowest and highest, degrees above the horizon, −89..89; below 0 looks from under the ground
+        elevations: lowest and highest, degrees above the horizon, −89..89; below 0 is under the ground
         distance: from the centre, in radii at a field of view of 50° along the shorter side of the image; a
             narrower or wider field moves the cameras so that the scene keeps its size in the picture
 
@@ -139,7 +139,7 @@ def orbit_rig(
     up = guess_up(scene) if up is None else up.float() / up.float().norm()
     if is_surrounding(scene, up):
         _log.warning(
-            "this looks like a scene one stands inside, which cameras around it cannot frame; give its own cameras"
+            "this looks like a scene to stand inside: cameras around it cannot frame it; give its own cameras"
         )
     centre, radius = scene_sphere(scene)
     K = intrinsics(fov_y, width, height)

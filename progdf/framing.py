@@ -71,8 +71,8 @@ def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
 def front(up: Tensor) -> Tensor:
     """The level direction from a scene to someone who looks at its front. [3] -> [3], unit length
 
-    +z for y up, −z for y down (the side the cameras of a COLMAP scene mostly look from), −y for z up. The same as
-    azimuth 0 in the viewer.
+    +z for y up, −z for y down (the side the cameras of a COLMAP scene mostly look from), −y for z up; the
+    same as azimuth 0 in the viewer.
     """
     largest = int(up.abs().argmax())
     towards = torch.zeros(3)

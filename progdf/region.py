@@ -1,11 +1,17 @@
-"""A region: which Gaussians an edit may change, and how sure we are of each."""
+"""A region: which Gaussians an edit may change, and how sure we are of each; set operations, plain shapes.
+
+The language in which a region is written is in `progdf.region_spec`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from progdf.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -41,3 +47,53 @@ class Region:
 def from_mask(name: str, mask: Tensor) -> Region:
     """The region of a boolean mask over the scene. [N] bool"""
     return Region(name, mask.nonzero()[:, 0], mask.float())
+
+
+def everything(scene: Gaussians) -> Region:
+    """All Gaussians of the scene."""
+    return from_mask("all", torch.ones(len(scene), dtype=torch.bool))
+
+
+def from_labels(name: str, labels: Tensor, ids: Sequence[int]) -> Region:
+    """The Gaussians whose label is one of `ids`. [N] integer"""
+    return from_mask(name, torch.isin(labels, torch.tensor(list(ids), dtype=labels.dtype)))
+
+
+def inside_box(name: str, scene: Gaussians, corner: Tensor, opposite: Tensor) -> Region:
+    """The Gaussians whose mean lies in the axis-aligned box between two opposite corners, edges included."""
+    low, high = torch.minimum(corner, opposite), torch.maximum(corner, opposite)
+    return from_mask(name, ((scene.means >= low) & (scene.means <= high)).all(dim=1))
+
+
+def inside_sphere(name: str, scene: Gaussians, centre: Tensor, radius: float) -> Region:
+    """The Gaussians whose mean is at most `radius` world units from `centre`."""
+    return from_mask(name, (scene.means - centre).norm(dim=1) <= radius)
+
+
+def union(a: Region, b: Region, name: str = "") -> Region:
+    """Members of either; the larger score."""
+    _same_scene(a, b)
+    members = torch.cat([a.members, b.members]).unique(sorted=True)  # type: ignore[no-untyped-call]
+    return Region(name or f"{a.name}+{b.name}", members, torch.maximum(a.score, b.score))
+
+
+def without(a: Region, b: Region, name: str = "") -> Region:
+    """Members of `a` that are not members of `b`; the score of `a`, at most what `b` leaves."""
+    _same_scene(a, b)
+    members = a.members[~torch.isin(a.members, b.members)]
+    return Region(name or f"{a.name}-{b.name}", members, torch.minimum(a.score, 1 - b.score))
+
+
+def intersection(a: Region, b: Region, name: str = "") -> Region:
+    """Members of both; the smaller score."""
+    _same_scene(a, b)
+    members = a.members[torch.isin(a.members, b.members)]
+    return Region(name or f"{a.name}&{b.name}", members, torch.minimum(a.score, b.score))
+
+
+def _same_scene(a: Region, b: Region) -> None:
+    if a.score.shape != b.score.shape:
+        raise ValueError(
+            f"{a.name} is a region of {len(a.score)} Gaussians, {b.name} of {len(b.score)}; "
+            "both must belong to one scene"
+        )
