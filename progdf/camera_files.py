@@ -1,0 +1,231 @@
+"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, and our own JSON, told apart by content."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.files import open_failure, written_whole
+
+_FORMAT = "progdf cameras 1"
+_NOT_A_ROTATION = 1e-2
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+"""Camera models that are a pinhole once their distortion is zero."""
+
+_IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+
+
+def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
+    """The cameras in a JSON file, in file order.
+
+    Three kinds are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
+    `transforms.json` (frames with an OpenGL camera-to-world matrix; intrinsics per file or per frame) and what
+    `save_cameras` writes, also a single such camera.
+
+    Raises:
+        ProgdfError: no such file, none of these kinds, a broken camera, or lens distortion (which is refused, not
+            ignored: undistort the images first).
+    """
+    name = os.fspath(path)
+    try:
+        content = json.loads(Path(path).read_bytes())
+    except OSError as error:
+        raise open_failure(path, error) from None
+    except (ValueError, RecursionError):
+        raise ProgdfError(
+            f"{name} is not JSON; give a cameras.json, a transforms.json or a file of saved cameras"
+        ) from None
+    match content:
+        case {"frames": list() as frames}:
+            cameras = [_nerfstudio(name, i, content, frame, Path(path)) for i, frame in enumerate(frames)]
+        case {"cameras": list() as entries}:
+            cameras = [_own(name, i, entry) for i, entry in enumerate(entries)]
+        case {"viewmat": _}:
+            cameras = [_own(name, 0, content)]
+        case [{"viewmat": _}, *_]:
+            cameras = [_own(name, i, entry) for i, entry in enumerate(content)]
+        case [{"rotation": _, "position": _}, *_]:
+            cameras = [_inria(name, i, entry) for i, entry in enumerate(content)]
+        case [] | {}:
+            cameras = []
+        case _:
+            raise ProgdfError(
+                f"{name} holds no cameras; give a cameras.json, a transforms.json or a file of saved cameras"
+            )
+    if not cameras:
+        raise ProgdfError(f"{name} holds 0 cameras; at least one would be right")
+    return cameras
+
+
+def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> None:
+    """Write cameras as JSON; `load_cameras` gives the same bits back. The file appears whole or not at all."""
+    entries = [
+        {
+            "name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "K": camera.K.double().tolist(),
+            "viewmat": camera.viewmat.double().tolist(),
+        }
+        for camera in cameras
+    ]
+    with written_whole(path) as beside:
+        beside.write_text(json.dumps({"format": _FORMAT, "cameras": entries}, indent=1), encoding="utf-8")
+
+
+def _own(file: str, index: int, entry: object) -> Camera:
+    where = f"camera {index} of {file}"
+    table = _table(where, entry)
+    return _camera(
+        where,
+        _matrix(where, table, "viewmat", (4,), 4),
+        _matrix(where, table, "K", (3,), 3),
+        _pixels(where, table, "width"),
+        _pixels(where, table, "height"),
+        str(table.get("name", "")),
+    )
+
+
+def _inria(file: str, index: int, entry: object) -> Camera:
+    """`rotation` and `position` are the camera-to-world matrix in OpenCV axes; the principal point is the centre."""
+    where = f"camera {index} of {file}"
+    table = _table(where, entry)
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[:3, :3] = _matrix(where, table, "rotation", (3,), 3)
+    position = table.get("position")
+    c2w[:3, 3] = _matrix(where, {"position": [position]}, "position", (1,), 3)[0]
+    width, height = _pixels(where, table, "width"), _pixels(where, table, "height")
+    K = _intrinsics(_number(where, table, "fx"), _number(where, table, "fy"), 0.5 * width, 0.5 * height)
+    return _camera(where, _world_to_camera(where, c2w), K, width, height, str(table.get("img_name", "")))
+
+
+def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object, path: Path) -> Camera:
+    """Intrinsics of the frame go before those of the file; axes are OpenGL's (y up, z backwards)."""
+    where = f"frame {index} of {file}"
+    table = {**shared, **_table(where, frame)}
+    model = str(table.get("camera_model", "")).upper()
+    if model not in _PINHOLES:
+        raise ProgdfError(
+            f"{where} has the camera model {model}; only pinhole cameras can be used: undistort first"
+        )
+    bent = [key for key in _DISTORTION if key in table and _number(where, table, key) != 0]
+    if bent:
+        raise ProgdfError(
+            f"{where} has lens distortion ({', '.join(bent)} not 0), which cannot be drawn; "
+            "undistort the images and give the new transforms.json"
+        )
+    width, height = _image_size(where, table, path)
+    if "fl_x" in table or "fl_y" in table:
+        focal_x = _number(where, table, "fl_x" if "fl_x" in table else "fl_y")
+        focal_y = _number(where, table, "fl_y" if "fl_y" in table else "fl_x")
+    else:
+        angles = [
+            0.5 * side / math.tan(0.5 * _angle(where, table, key))
+            for key, side in (("camera_angle_x", width), ("camera_angle_y", height))
+            if key in table
+        ]
+        if not angles:
+            raise ProgdfError(f"{where} has no focal length; fl_x, fl_y or camera_angle_x would be right")
+        focal_x, focal_y = angles[0], angles[-1]
+    cx = _number(where, table, "cx") if "cx" in table else 0.5 * width
+    cy = _number(where, table, "cy") if "cy" in table else 0.5 * height
+    c2w = _matrix(where, table, "transform_matrix", (3, 4), 4)
+    c2w = torch.cat([c2w[:3], torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)])
+    c2w[:, 1:3] *= -1  # OpenGL -> OpenCV
+    K = _intrinsics(focal_x, focal_y, cx, cy)
+    return _camera(where, _world_to_camera(where, c2w), K, width, height, str(table.get("file_path", "")))
+
+
+def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, int]:
+    """From the file, else from the picture it names (synthetic NeRF scenes have no w and h)."""
+    if "w" in table and "h" in table:
+        return _pixels(where, table, "w"), _pixels(where, table, "h")
+    from PIL import Image
+
+    for suffix in _IMAGE_SUFFIXES:
+        picture = path.parent / (str(table.get("file_path", "")) + suffix)
+        if picture.is_file():
+            try:
+                with Image.open(picture) as image:
+                    return image.size
+            except OSError:
+                raise ProgdfError(
+                    f"{picture}, which {where} names, is no image; repair or replace it"
+                ) from None
+    raise ProgdfError(f"{where} has no image size; w and h would be right")
+
+
+def _world_to_camera(where: str, c2w: Tensor) -> Tensor:
+    rotation = c2w[:3, :3]
+    error = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max())
+    if not error < _NOT_A_ROTATION or float(torch.det(rotation)) < 0:
+        raise ProgdfError(
+            f"{where} has a matrix that is no rotation and translation; export the cameras again"
+        )
+    return torch.linalg.inv(c2w)
+
+
+def _camera(where: str, viewmat: Tensor, K: Tensor, width: int, height: int, name: str) -> Camera:
+    try:
+        return Camera(viewmat.float(), K.float(), width, height, name)
+    except ValueError as error:
+        raise ProgdfError(f"{where} is broken: {error}") from None
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def _table(where: str, entry: object) -> Mapping[str, Any]:
+    if not isinstance(entry, dict):
+        raise ProgdfError(f"{where} is no JSON object; export the cameras again")
+    return entry
+
+
+def _number(where: str, table: Mapping[str, Any], key: str) -> float:
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ProgdfError(f"{where} has {key} = {_shown(value)}; a number would be right")
+    return float(value)
+
+
+def _angle(where: str, table: Mapping[str, Any], key: str) -> float:
+    angle = _number(where, table, key)
+    if not 0 < angle < math.pi:
+        raise ProgdfError(f"{where} has {key} = {angle:g}; an angle between 0 and pi would be right")
+    return angle
+
+
+def _pixels(where: str, table: Mapping[str, Any], key: str) -> int:
+    number = _number(where, table, key)
+    if number != round(number) or not 1 <= number <= 1_000_000:
+        raise ProgdfError(f"{where} has {key} = {number:g}; a whole number of pixels would be right")
+    return int(number)
+
+
+def _matrix(where: str, table: Mapping[str, Any], key: str, rows: tuple[int, ...], columns: int) -> Tensor:
+    value = table.get(key)
+    good = (
+        isinstance(value, list)
+        and len(value) in rows
+        and all(isinstance(row, list) and len(row) == columns for row in value)
+        and all(isinstance(x, int | float) and math.isfinite(x) for row in value for x in row)
+    )
+    if not good:
+        shape = " or ".join(f"{count}x{columns}" for count in rows)
+        raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers would be right")
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def _shown(value: object) -> str:
+    return "nothing" if value is None else repr(value)[:40]
