@@ -1,4 +1,4 @@
-"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, and our own JSON, told apart by content."""
+"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, told apart by content."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """The cameras in a JSON file, in file order.
 
     Three kinds are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
-    `transforms.json` (frames with an OpenGL camera-to-world matrix; intrinsics per file or per frame) and what
-    `save_cameras` writes, also a single such camera.
+    `transforms.json` (frames with an OpenGL camera-to-world matrix; intrinsics per file or per frame) and
+    what `save_cameras` writes, also a single such camera.
 
     Raises:
-        ProgdfError: no such file, none of these kinds, a broken camera, or lens distortion (which is refused, not
-            ignored: undistort the images first).
+        ProgdfError: no such file, none of these kinds, a broken camera, or lens distortion (which is refused,
+            not ignored: undistort the images first).
     """
     name = os.fspath(path)
     try:
@@ -56,7 +56,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
             cameras = [_own(name, i, entry) for i, entry in enumerate(content)]
         case [{"rotation": _, "position": _}, *_]:
             cameras = [_inria(name, i, entry) for i, entry in enumerate(content)]
-        case [] | {}:
+        case []:
             cameras = []
         case _:
             raise ProgdfError(
@@ -68,7 +68,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> None:
-    """Write cameras as JSON; `load_cameras` gives the same bits back. The file appears whole or not at all."""
+    """Write cameras as JSON, whole or not at all; `load_cameras` gives the same bits back."""
     entries = [
         {
             "name": camera.name,
@@ -97,7 +97,7 @@ def _own(file: str, index: int, entry: object) -> Camera:
 
 
 def _inria(file: str, index: int, entry: object) -> Camera:
-    """`rotation` and `position` are the camera-to-world matrix in OpenCV axes; the principal point is the centre."""
+    """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the image's centre."""
     where = f"camera {index} of {file}"
     table = _table(where, entry)
     c2w = torch.eye(4, dtype=torch.float64)
@@ -158,7 +158,7 @@ def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, 
             try:
                 with Image.open(picture) as image:
                     return image.size
-            except OSError:
+            except (OSError, Image.DecompressionBombError):
                 raise ProgdfError(
                     f"{picture}, which {where} names, is no image; repair or replace it"
                 ) from None
@@ -172,7 +172,8 @@ def _world_to_camera(where: str, c2w: Tensor) -> Tensor:
         raise ProgdfError(
             f"{where} has a matrix that is no rotation and translation; export the cameras again"
         )
-    return torch.linalg.inv(c2w)
+    viewmat: Tensor = torch.linalg.inv(c2w)
+    return viewmat
 
 
 def _camera(where: str, viewmat: Tensor, K: Tensor, width: int, height: int, name: str) -> Camera:
@@ -194,9 +195,9 @@ def _table(where: str, entry: object) -> Mapping[str, Any]:
 
 def _number(where: str, table: Mapping[str, Any], key: str) -> float:
     value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not _is_number(value):
         raise ProgdfError(f"{where} has {key} = {_shown(value)}; a number would be right")
-    return float(value)
+    return float(table[key])
 
 
 def _angle(where: str, table: Mapping[str, Any], key: str) -> float:
@@ -219,12 +220,17 @@ def _matrix(where: str, table: Mapping[str, Any], key: str, rows: tuple[int, ...
         isinstance(value, list)
         and len(value) in rows
         and all(isinstance(row, list) and len(row) == columns for row in value)
-        and all(isinstance(x, int | float) and math.isfinite(x) for row in value for x in row)
+        and all(_is_number(x) for row in value for x in row)
     )
     if not good:
         shape = " or ".join(f"{count}x{columns}" for count in rows)
         raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers would be right")
     return torch.tensor(value, dtype=torch.float64)
+
+
+def _is_number(value: object) -> bool:
+    """Finite, and within what float32 can hold (JSON has integers of any length)."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
 
 
 def _shown(value: object) -> str:
