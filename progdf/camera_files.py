@@ -97,7 +97,7 @@ def _own(file: str, index: int, entry: object) -> Camera:
 
 
 def _inria(file: str, index: int, entry: object) -> Camera:
-    """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the image's centre."""
+    """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the centre."""
     where = f"camera {index} of {file}"
     table = _table(where, entry)
     c2w = torch.eye(4, dtype=torch.float64)
