@@ -1,1 +1,44 @@
-"""Image editors: views in, edited views out."""
+"""Image editors: a view in, the edited view out. One file a family, one line in `EDITORS`, one test each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.region import Region
+from trainer.editors.base import ImageEditor
+from trainer.editors.folder import folder
+from trainer.editors.procedural import darken, night, recolor, stripes, tint
+from trainer.views import View
+
+Factory = Callable[[str, Gaussians, Region, Sequence[View]], ImageEditor]
+
+EDITORS: dict[str, Factory] = {
+    "recolor": recolor,
+    "tint": tint,
+    "stripes": stripes,
+    "darken": darken,
+    "night": night,
+    "folder": folder,
+}
+"""Kind of editor → its factory, given what stands behind the colon, the scene, the region and the views."""
+
+EXAMPLES = ("recolor:#3060d0", "tint:#d4af37", "stripes:#20a040", "darken:0.7", "night", "folder:DIR")
+
+
+def check_editor(spec: str) -> tuple[str, str]:
+    """Split `KIND:WHAT`; ProgdfError if there is no such kind. Cheap: nothing is read or rendered."""
+    kind, _, what = spec.partition(":")
+    if kind not in EDITORS:
+        raise ProgdfError(f"there is no editor '{kind}'; use one of {', '.join(EXAMPLES)}")
+    return kind, what
+
+
+def make_editor(spec: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ImageEditor:
+    """The editor that `spec` names, for one region and its views; ProgdfError tells what is wrong with it."""
+    kind, what = check_editor(spec)
+    return EDITORS[kind](what, scene, region, views)
+
+
+__all__ = ["EDITORS", "ImageEditor", "check_editor", "make_editor"]

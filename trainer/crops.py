@@ -1,0 +1,147 @@
+"""Rendering one view's box of the scene with other values in the region's rows, and nothing more than that.
+
+An edit changes the members of a region only, so a view is prepared once: the Gaussians that its box can
+show, their activated values, the colours seen from there. What a training step pays for is the members and
+the box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians, unpack
+from progdf.rasterize import Crop, rasterize
+from progdf.sh import basis, shade
+from trainer.losses import clamp_towards
+
+
+@dataclass(frozen=True)
+class CropScene:
+    """What one view's box can show, ready to be rendered with other member rows.
+
+    Args:
+        camera: the whole view
+        box: the pixels that are rendered
+        means, quats, scales, opacities, colors: activated values of the n Gaussians of the box, colours
+            as seen from this camera; members hold the original's values. [n,3], [n,4], [n,3], [n], [n,3]
+        rows: where the members are among them, in the region's order. [M] int64
+        member_shN: higher SH bands of the members in the original. [M,K,3]
+        background: what shows through. [3]
+    """
+
+    camera: Camera
+    box: Crop
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    rows: Tensor
+    member_shN: Tensor
+    background: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the box in pixels."""
+        return self.box[3] - self.box[1], self.box[2] - self.box[0]
+
+    def original(self) -> Tensor:
+        """The box of the unedited view, not clamped. [h,w,3]"""
+        image, _ = self._draw(self.means, self.quats, self.scales, self.opacities, self.colors)
+        return image
+
+    def render(self, packed: Tensor) -> tuple[Tensor, Tensor]:
+        """The box with these raw values in the region's rows, differentiable in them.
+
+        Args:
+            packed: member rows as `gaussians.pack` gives them. [M,14] or [M,14+3K]
+
+        Returns:
+            image [h,w,3], 0..1 with the clamp's gradient kept where it points inwards; transmittance [h,w]
+        """
+        members = unpack(packed, self.member_shN)
+        colors = member_colors(members, self.camera.position)
+        image, transmittance = self._draw(
+            self.means.index_copy(0, self.rows, members.means),
+            self.quats.index_copy(0, self.rows, members.quats),
+            self.scales.index_copy(0, self.rows, members.scales),
+            self.opacities.index_copy(0, self.rows, members.opacities),
+            self.colors.index_copy(0, self.rows, colors),
+        )
+        return clamp_towards(image, 0.0, 1.0), transmittance
+
+    def _draw(
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        camera = self.camera
+        image, transmittance, _ = rasterize(
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            background=self.background,
+            crop=self.box,
+        )
+        return image, transmittance
+
+
+def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
+    """SH colours seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
+
+    Directions are constants here: their share of the means' gradient is small and mostly noise.
+    """
+    directions = torch.nn.functional.normalize(members.means.detach() - eye, dim=1)
+    degree = min(members.sh_degree, 3)
+    weights = basis(degree, directions)
+    raw = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
+    return clamp_towards(raw, 0.0, float("inf"))
+
+
+def crop_scene(scene: Gaussians, members: Tensor, camera: Camera, box: Crop, background: Tensor) -> CropScene:
+    """Prepare one view. `members`: rows of the region [M] int64; `background` [3]."""
+    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
+    colors = shade(min(scene.sh_degree, 3), directions, scene.sh)
+    _, _, seen = rasterize(
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        colors,
+        camera.viewmat,
+        camera.K,
+        camera.width,
+        camera.height,
+        background=background,
+        crop=box,
+    )
+    kept = seen.visible.clone()
+    kept[members] = True  # a member that is out of sight now may come into it
+    index = kept.nonzero()[:, 0]
+    return CropScene(
+        camera,
+        box,
+        scene.means[index],
+        scene.quats[index],
+        scene.scales[index],
+        scene.opacities[index],
+        colors[index],
+        torch.searchsorted(index, members),
+        scene.shN[members],
+        background,
+    )
+
+
+def render_all(crops: Sequence[CropScene], packed: Tensor) -> list[Tensor]:
+    """Every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
+    with torch.no_grad():
+        return [crop.render(packed)[0] for crop in crops]

@@ -1,0 +1,95 @@
+"""Edited views made elsewhere: any tool that reads and writes pictures can be the editor.
+
+    folder:DIR     DIR/view_000.png …                the finished edit, strength 1
+                   DIR/0.25/view_000.png … DIR/0.5/… further strengths, a subfolder each
+
+Files are named as the run names its views (see RUN/views/original); another size is scaled to the view's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from PIL import UnidentifiedImageError
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.region import Region
+from trainer.editors.base import EditKind
+from trainer.pictures import read_picture
+from trainer.views import View
+
+_REMEDY = "put the edited copies of RUN/views/original/*.png there, under the same names"
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True)
+class FolderEditor:
+    """Reads edited views from one folder per strength.
+
+    Args:
+        folders: strength → folder
+        stages: the strengths, ascending
+    """
+
+    folders: dict[float, Path]
+    stages: tuple[float, ...]
+    kind: EditKind = "style"
+
+    def edit(self, view: View, strength: float) -> Tensor:
+        """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
+        if strength == 0.0:
+            return view.image
+        if strength not in self.folders:
+            raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
+        path = _picture(self.folders[strength], view.camera.name)
+        width, height = view.camera.width, view.camera.height
+        try:
+            picture = read_picture(path, size=(width, height))
+        except (UnidentifiedImageError, OSError) as error:
+            raise ProgdfError(
+                f"{path} cannot be read as a picture ({type(error).__name__}); save it as PNG"
+            ) from error
+        return picture
+
+
+def folder(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> FolderEditor:
+    """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
+    if not what:
+        raise ProgdfError("folder: names no folder; write folder:DIR with the edited views in DIR")
+    root = Path(what).expanduser()
+    if not root.is_dir():
+        raise ProgdfError(f"{root} is not a folder; {_REMEDY}")
+    folders: dict[float, Path] = {}
+    for child in sorted(root.iterdir()):
+        strength = _strength(child.name)
+        if child.is_dir() and strength is not None:
+            if not 0.0 < strength <= 1.0:
+                raise ProgdfError(f"{child} is named for a strength outside 0..1; name it 0.25, 0.5, … or 1")
+            folders[strength] = child
+    if 1.0 not in folders:
+        folders[1.0] = root
+    editor = FolderEditor(folders, tuple(sorted(folders)))
+    for strength in editor.stages:
+        for view in views:
+            _picture(folders[strength], view.camera.name)
+    return editor
+
+
+def _strength(name: str) -> float | None:
+    try:
+        value = float(name)
+    except ValueError:
+        return None
+    return value if torch.isfinite(torch.tensor(value)) else None
+
+
+def _picture(where: Path, name: str) -> Path:
+    for suffix in SUFFIXES:
+        if (where / f"{name}{suffix}").is_file():
+            return where / f"{name}{suffix}"
+    raise ProgdfError(f"{where} has no picture {name}.png; {_REMEDY}")

@@ -1,0 +1,146 @@
+"""Editors made of a colour function: exact, the same in every view, and with a dial of their own.
+
+They edit the region's own colour, unmixed from what shares a pixel with it, and mix it back (see
+`View.blended`): soft edges keep the right share of either side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf import colour
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.rasterize import rasterize
+from progdf.region import Region
+from progdf.sh import shade
+from trainer.editors.base import EditKind
+from trainer.views import View
+
+STAGES = (0.25, 0.5, 0.75, 1.0)
+_STRIPES = 7  # across the longest side of the region
+
+
+@dataclass(frozen=True)
+class ColourEditor:
+    """A function of colour and strength, applied to each pixel's share of the region."""
+
+    change: Callable[[Tensor, float], Tensor]
+    kind: EditKind = "colour"
+    stages: tuple[float, ...] = STAGES
+
+    def edit(self, view: View, strength: float) -> Tensor:
+        """See `ImageEditor.edit`."""
+        return view.blended(self.change(view.inside, strength))
+
+
+@dataclass(frozen=True)
+class StripesEditor:
+    """A pattern painted on the Gaussians themselves and rendered: the same stripes from everywhere.
+
+    Args:
+        scene: the original
+        members: rows of the region. [M] int64
+        pattern: how much of each member is stripe, 0..1. [M]
+        target: colour of the stripes, sRGB 0..1. [3]
+        reference: typical colour of the region. [3]
+    """
+
+    scene: Gaussians
+    members: Tensor
+    pattern: Tensor
+    target: Tensor
+    reference: Tensor
+    kind: EditKind = "colour"
+    stages: tuple[float, ...] = STAGES
+
+    def edit(self, view: View, strength: float) -> Tensor:
+        """See `ImageEditor.edit`."""
+        if strength == 0.0:
+            return view.image
+        scene, members, camera = self.scene, self.members, view.camera
+        directions = torch.nn.functional.normalize(scene.means[members] - camera.position, dim=1)
+        before = shade(min(scene.sh_degree, 3), directions, scene.sh[members])
+        painted = colour.stripes(before, self.pattern, self.target, strength, self.reference)
+        colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
+        with torch.no_grad():
+            premultiplied, _, _ = rasterize(
+                scene.means,
+                scene.quats,
+                scene.scales,
+                scene.opacities,
+                colors,
+                camera.viewmat,
+                camera.K,
+                camera.width,
+                camera.height,
+                background=torch.zeros(3),
+            )
+        return view.blended((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
+
+
+def recolor(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+    """`recolor:#rrggbb`: another colour, the shading kept; hue, saturation and lightness move together."""
+    target, reference = colour.parse_color(what), reference_color(views)
+    return ColourEditor(lambda rgb, strength: colour.recolor(rgb, target, strength, reference))
+
+
+def tint(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+    """`tint:#rrggbb`: a wash of colour, lightness kept."""
+    target = colour.parse_color(what)
+    return ColourEditor(lambda rgb, strength: colour.tint(rgb, target, strength))
+
+
+def darken(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+    """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
+    stops = _stops(what, "darken")
+    return ColourEditor(lambda rgb, strength: colour.darken(rgb, strength, stops))
+
+
+def night(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+    """`night` or `night:AMOUNT`: as `darken`, with colours fading to the blue of moonlight."""
+    stops = _stops(what, "night")
+    return ColourEditor(lambda rgb, strength: colour.night(rgb, strength, stops))
+
+
+def stripes(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> StripesEditor:
+    """`stripes:#rrggbb`: seven stripes across the region's longest side, painted in 3D."""
+    target = colour.parse_color(what)
+    points = scene.means[region.members]
+    axis, period, phase = stripe_frame(points)
+    pattern = colour.stripe_pattern(points, axis, period, phase)
+    return StripesEditor(scene, region.members, pattern, target, reference_color(views))
+
+
+def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
+    """World axis along which the points spread most, period of seven stripes, phase. [M,3] -> [3], float, float"""
+    low, high = (torch.quantile(points[:: max(1, len(points) // 100_000)], q, dim=0) for q in (0.01, 0.99))
+    longest = int((high - low).argmax())
+    axis = torch.zeros(3)
+    axis[longest] = 1.0
+    period = max(float(high[longest] - low[longest]) / _STRIPES, 1e-6)
+    return axis, period, 0.5 - float(low[longest]) / period
+
+
+def reference_color(views: Sequence[View]) -> Tensor:
+    """The region's typical colour over all views, so that each view's edit is the same function. [3]"""
+    inside = torch.cat([view.inside.reshape(-1, 3) for view in views])
+    weights = torch.cat([view.mask.reshape(-1) for view in views])
+    return colour.typical_color(inside, weights)
+
+
+def _stops(what: str, editor: str) -> float:
+    try:
+        amount = float(what) if what else 0.875
+    except ValueError:
+        amount = math.nan
+    if not 0.0 < amount < 1.0:
+        raise ProgdfError(
+            f"{editor}:{what} is no share of the light; write a number between 0 and 1, as {editor}:0.7"
+        )
+    return -math.log2(1.0 - amount)

@@ -1,0 +1,87 @@
+"""What the optimiser minimises: L1, a perceptual term, and the clamp whose gradient is not lost.
+
+L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view; method.md 3 has the weights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+
+class _ClampTowards(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor, low: float, high: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.bounds = (low, high)  # type: ignore[attr-defined]
+        return x.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (x,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        low, high = ctx.bounds  # type: ignore[attr-defined]
+        # descent moves x against the gradient: below the range a negative one brings it back
+        useful = ((x >= low) | (gradient < 0)) & ((x <= high) | (gradient > 0))
+        return gradient * useful, None, None
+
+
+def clamp_towards(x: Tensor, low: float, high: float) -> Tensor:
+    """`x.clamp(low, high)` whose gradient also passes where descent would bring x back into the range.
+
+    A sixth of a trained scene's colours have a channel below 0; with the plain clamp they could never change.
+    """
+    clamped: Tensor = _ClampTowards.apply(x, low, high)  # type: ignore[no-untyped-call]
+    return clamped
+
+
+def l1(image: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute difference. [h,w,3], [h,w,3] -> []"""
+    return (image - target).abs().mean()
+
+
+class Perceptual(Protocol):
+    """A perceptual distance whose target side is computed once per key."""
+
+    name: str
+
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable) -> Tensor:
+        """[h,w,3], [h,w,3] in 0..1 -> []; `key` names the target, None caches nothing."""
+        ...
+
+    def forget(self) -> None:
+        """Drop what is cached for targets."""
+        ...
+
+
+class GradientL1:
+    """The stand-in where LPIPS weights are absent: L1 of the image gradients at full and half resolution."""
+
+    name = "gradient-l1"
+
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable) -> Tensor:
+        a, b = image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
+        total = image.new_zeros(())
+        for _ in range(2):
+            for axis in (2, 3):
+                total = total + (a.diff(dim=axis) - b.diff(dim=axis)).abs().mean()
+            if min(a.shape[2:]) < 4:
+                break
+            a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
+        return total
+
+    def forget(self) -> None:
+        """Nothing is cached."""
+
+
+def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
+    """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
+
+    The paper penalises every parameter's step with α·β^(t/s) (eq. 5), which freezes the edit at its weights;
+    what helps is that early steps are short (method.md 3, L_prog).
+    """
+    return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))

@@ -1,0 +1,210 @@
+"""The recorded trajectory of an edit: how every member moved, and at which slider value it was where.
+
+The slider is visible change, not time (method.md 3, recording): between two stages, whose strengths are
+pinned, equal steps of the slider change the pictures equally.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.files import open_failure, written_whole
+
+Slider = Literal["stages", "even", "time"]
+
+_FORMAT = "progdf-trajectory-1"
+_LEAST_GAP = 1e-4  # slider values of neighbouring recordings stay apart by this
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """S recordings of the members' offsets along the slider.
+
+    Args:
+        s: slider value of each recording, ascending, first 0, last 1. [S] float32
+        offsets: raw-space offsets, row 0 is zero, the last row equals `end` in half precision. [S,M,C]
+        float16 end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
+        steps: optimiser steps done at each recording. [S] int64
+        stage_ends: recording at which each stage ends, ascending, the last S − 1
+        strengths: the slider value that each stage's end is pinned to
+    """
+
+    s: Tensor
+    offsets: Tensor
+    end: Tensor
+    steps: Tensor
+    stage_ends: tuple[int, ...]
+    strengths: tuple[float, ...]
+
+    def __len__(self) -> int:
+        return int(self.s.shape[0])
+
+    def at(self, s: float) -> Tensor:
+        """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
+        if s >= 1.0:
+            return self.end
+        right = int(torch.searchsorted(self.s, torch.tensor(s, dtype=self.s.dtype), right=True))
+        right = min(max(right, 1), len(self) - 1)
+        low, high = float(self.s[right - 1]), float(self.s[right])
+        share = min(max((s - low) / (high - low), 0.0), 1.0)
+        return torch.lerp(self.node(right - 1), self.node(right), share)
+
+    def node(self, index: int) -> Tensor:
+        """Offsets of one recording. [M,C] float32"""
+        return self.end if index == len(self) - 1 else self.offsets[index].float()
+
+
+def record(
+    snapshots: Sequence[tuple[int, int, bool, Tensor]], end: Tensor, strengths: Sequence[float]
+) -> Trajectory:
+    """Build a trajectory, its slider values still even in time.
+
+    Args:
+        snapshots: (step, stage, ends_stage, offsets [M,C] float16) in order; the original is added before
+        them end: the last offsets in full precision. [M,C] float32
+        strengths: slider value of each stage's end
+    """
+    offsets = torch.stack([torch.zeros_like(snapshots[0][3]), *(offset for *_, offset in snapshots)])
+    steps = torch.tensor([0, *(step for step, *_ in snapshots)])
+    ends = tuple(i + 1 for i, (_, _, last, _) in enumerate(snapshots) if last)
+    s = steps.float() / float(steps[-1])
+    return Trajectory(s, offsets, end, steps, ends, tuple(strengths))
+
+
+def retime(
+    trajectory: Trajectory,
+    render: Callable[[Tensor], Tensor],
+    slider: Slider = "stages",
+    passes: int = 3,
+    samples: int = 12,
+) -> Trajectory:
+    """Give every recording the slider value at which its visible change is due.
+
+    The chord length between pictures is what counts: arc length summed over recordings would count jitter. Each pass
+    samples the trajectory at even slider values, measures the chords between the samples and stretches the
+    slider accordingly.
+
+    Args:
+        trajectory: recordings with any slider values
+        render: offsets [M,C] -> what is seen of them, any fixed shape
+        slider: "stages": even change between the stages' pinned strengths; "even": over the whole slider,
+            nothing pinned; "time": the optimiser's steps
+        passes: how often to repeat
+        samples: chords per pinned segment, at least
+    """
+    if slider == "time":
+        return replace(trajectory, s=_placed(0.0, 1.0, trajectory.steps.double()).float())
+    if slider == "stages":
+        knots, pins = [0, *trajectory.stage_ends], [0.0, *trajectory.strengths]
+    else:
+        knots, pins = [0, len(trajectory) - 1], [0.0, 1.0]
+    s = torch.zeros(len(trajectory), dtype=torch.float64)
+    chords = _chords([render(trajectory.node(i)) for i in range(len(trajectory))])
+    segments = [
+        (slice(a, b + 1), low, high)
+        for a, b, low, high in zip(knots, knots[1:], pins, pins[1:], strict=False)
+    ]
+    for nodes, low, high in segments:
+        s[nodes] = _placed(low, high, _cumulative(chords[nodes.start : nodes.stop - 1]))
+    for _ in range(passes - 1):
+        trajectory = replace(trajectory, s=s.float())
+        for nodes, low, high in segments:
+            count = max(samples, nodes.stop - nodes.start)
+            even = torch.linspace(low, high, count + 1, dtype=torch.float64)
+            progress = _cumulative(_chords([render(trajectory.at(float(x))) for x in even]))
+            s[nodes] = _placed(low, high, _interpolate(s[nodes], even, progress))
+    return replace(trajectory, s=s.float())
+
+
+def save_trajectory(
+    path: Path, trajectory: Trajectory, extra: Mapping[str, Tensor], about: Mapping[str, Any]
+) -> None:
+    """Write a trajectory with what a refit needs.
+
+    Args:
+        path: trajectory.safetensors
+        trajectory: what to save
+        extra: further tensors by name (members, score, cameras)
+        about: JSON values (scene, options, …)
+    """
+    tensors = {
+        "s": trajectory.s,
+        "offsets": trajectory.offsets,
+        "end": trajectory.end,
+        "steps": trajectory.steps,
+        "stage_ends": torch.tensor(trajectory.stage_ends),
+        "strengths": torch.tensor(trajectory.strengths, dtype=torch.float64),
+        **extra,
+    }
+    header = {"format": _FORMAT, "about": json.dumps(dict(about))}
+    with written_whole(path) as beside:
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, beside, metadata=header)
+
+
+def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_trajectory` wrote: trajectory, extra tensors, about.
+
+    Raises:
+        ProgdfError: the file is absent, damaged or something else.
+    """
+    try:
+        with safe_open(path, framework="pt") as opened:
+            header = opened.metadata() or {}
+            if header.get("format") != _FORMAT:
+                raise ProgdfError(f"{path} is no recorded trajectory; give a run folder of progdf train")
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # no dict
+    except OSError as error:
+        raise open_failure(path, error) from error
+    except SafetensorError as error:
+        raise ProgdfError(f"{path} is damaged ({error}); train again") from error
+    trajectory = Trajectory(
+        tensors.pop("s"),
+        tensors.pop("offsets"),
+        tensors.pop("end"),
+        tensors.pop("steps"),
+        tuple(tensors.pop("stage_ends").tolist()),
+        tuple(tensors.pop("strengths").tolist()),
+    )
+    return trajectory, tensors, json.loads(header["about"])
+
+
+def _chords(pictures: Sequence[Tensor]) -> Tensor:
+    """Mean absolute difference of neighbours. [n-1] float64"""
+    pairs = pairwise(pictures)
+    return torch.tensor([float((b - a).abs().mean()) for a, b in pairs], dtype=torch.float64)
+
+
+def _cumulative(lengths: Tensor) -> Tensor:
+    """0 … 1 along the lengths; even where all are 0. [n] -> [n+1]"""
+    total = float(lengths.sum())
+    lengths = lengths if total > 0 else torch.ones_like(lengths)
+    return torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / lengths.sum()])
+
+
+def _interpolate(x: Tensor, nodes: Tensor, values: Tensor) -> Tensor:
+    """Piecewise linear through (nodes, values). [n], [k], [k] -> [n]"""
+    right = torch.searchsorted(nodes, x).clamp(1, len(nodes) - 1)
+    share = (x - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
+    return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
+
+
+def _placed(low: float, high: float, progress: Tensor) -> Tensor:
+    """Slider values from `low` to `high`, both exact, strictly ascending as `progress` does. [n] -> [n] float64"""
+    gaps = progress.diff()
+    gaps = gaps / float(gaps.sum()) * (high - low)
+    gaps = gaps.clamp_min(min(_LEAST_GAP, 0.5 * (high - low) / len(gaps)))
+    rising = torch.cat([gaps.new_zeros(1), gaps.cumsum(0)])
+    placed = low + (high - low) * rising / rising[-1]
+    placed[-1] = high
+    return placed

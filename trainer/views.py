@@ -1,0 +1,208 @@
+"""The views an edit is trained on and judged by: where the cameras stand, where the region lies in each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, intrinsics, look_at, orbit_rig
+from progdf.errors import ProgdfError
+from progdf.framing import guess_up, scene_sphere
+from progdf.gaussians import Gaussians
+from progdf.rasterize import Crop, rasterize
+from progdf.region import Region
+from progdf.sh import shade
+
+MOST_VIEWS = 96
+"""As many views as the paper edits at most."""
+
+_LEAST_BOX = 64  # LPIPS needs that many pixels on each side
+_SEEN = 0.05  # a pixel shows the region where the members' weight is above this
+_LEAST_COVER = (
+    0.25  # a view that shows less than this share of what the median view shows of the region is dropped
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's picture of the original scene, and the region in it.
+
+    Args:
+        camera: the whole view; its name is the file name of its pictures
+        image: the original. [H,W,3] 0..1
+        mask: the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
+        inside: the colour of the members alone, unmixed from what shares a pixel with them; meaningless
+            where `mask` is 0. [H,W,3]
+        box: the pixels that an edit of the region can change, at least 64 each way where the image is that
+            large
+    """
+
+    camera: Camera
+    image: Tensor
+    mask: Tensor
+    inside: Tensor
+    box: Crop
+
+    def blended(self, edited_inside: Tensor) -> Tensor:
+        """The view with another colour in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]
+
+        Exact at soft edges: what shines through from behind or past the region stays what it was, so a border
+        neither bleeds nor keeps a rim.
+        """
+        change = torch.where(self.mask[..., None] > 1e-4, edited_inside - self.inside, 0.0)
+        return (self.image + self.mask[..., None] * change).clamp(0.0, 1.0)
+
+
+def crop(image: Tensor, box: Crop) -> Tensor:
+    """The pixels of a box. [H,W,...] -> [h,w,...]"""
+    x0, y0, x1, y1 = box
+    return image[y0:y1, x0:x1]
+
+
+def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:
+    """Render the original view and the region's share of it."""
+    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
+    colors = shade(min(scene.sh_degree, 3), directions, scene.sh)
+    member = torch.zeros(len(scene))
+    member[region.members] = 1.0
+
+    def draw(values: Tensor, behind: Tensor) -> Tensor:
+        image: Tensor = rasterize(
+            scene.means,
+            scene.quats,
+            scene.scales,
+            scene.opacities,
+            values,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            background=behind,
+        )[0]
+        return image
+
+    with torch.no_grad():
+        image = draw(colors, background).clamp(0.0, 1.0)
+        black = torch.zeros(3)
+        mask = draw(member[:, None].expand(-1, 3).contiguous(), black)[..., 0].clamp(0.0, 1.0)
+        premultiplied = draw(colors * member[:, None], black)
+    inside = (premultiplied / mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0)
+    return View(camera, image, mask, inside, region_box(mask))
+
+
+def region_box(mask: Tensor, margin: int = 6) -> Crop:
+    """The smallest box around the pixels that show the region, with a margin, grown to 64 pixels. [H,W]"""
+    height, width = mask.shape
+    shown = mask > 0.5 * _SEEN
+    if not bool(shown.any()):
+        return (0, 0, width, height)
+    spans = []
+    for axis, side in ((0, width), (1, height)):
+        hit = shown.any(dim=axis).nonzero()[:, 0]
+        low, high = int(hit[0]) - margin, int(hit[-1]) + 1 + margin
+        missing = _LEAST_BOX - (high - low)
+        if missing > 0:
+            low, high = low - (missing + 1) // 2, high + missing // 2
+        low, high = max(0, min(low, side - _LEAST_BOX)), min(side, max(high, _LEAST_BOX))
+        spans.append((low, high))
+    (x0, x1), (y0, y1) = spans
+    return (x0, y0, x1, y1)
+
+
+def region_rig(scene: Gaussians, region: Region, count: int, image_size: int) -> list[Camera]:
+    """The orbit rig of the scene, aimed at the region and zoomed in on it.
+
+    The cameras stand where those of the whole scene would, so nothing new comes between them and the region; every
+    other one lets the region fill about 80 % of the picture, the rest 50 %: a hand that is 3 % of the scene is
+    trained on as many pixels as the whole body.
+
+    Args:
+        scene: see `orbit_rig`
+        region: what they look at
+        count: how many, ≥ 1
+        image_size: both sides in pixels
+    """
+    up = guess_up(scene)
+    centre, radius = scene_sphere(scene[region.members])
+    radius += float(scene.scales[region.members].amax(dim=1).median())
+    cameras = []
+    for i, camera in enumerate(orbit_rig(scene, count, image_size, image_size, up=up)):
+        distance = float((camera.position - centre).norm())
+        share = 0.8 if i % 2 == 0 else 0.5
+        fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
+        aimed = look_at(camera.position, centre, up)
+        cameras.append(replace(camera, viewmat=aimed, K=intrinsics(fov, image_size, image_size)))
+    return cameras
+
+
+def choose_views(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int, background: Tensor
+) -> list[View]:
+    """Up to `count` of the cameras that see the region best spread around it.
+
+    A view that shows less than a quarter of what the median view shows of the region is left out (it is
+    hidden there, or outside the picture); of the others the farthest from those already taken comes next.
+
+    Raises:
+        ProgdfError: no camera sees the region.
+    """
+    views = [make_view(scene, region, camera, background) for camera in cameras]
+    cover = torch.tensor([float((view.mask > _SEEN).float().mean()) for view in views])
+    seen = cover[cover > 0]
+    if not len(seen):
+        raise ProgdfError(
+            f"none of the {len(views)} cameras sees the region '{region.name}'; give cameras that look at it"
+        )
+    good = [i for i in range(len(views)) if float(cover[i]) >= _LEAST_COVER * float(seen.median())]
+    if len(good) > count:
+        centre = scene.means[region.members].median(dim=0).values
+        eyes = torch.stack([views[i].camera.position - centre for i in good])
+        good = [good[k] for k in _spread(torch.nn.functional.normalize(eyes, dim=1), count)]
+    return [views[i] for i in good]
+
+
+def split_views(views: Sequence[View], held_out: int) -> tuple[list[View], list[View]]:
+    """Training views and held-out views, the latter evenly spaced through the list."""
+    held_out = min(held_out, len(views) // 3)
+    if held_out <= 0:
+        return list(views), list(views)
+    every = len(views) / held_out
+    chosen = {int((k + 0.5) * every) for k in range(held_out)}
+    train = [view for i, view in enumerate(views) if i not in chosen]
+    return train, [views[i] for i in sorted(chosen)]
+
+
+def fit_size(camera: Camera, image_size: int) -> Camera:
+    """The camera with its longer side at `image_size` pixels, never enlarged."""
+    scale = image_size / max(camera.width, camera.height)
+    if scale >= 1.0:
+        return camera
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def named(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras with names that are distinct and can be file names."""
+    taken: set[str] = set()
+    result = []
+    for i, camera in enumerate(cameras):
+        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name.rsplit("/", 1)[-1])
+        name = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg")) else name
+        if not name.strip("._") or name in taken:
+            name = f"view_{i:03d}"
+        taken.add(name)
+        result.append(replace(camera, name=name))
+    return result
+
+
+def _spread(directions: Tensor, count: int) -> list[int]:
+    """Farthest-point sampling of unit vectors, in the order of the list. [n,3] -> indices"""
+    taken = [0]
+    nearest = (directions - directions[0]).norm(dim=1)
+    while len(taken) < count:
+        taken.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, (directions - directions[taken[-1]]).norm(dim=1))
+    return sorted(taken)
