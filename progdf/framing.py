@@ -23,18 +23,23 @@ _GROUND_HALF_THICKNESS = 0.08
 _LONG_TAIL = 5.0
 _CEILING_COVER = 0.5
 _LEAST_CELLS = 16
+_ENOUGH = 64
+"""Fewer Gaussians tell nothing about the shape of a scene."""
 
 
 def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
     """Centre [3] and radius (> 0) of the bulk of a scene, world units.
 
-    The median of the means, and the distance within which 97 % of them lie: far strays do not count.
+    The median of the means, and the distance within which 97 % of them lie: far strays do not count. A scene of
+    one or a few Gaussians is as large as these are: twice the median of their longest axes at least.
     """
-    means = _sample(scene).means
+    scene = _sample(scene)
+    means = scene.means
     centre = means.median(dim=0).values
     distances = (means - centre).norm(dim=1)
     nearest = max(round(0.97 * len(means)), 1)
-    return centre, max(float(distances.kthvalue(nearest).values), 1e-6)
+    size = 2 * float(scene.log_scales.amax(dim=1).median().exp())
+    return centre, max(float(distances.kthvalue(nearest).values), size, 1e-6)
 
 
 def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
@@ -92,8 +97,8 @@ def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
     sample = _sample(scene)
     centre, radius = scene_sphere(sample)
     offsets = sample.means - centre
-    if radius > _LONG_TAIL * float(offsets.norm(dim=1).median().clamp_min(1e-12)):
-        return True
+    if len(sample) < _ENOUGH or radius > _LONG_TAIL * float(offsets.norm(dim=1).median()):
+        return len(sample) >= _ENOUGH
     ahead = front(up)
     plan = offsets @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     height = offsets @ up

@@ -72,7 +72,7 @@ class LoadReport:
             (self.transparent, "with an opacity of −inf, made finite and just as invisible"),
             (self.zero_quats, "with a zero quaternion, taken as no rotation"),
         )
-        return tuple(f"{_rows(rows)} {what}" for rows, what in phrases if rows)
+        return tuple(f"{counted(rows)} {what}" for rows, what in phrases if rows)
 
     @property
     def ignored(self) -> tuple[str, ...]:
@@ -91,16 +91,18 @@ class LoadReport:
         if self.sh_degree == 4:
             sh += " (band 4 is kept, and not shown)"
         lines = [
-            f"{self.file}: {_rows(self.count)}, {sh}, {self.format}, {_size(self.file_bytes)}",
-            *(f"repaired: {phrase}" for phrase in self.repairs),
+            f"{self.file}: {counted(self.count)}, {sh}, {self.format}, {_size(self.file_bytes)}",
             *(f"ignored: {phrase}" for phrase in self.ignored),
         ]
         if self.scaled_quats:
-            lines.append(f"normalised: {_rows(self.scaled_quats)} had a quaternion of another length than 1")
-        return lines
+            lines.append(
+                f"normalised: {counted(self.scaled_quats)} had a quaternion that was not of unit length"
+            )
+        return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]
 
 
-def _rows(count: int) -> str:
+def counted(count: int) -> str:
+    """1 as "1 Gaussian", 12345 as "12 345 Gaussians"."""
     return f"{_n(count)} Gaussian{'' if count == 1 else 's'}"
 
 
