@@ -1,1 +1,208 @@
-"""The differentiable rasteriser: one signature, three engines."""
+"""The differentiable rasteriser: one signature, several engines.
+
+`reference` is plain torch, slow, in any floating type: the oracle. `cpu` is numba, fast, with an analytic backward.
+The conventions both follow are in `conventions.py`; beyond those numbers:
+
+- the support of a Gaussian is exactly {alpha ≥ 1/255}, whatever the tile size;
+- the near plane cuts at camera z > `near`; order is camera z in float32, ties by index;
+- pixel centres lie at column + 0.5, row + 0.5;
+- a Gaussian with a number that is not finite is not drawn; a quaternion that is zero or not finite is the identity.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.rasterize.conventions import RasterInfo
+from progdf.rasterize.threads import set_threads
+
+__all__ = ["ENGINES", "Crop", "RasterInfo", "alpha_weights", "rasterize", "render", "set_threads"]
+
+Crop = tuple[int, int, int, int]
+"""A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
+
+ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu"}
+"""Engine name -> module with `rasterize` and `alpha_weights`, imported when first used."""
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | Sequence[float] | None = None,
+    near: float = 0.01,
+    sh_degree: int | None = None,
+    antialiased: bool = False,
+    engine: str = "cpu",
+    crop: Crop | None = None,
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """Draw Gaussians in activated units (Kerbl et al. 2023), differentiable in every floating input.
+
+    Args:
+        means: centres, world units. [N,3]
+        quats: rotations wxyz, any nonzero length. [N,4]
+        scales: standard deviations, world units, ≥ 0. [N,3]
+        opacities: 0..1. [N]
+        colors: rgb [N,3], or with `sh_degree` spherical-harmonic coefficients [N,≥(d+1)²,3]
+        viewmat: world → camera, OpenCV axes, orthonormal rotation. [4,4]
+        K: intrinsics in pixels; no skew. [3,3]
+        width, height: size of the full image in pixels
+        background: rgb behind everything, None is black. [3]
+        near: camera z below and at which nothing is drawn, world units
+        sh_degree: 0..3; None where `colors` is rgb
+        antialiased: scale opacities by sqrt(det/dilated det) of the 2D covariance (Mip-Splatting)
+        engine: a key of `ENGINES`; "cpu" computes in float32 (projection in float64) whatever the inputs' type
+        crop: draw only this window, with the full image's conventions; equals the slice of the full image bit for
+            bit. Gaussians that do not touch it cost next to nothing
+
+    Returns:
+        image [H,W,3], transmittance [H,W] (of the window where there is a crop), and what the projection found.
+
+    Raises:
+        ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown.
+        ProgdfError: more (Gaussian, tile) pairs than memory should hold.
+    """
+    _check_shapes(means, quats, scales, opacities, colors, viewmat, K, sh_degree)
+    window = _checked_crop(crop, width, height)
+    if background is None:
+        background = means.new_zeros(3)
+    elif not isinstance(background, Tensor):
+        background = torch.tensor(background, dtype=means.dtype)
+    if tuple(background.shape) != (3,):
+        raise ValueError(f"background has shape {list(background.shape)}, expected [3]")
+    image, transmittance, info = _engine(engine).rasterize(
+        means, quats, scales, opacities, colors, viewmat, K, width, height,
+        background, near, sh_degree, antialiased, window,
+    )  # fmt: skip
+    return image, transmittance, info
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | Sequence[float] = (1.0, 1.0, 1.0),
+    engine: str = "cpu",
+    antialiased: bool = False,
+    crop: Crop | None = None,
+) -> Tensor:
+    """Draw a scene of raw Gaussians; bands of spherical harmonics above 3 are not shown.
+
+    Returns:
+        image [H,W,3] float32 in 0..1 as far as the colours are (of the window where there is a `crop`)
+    """
+    degree = min(gaussians.sh_degree, 3)
+    image, _, _ = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        camera.viewmat,
+        camera.K,
+        camera.width,
+        camera.height,
+        background,
+        sh_degree=degree,
+        antialiased=antialiased,
+        engine=engine,
+        crop=crop,
+    )
+    return image.float()
+
+
+def alpha_weights(
+    gaussians: Gaussians, camera: Camera, mask: Tensor, engine: str = "cpu", near: float = 0.01
+) -> Tensor:
+    """What each Gaussian contributes to a view, inside a mask and in all (for lifting masks, method.md 4).
+
+    Args:
+        gaussians: raw parameters
+        camera: the view
+        mask: 0..1 or bool, of the camera's size. [H,W]
+        engine: a key of `ENGINES`
+        near: as in `rasterize`
+
+    Returns:
+        Σ w·m, Σ m, Σ w and n over the pixels that the Gaussian contributes to; w = αT. [N,4]; no gradients
+    """
+    if tuple(mask.shape) != (camera.height, camera.width):
+        raise ValueError(f"mask has shape {list(mask.shape)}, expected [{camera.height}, {camera.width}]")
+    with torch.no_grad():
+        weights: Tensor = _engine(engine).alpha_weights(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            camera.viewmat,
+            camera.K,
+            mask,
+            near,
+        )
+    return weights
+
+
+def _engine(name: str) -> ModuleType:
+    if name not in ENGINES:
+        raise ValueError(f"there is no rasteriser '{name}', expected one of {', '.join(ENGINES)}")
+    return importlib.import_module(ENGINES[name])
+
+
+def _check_shapes(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    sh_degree: int | None,
+) -> None:
+    n = means.shape[0] if means.ndim else 0
+    expected = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "viewmat": (viewmat, (4, 4)),
+        "K": (K, (3, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(
+                f"{name} has shape {list(tensor.shape)}, expected {list(shape)} (N={n} from means)"
+            )
+    if sh_degree is None:
+        if tuple(colors.shape) != (n, 3):
+            raise ValueError(f"colors has shape {list(colors.shape)}, expected [{n}, 3] (rgb)")
+        return
+    if not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree is {sh_degree}, expected 0 to 3")
+    bands = (sh_degree + 1) ** 2
+    if colors.ndim != 3 or colors.shape[0] != n or colors.shape[1] < bands or colors.shape[2] != 3:
+        raise ValueError(
+            f"colors has shape {list(colors.shape)}, expected [{n}, ≥{bands}, 3] for SH degree {sh_degree}"
+        )
+
+
+def _checked_crop(crop: Crop | None, width: int, height: int) -> Crop:
+    if width < 1 or height < 1:
+        raise ValueError(f"the image is {width}x{height} pixels; both must be at least 1")
+    if crop is None:
+        return (0, 0, width, height)
+    x0, y0, x1, y1 = (int(value) for value in crop)
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+        raise ValueError(f"crop {(x0, y0, x1, y1)} is empty or leaves the image of {width}x{height} pixels")
+    return (x0, y0, x1, y1)

@@ -1,0 +1,40 @@
+"""What every engine agrees on: the numbers that make a picture match scenes trained elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+DILATION = 0.3
+"""Added to the diagonal of the 2D covariance, px² (Kerbl 2023, gsplat)."""
+
+ALPHA_MAX = 0.99
+"""Alpha is clamped here; where it is, its gradient is zero (Kerbl 2023)."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""A Gaussian contributes to a pixel exactly where its alpha is at least this."""
+
+TRANSMITTANCE_MIN = 1e-4
+"""A Gaussian that would bring the transmittance to this or below is left out, and the pixel is done."""
+
+FRUSTUM_MARGIN = 0.3
+"""x/z and y/z in the Jacobian are clamped to the frustum plus this share of tan(fov/2) on each side (gsplat)."""
+
+ANTIALIAS_FLOOR = 0.005
+"""Least det(before dilation) / det(after) that the antialias option takes the root of."""
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """What the projection found, not differentiable.
+
+    Args:
+        means2d: centres in pixels; 0 for a Gaussian that is not in front of the near plane or not finite. [N,2]
+        depths: camera z, world units; 0 likewise. [N] float32
+        visible: the box around its {alpha ≥ 1/255} touches the window that was rendered. [N] bool
+    """
+
+    means2d: Tensor
+    depths: Tensor
+    visible: Tensor

@@ -1,0 +1,232 @@
+"""The fast engine: numba kernels behind one `torch.autograd.Function`.
+
+Projection is computed in float64, pixels in float32, whatever the type of the inputs; results are float32. The picture
+and the gradients are the same bits in every run and for every number of threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.rasterize import binning, projection, weights
+from progdf.rasterize.binning import TILE_H, TILE_W
+from progdf.rasterize.blend import blend
+from progdf.rasterize.blend_backward import SUMS, unblend
+from progdf.rasterize.conventions import RasterInfo
+from progdf.rasterize.jit import running
+from progdf.rasterize.projection_backward import CAMERA, PARTS, project_backward
+
+Array = NDArray[Any]
+
+MOST_INTERSECTIONS = 100_000_000
+"""(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """The camera as the kernels want it."""
+
+    viewmat: Array
+    intrinsics: Array
+    size: Array
+    window: Array
+    grid: Array
+    near: float
+    degree: int
+    antialiased: bool
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """What a forward pass found out, kept for the backward pass; see `projection` and `binning` for the layouts."""
+
+    ids: Array
+    splats: Array
+    rgb: Array
+    tile_starts: Array
+    members: Array
+    slots: Array
+    per_splat: Array
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    background: Tensor,
+    near: float,
+    sh_degree: int | None,
+    antialiased: bool,
+    crop: tuple[int, int, int, int],
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """See `progdf.rasterize.rasterize`."""
+    view = _view(viewmat, K, width, height, near, sh_degree, antialiased, crop)
+    inputs = [_float32(t) for t in (means, quats, scales, opacities, colors, background)]
+    image, transmittance, centres, depths, visible = _Rasterize.apply(view, *inputs, viewmat, K)
+    return image, transmittance, RasterInfo(centres, depths, visible)
+
+
+def alpha_weights(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    mask: Tensor,
+    near: float,
+) -> Tensor:
+    """See `progdf.rasterize.alpha_weights`; activated units."""
+    height, width = mask.shape
+    view = _view(viewmat, K, width, height, near, None, False, (0, 0, width, height))
+    gaussians = [_float32(tensor).detach().numpy() for tensor in (means, quats, scales, opacities)]
+    gaussians.append(np.zeros((len(means), 1, 3), np.float32))
+    totals = np.zeros((len(means), weights.SUMS))
+    with running("weights", 8) as workers:
+        lists, _ = _list_splats(view, gaussians, workers, for_gradients=True)
+        sums = np.zeros((len(lists.members), weights.SUMS))
+        weights.weigh(
+            lists.splats, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
+            _float32(mask).numpy(), workers, sums,
+        )  # fmt: skip
+        weights.gather(lists.ids, lists.per_splat, sums, totals)
+    return torch.from_numpy(totals.astype(np.float32))
+
+
+def _view(
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    sh_degree: int | None,
+    antialiased: bool,
+    crop: tuple[int, int, int, int],
+) -> _View:
+    k = K.detach().cpu().double()
+    x0, y0, x1, y1 = crop
+    column, row = x0 // TILE_W, y0 // TILE_H
+    return _View(
+        viewmat=np.ascontiguousarray(viewmat.detach().cpu().double().numpy()),
+        intrinsics=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+        size=np.array([width, height], np.int64),
+        window=np.array(crop, np.int64),
+        grid=np.array([column, row, -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row], np.int64),
+        near=float(near),
+        degree=-1 if sh_degree is None else sh_degree,
+        antialiased=antialiased,
+    )
+
+
+def _float32(tensor: Tensor) -> Tensor:
+    return tensor.to("cpu", torch.float32).contiguous()
+
+
+def _list_splats(
+    view: _View, gaussians: list[Array], workers: int, for_gradients: bool
+) -> tuple[_Lists, list[Array]]:
+    """Project, sort and bin; also the centres, depths and visibility of all Gaussians."""
+    means, quats, scales, opacities, colors = gaussians
+    n = len(means)
+    centres, depths, candidates = np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_)
+    projection.cull(
+        means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
+        centres, depths, candidates,
+    )  # fmt: skip
+    ids = binning.depth_order(depths, candidates, workers)
+    splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
+    visible = np.zeros(n, np.bool_)
+    projection.project(
+        ids, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
+        view.window, view.antialiased, splats, rgb, visible,
+    )  # fmt: skip
+    tiles = int(view.grid[2] * view.grid[3])
+    counts, per_splat = np.empty((workers, tiles), np.int64), np.empty(len(ids) + 1, np.int64)
+    binning.count_tiles(splats, view.window, view.grid, counts, per_splat)
+    tile_starts = np.empty(tiles + 1, np.int64)
+    total = binning.place_tiles(counts, tile_starts, per_splat)
+    if total > MOST_INTERSECTIONS:
+        raise ProgdfError(
+            f"{len(ids)} Gaussians meet {total} tiles of the image, more than {MOST_INTERSECTIONS}; "
+            "draw a smaller image or a crop, or take giant Gaussians out of the scene"
+        )
+    members = np.empty(total, np.int32)
+    slots = np.empty(total if for_gradients else 0, np.int64)
+    binning.fill_tiles(splats, view.window, view.grid, counts, per_splat, members, slots)
+    return _Lists(ids, splats, rgb, tile_starts, members, slots, per_splat), [centres, depths, visible]
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, view: _View, *tensors: Tensor) -> tuple[Tensor, ...]:
+        arrays = [tensor.detach().numpy() for tensor in tensors[:6]]
+        *gaussians, background = arrays
+        if view.degree < 0:
+            gaussians[4] = gaussians[4].reshape(-1, 1, 3)
+        x0, y0, x1, y1 = view.window
+        image = np.empty((y1 - y0, x1 - x0, 3), np.float32)
+        transmittance, last = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
+        with running("forward", 15) as workers:
+            lists, found = _list_splats(view, gaussians, workers, any(ctx.needs_input_grad))
+            blend(
+                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, background, workers,
+                image, transmittance, last,
+            )  # fmt: skip
+        results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
+        ctx.mark_non_differentiable(*results[2:])
+        ctx.view, ctx.lists, ctx.last = view, lists, last
+        ctx.save_for_backward(*tensors, results[1])
+        return results
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        view, lists = ctx.view, ctx.lists
+        *tensors, saved_transmittance = ctx.saved_tensors
+        *gaussians, background = [tensor.detach().numpy() for tensor in tensors[:6]]
+        shapes = [array.shape for array in gaussians]
+        if view.degree < 0:
+            gaussians[4] = gaussians[4].reshape(-1, 1, 3)
+        transmittance = saved_transmittance.numpy()
+        grad_image, grad_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads[:2])
+        sums = np.empty((len(lists.members), SUMS), np.float32)
+        gradients = [np.zeros(array.shape, np.float32) for array in gaussians]
+        grad_camera = np.empty((PARTS, CAMERA))
+        with running("backward", 10) as workers:
+            unblend(
+                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
+                background, workers, transmittance, ctx.last, grad_image, grad_transmittance, sums,
+            )  # fmt: skip
+            project_backward(
+                lists.ids, *gaussians, view.degree, view.viewmat, view.intrinsics, view.size, view.antialiased,
+                lists.splats, lists.per_splat, sums, *gradients, grad_camera,
+            )  # fmt: skip
+        results: list[Tensor | None] = [
+            torch.from_numpy(array.reshape(shape)) for array, shape in zip(gradients, shapes, strict=True)
+        ]
+        needs = ctx.needs_input_grad[6:]
+        results.append(_background_gradient(transmittance, grad_image) if needs[0] else None)
+        camera = torch.from_numpy(grad_camera.sum(axis=0))
+        viewmat, K = tensors[6:]
+        grad_viewmat, grad_K = torch.zeros(4, 4, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+        grad_viewmat[:3] = camera[:12].reshape(3, 4)
+        grad_K[0, 0], grad_K[1, 1], grad_K[0, 2], grad_K[1, 2] = camera[12:]
+        return None, *results, grad_viewmat.to(viewmat), grad_K.to(K)
+
+
+def _background_gradient(transmittance: Array, grad_image: Array) -> Tensor:
+    per_channel = (grad_image * transmittance[..., None]).astype(np.float64).sum(axis=(0, 1))
+    return torch.from_numpy(per_channel.astype(np.float32))

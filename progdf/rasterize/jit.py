@@ -1,0 +1,119 @@
+"""How the kernels are compiled: flags, the cache on disk, the message of a cold start, the lock."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba import config
+
+from progdf.rasterize.threads import threads
+
+log = logging.getLogger("progdf")
+
+FAST = {"nnan", "ninf", "nsz", "contract", "reassoc", "afn"}
+"""Float flags of the pixel loops: all but `arcp`, which costs a factor of 10 in gradient accuracy and buys nothing."""
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+_lock = threading.RLock()
+
+
+def _source_version() -> str:
+    """Of all files here: numba's own cache notices neither changed constants nor changed imported functions."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """A folder of this user's that can be written, for this version of the kernels; never in the source tree."""
+    if "NUMBA_CACHE_DIR" in os.environ:
+        root = Path(os.environ["NUMBA_CACHE_DIR"])
+    elif sys.platform == "win32":
+        root = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "progdf" / "kernels"
+    elif sys.platform == "darwin":
+        root = Path.home() / "Library" / "Caches" / "progdf" / "kernels"
+    else:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "progdf" / "kernels"
+    folder = root / _source_version()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        log.warning("%s cannot be written; the kernels are compiled anew in every process", folder)
+        return Path(tempfile.mkdtemp(prefix="progdf-kernels-"))
+
+
+CACHE = _cache_folder()
+
+
+def kernel(
+    *, fast: bool = False, parallel: bool = False, cache: bool = False, inline: bool = False
+) -> Callable[[_F], _F]:
+    """Compile a function with numba.
+
+    Args:
+        fast: with the flags of the pixel loops (`FAST`); otherwise strict IEEE
+        parallel: `prange` runs on several threads
+        cache: keep the machine code on disk; for functions that Python calls
+        inline: always inline into the calling kernel
+    """
+
+    def decorate(function: _F) -> _F:
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(
+            CACHE
+        )  # read when the decorator runs; other packages' caches stay where they are
+        try:
+            compiled: _F = numba.njit(
+                fastmath=FAST if fast else False,
+                parallel=parallel,
+                cache=cache,
+                nogil=True,
+                error_model="numpy",
+                forceinline=inline,
+            )(function)
+        finally:
+            config.CACHE_DIR = before
+        return compiled
+
+    return decorate
+
+
+@contextmanager
+def running(stage: str, seconds: int) -> Iterator[int]:
+    """Hold the kernels for one call and give the number of threads to use.
+
+    numba's `workqueue` layer aborts when two Python threads launch kernels at once, so one waits for the other.
+
+    Args:
+        stage: names the kernels that will run, to tell a cold start from a warm one
+        seconds: about how long these take to compile
+    """
+    marker = CACHE / f"{stage}.ready"
+    with _lock:
+        cold = not marker.exists()
+        if cold:
+            log.warning(
+                "compiling the rasteriser's %s kernels (about %d s, once per machine)", stage, seconds
+            )
+        before = numba.get_num_threads()
+        count = max(1, min(threads(), config.NUMBA_NUM_THREADS))
+        numba.set_num_threads(count)
+        try:
+            yield count
+        finally:
+            numba.set_num_threads(before)
+        if cold:
+            marker.touch()

@@ -1,0 +1,229 @@
+"""The rasteriser in plain torch: any floating type, differentiable in everything, the oracle of the tests.
+
+Conventions: Kerbl et al. 2023 (3D Gaussian Splatting) with the choices listed in `progdf.rasterize`. Tiles of
+16x16 pixels bound the memory; within a tile every Gaussian meets every pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import normalize_quats
+from progdf.rasterize.conventions import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    ANTIALIAS_FLOOR,
+    DILATION,
+    FRUSTUM_MARGIN,
+    TRANSMITTANCE_MIN,
+    RasterInfo,
+)
+from progdf.sh import shade
+
+TILE = 16
+
+
+@dataclass(frozen=True)
+class Splats:
+    """The V Gaussians that a window shows, nearest first.
+
+    Args:
+        rows: their indices. [V] int64
+        means2d: centres in pixels. [V,2]
+        whitening: L with σ = ½|Lᵀd|² for a pixel offset d: l11, l21, l22. [V,3]
+        opacities: activated, antialias included. [V]
+        colors: rgb. [V,3]
+        extents: half sides of the box around {alpha ≥ 1/255}, pixels. [V,2]
+    """
+
+    rows: Tensor
+    means2d: Tensor
+    whitening: Tensor
+    opacities: Tensor
+    colors: Tensor
+    extents: Tensor
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    background: Tensor,
+    near: float,
+    sh_degree: int | None,
+    antialiased: bool,
+    crop: tuple[int, int, int, int],
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """See `progdf.rasterize.rasterize`; everything is computed in the type of `means`, projection in float64."""
+    splats, info = project(
+        means, quats, scales, opacities, colors, viewmat, K, width, height, near, sh_degree, antialiased, crop
+    )
+    x0, y0, x1, y1 = crop
+    left, top = x0 // TILE * TILE, y0 // TILE * TILE
+    bands = []
+    for y in range(top, y1, TILE):
+        tiles = []
+        for x in range(left, x1, TILE):
+            _, weights, transmittance, members = tile_weights(splats, x, y)
+            rgb = weights @ splats.colors[members]
+            tiles.append(torch.cat([rgb, transmittance[:, None]], dim=1).reshape(TILE, TILE, 4))
+        bands.append(torch.cat(tiles, dim=1))
+    window = torch.cat(bands, dim=0)[y0 - top : y1 - top, x0 - left : x1 - left]
+    transmittance = window[..., 3]
+    return window[..., :3] + transmittance[..., None] * background.to(means.dtype), transmittance, info
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    sh_degree: int | None,
+    antialiased: bool,
+    crop: tuple[int, int, int, int],
+) -> tuple[Splats, RasterInfo]:
+    """Project, cull and sort; arguments as in `rasterize`."""
+    dtype = means.dtype
+    means, quats, scales, opacities, colors, viewmat, K = (
+        tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K)
+    )
+    used = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
+    usable = means.isfinite().all(1) & scales.isfinite().all(1) & used.isfinite().flatten(1).all(1)
+    usable = usable & opacities.isfinite() & (opacities >= ALPHA_MIN)
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    rows = usable.nonzero()[:, 0]
+    points = means[rows] @ rotation.T + translation
+    front = points[:, 2] > near
+    rows = rows[front]
+    x, y, z = points[front].unbind(1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
+
+    # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+    tan_x = torch.clamp(x / z, -(cx / fx + margin_x), (width - cx) / fx + margin_x)
+    tan_y = torch.clamp(y / z, -(cy / fy + margin_y), (height - cy) / fy + margin_y)
+    axes = rotation_matrices(normalize_quats(quats[rows])) * scales[rows, None, :]
+    p0 = ((fx / z)[:, None] * (rotation[0] - tan_x[:, None] * rotation[2]))[:, None] @ axes
+    p1 = ((fy / z)[:, None] * (rotation[1] - tan_y[:, None] * rotation[2]))[:, None] @ axes
+    p0, p1 = p0[:, 0], p1[:, 0]
+    a, b, c = (p0 * p0).sum(1), (p0 * p1).sum(1), (p1 * p1).sum(1)
+    # ac − b² cancels for needles; the cross product does not
+    det0 = torch.linalg.cross(p0, p1).square().sum(1)
+    det = det0 + DILATION * (a + c) + DILATION**2
+    opacity = opacities[rows]
+    if antialiased:
+        opacity = opacity * (det0 / det).clamp_min(ANTIALIAS_FLOOR).sqrt()
+    whitening = torch.stack(
+        [((c + DILATION) / det).sqrt(), -b / (det * (c + DILATION)).sqrt(), (c + DILATION).rsqrt()], dim=1
+    )
+
+    reach = (2.0 * torch.log(opacity.detach() / ALPHA_MIN).clamp_min(0.0)).sqrt()
+    extents = reach[:, None] * torch.stack([a + DILATION, c + DILATION], dim=1).detach().sqrt()
+    low, high = (means2d - extents).detach(), (means2d + extents).detach()
+    x0, y0, x1, y1 = crop
+    shown = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
+    shown = shown & (opacity.detach() >= ALPHA_MIN)
+    depths = torch.zeros_like(opacities).index_copy(0, rows, z).detach().float()
+    # float32 depth, ties by index: what a viewer can sort by, and the same in every engine
+    order = z.detach().float().argsort(stable=True)
+    order = order[shown[order]]
+    if sh_degree is None:
+        rgb = colors[rows[order]]
+    else:
+        eye = -rotation.T @ translation
+        direction = torch.nn.functional.normalize(means[rows[order]] - eye, dim=1, eps=1e-300)
+        rgb = shade(sh_degree, direction, colors[rows[order]])
+    splats = Splats(
+        rows[order],
+        means2d[order].to(dtype),
+        whitening[order].to(dtype),
+        opacity[order].to(dtype),
+        rgb.to(dtype),
+        extents[order].to(dtype),
+    )
+    visible = torch.zeros(len(means), dtype=torch.bool).index_fill(0, splats.rows, True)
+    centres = torch.zeros_like(means[:, :2]).index_copy(0, rows, means2d).detach().float()
+    return splats, RasterInfo(centres, depths, visible)
+
+
+def tile_weights(splats: Splats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Alphas and blending weights of one 16x16 tile whose first pixel is (x, y).
+
+    Returns:
+        alphas of the Gaussians that contribute, else 0 [256,n]; weights αT [256,n]; final transmittance [256];
+        the n rows of `splats` that may touch the tile, nearest first [n] int64
+    """
+    low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
+    near_x = (high[:, 0] >= x) & (low[:, 0] <= x + TILE)
+    near_y = (high[:, 1] >= y) & (low[:, 1] <= y + TILE)
+    members = (near_x & near_y).nonzero()[:, 0]
+    centre = torch.arange(TILE, dtype=splats.means2d.dtype) + 0.5
+    pixels = torch.cartesian_prod(y + centre, x + centre).flip(1)
+    dx, dy = (pixels[:, None] - splats.means2d[members]).unbind(2)
+    l11, l21, l22 = splats.whitening[members].unbind(1)
+    raw = splats.opacities[members] * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))
+    alphas = torch.where(raw >= ALPHA_MIN, raw.clamp_max(ALPHA_MAX), 0.0)
+    after = torch.cumprod(1.0 - alphas, dim=1)
+    alphas = torch.where(after > TRANSMITTANCE_MIN, alphas, 0.0)  # and none after it: `after` only falls
+    after = torch.cumprod(1.0 - alphas, dim=1)
+    before = torch.cat([after.new_ones(len(after), 1), after], dim=1)
+    return alphas, alphas * before[:, :-1], before[:, -1], members
+
+
+def alpha_weights(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    mask: Tensor,
+    near: float,
+) -> Tensor:
+    """See `progdf.rasterize.alpha_weights`; activated units."""
+    height, width = mask.shape
+    window = (0, 0, width, height)
+    splats, _ = project(
+        means, quats, scales, opacities, means.new_zeros(len(means), 3), viewmat, K, width, height, near, None, False, window
+    )  # fmt: skip
+    # two channels, zero beyond the image's edge: the mask, and what is image at all
+    inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])
+    inside = torch.nn.functional.pad(inside, (0, -width % TILE, 0, -height % TILE))
+    totals = means.new_zeros(len(means), 4)
+    for y in range(0, height, TILE):
+        for x in range(0, width, TILE):
+            alphas, weights, _, members = tile_weights(splats, x, y)
+            tile = inside[:, y : y + TILE, x : x + TILE].reshape(2, -1)
+            touched = (alphas > 0).to(means.dtype)
+            sums = torch.stack(
+                [tile[0] @ weights, tile[0] @ touched, tile[1] @ weights, tile[1] @ touched], dim=1
+            )
+            totals.index_add_(0, splats.rows[members], sums)
+    return totals
+
+
+def rotation_matrices(unit_quats: Tensor) -> Tensor:
+    """Rotation matrices of unit quaternions wxyz. [N,4] -> [N,3,3]"""
+    w, x, y, z = unit_quats.unbind(1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, dim=1).reshape(-1, 3, 3)

@@ -1,0 +1,80 @@
+"""Kernel: how much each splat contributes to a view, inside a mask and in all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
+from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
+from progdf.rasterize.jit import kernel
+from progdf.rasterize.pixels import LOG2_ALPHA_MIN, exp2, row_support
+from progdf.rasterize.projection import L11, R2
+
+Array = NDArray[Any]
+
+SUMS = 4
+"""Numbers of one intersection: Σ w·m, Σ m, Σ w, n."""
+
+_ALPHA_MAX = np.float32(ALPHA_MAX)
+_T_MIN = np.float32(TRANSMITTANCE_MIN)
+_ONE = np.float32(1.0)
+
+
+@kernel(parallel=True, cache=True)
+def weigh(
+    splats: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array, mask: Array,
+    workers: int, sums: Array,
+) -> None:  # fmt: skip
+    """Add up the weights of every (splat, tile) intersection; the first arguments as in `blend.blend`.
+
+    Args:
+        slots: row of `sums` that belongs to each entry of `members`. [I] int64
+        mask: of the full image. [H,W] float32
+        sums: out, zero on entry. [I,4] float64
+    """
+    tiles = tile_starts.size - 1
+    for worker in prange(workers):
+        state = np.empty(TILE_H * TILE_W, np.float32)
+        for tile in range(worker, tiles, workers):
+            x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
+            state[:] = _ONE
+            left, right = max(0, window[0] - x), min(TILE_W, window[2] - x)
+            for place in range(tile_starts[tile], tile_starts[tile + 1]):
+                splat = splats[members[place]]
+                out = sums[slots[place]]
+                first, end = row_bounds(splat, window)
+                for row in range(max(first, y), min(end, y + TILE_H)):
+                    start, stop, peak, u_peak, v = row_support(splat, x, row, left, right)
+                    top = np.float32(splat[R2] + LOG2_ALPHA_MIN - v * v)
+                    for j in range(start, stop):
+                        p = (row - y) * TILE_W + j
+                        u = np.float32(u_peak) + np.float32(splat[L11]) * (np.float32(j) - np.float32(peak))
+                        alpha = min(_ALPHA_MAX, exp2(top - u * u))
+                        before = state[p]
+                        after = before * (_ONE - alpha)
+                        if after > _T_MIN:
+                            weight = alpha * before
+                            m = mask[row, x + j]
+                            state[p] = after
+                            out[0] += weight * m
+                            out[1] += m
+                            out[2] += weight
+                            out[3] += 1.0
+                        else:
+                            state[p] = -abs(before)
+
+
+@kernel(parallel=True, cache=True)
+def gather(ids: Array, per_splat: Array, sums: Array, totals: Array) -> None:
+    """Add up each splat's intersections in their fixed order. totals: out, [N,4] float64, zero on entry"""
+    chunk = 256
+    count = ids.size
+    for part in prange((count + chunk - 1) // chunk):
+        for s in range(part * chunk, min(count, (part + 1) * chunk)):
+            for slot in range(per_splat[s], per_splat[s + 1]):
+                for k in range(SUMS):
+                    totals[ids[s], k] += sums[slot, k]

@@ -1,0 +1,209 @@
+"""Builders of the scenes that tests share: random ones, and the hard cases that every engine must survive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.gaussians import Gaussians
+
+
+def random_gaussians(
+    count: int, seed: int = 0, sh_degree: int = 0, spread: float = 1.0, scale: float = 0.05
+) -> Gaussians:
+    """A cloud around the origin.
+
+    Args:
+        count: N
+        seed: the same seed gives the same cloud
+        sh_degree: 0..3
+        spread: standard deviation of the centres, world units
+        scale: median standard deviation of one Gaussian, world units; axes differ by a factor of about 2
+    """
+    rng = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=rng)
+
+    return Gaussians(
+        means=normal(count, 3) * spread,
+        quats=normal(count, 4),
+        log_scales=torch.log(torch.tensor(scale)) + 0.5 * normal(count, 3),
+        logit_opacities=normal(count) * 1.5,
+        sh0=normal(count, 3),
+        shN=0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3),
+    )
+
+
+def orbit_camera(
+    width: int = 40, height: int = 24, azimuth: float = 0.4, elevation: float = 0.3, distance: float = 4.0
+) -> Camera:
+    """A camera on a sphere around the origin (angles in radians, y down), with a vertical field of view of 0.9."""
+    az, el = torch.tensor(azimuth).double(), torch.tensor(elevation).double()
+    eye = distance * torch.stack([az.sin() * el.cos(), -el.sin(), -az.cos() * el.cos()])
+    viewmat = look_at(eye, torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
+    return Camera(viewmat, intrinsics(0.9, width, height), width, height)
+
+
+def front_camera(width: int = 40, height: int = 24, focal: float = 30.0) -> Camera:
+    """A camera at the origin that looks along +z; x right, y down: world and camera axes are the same."""
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(torch.eye(4), K, width, height)
+
+
+def one_gaussian(
+    mean: tuple[float, float, float] = (0.0, 0.0, 2.0),
+    scales: tuple[float, float, float] = (0.2, 0.1, 0.15),
+    quat: tuple[float, float, float, float] = (0.9, 0.2, -0.3, 0.1),
+    opacity: float = 0.8,
+    rgb: tuple[float, float, float] = (0.9, 0.3, 0.1),
+) -> Gaussians:
+    """A single Gaussian in activated units (opacity 0..1, standard deviations in world units, colour 0..1)."""
+    return Gaussians(
+        means=torch.tensor([mean]),
+        quats=torch.tensor([quat]),
+        log_scales=torch.tensor([scales]).log(),
+        logit_opacities=logit_of(torch.tensor([opacity])),
+        sh0=(torch.tensor([rgb]) - 0.5) / 0.28209479177387814,
+        shN=torch.zeros(1, 0, 3),
+    )
+
+
+def logit_of(opacity: Tensor) -> Tensor:
+    """Logits whose float32 sigmoid is `opacity` as nearly as float32 allows, and not below it. [N] -> [N]"""
+    logit = torch.logit(opacity.double()).float()
+    for _ in range(64):
+        low = logit.sigmoid() < opacity
+        if not bool(low.any()):
+            break
+        logit = torch.where(low, torch.nextafter(logit, torch.full_like(logit, torch.inf)), logit)
+    return logit
+
+
+def concatenate(*parts: Gaussians) -> Gaussians:
+    """The rows of all parts, in order; all must have the same number of SH bands."""
+    return Gaussians(
+        **{
+            name: torch.cat([getattr(part, name) for part in parts])
+            for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+        }
+    )
+
+
+@dataclass(frozen=True)
+class HardCase:
+    """A scene and a camera that some engine, somewhere, gets wrong.
+
+    Args:
+        gaussians: raw parameters
+        camera: the view
+        antialiased: render it with the antialias option
+        poisoned: rows that hold something not finite; all other rows must render as if these were absent
+    """
+
+    gaussians: Gaussians
+    camera: Camera
+    antialiased: bool = False
+    poisoned: tuple[int, ...] = ()
+
+
+def hard_cases() -> dict[str, HardCase]:
+    """Every hard case by name; the names are sentences' subjects, for test ids. Small images: each is quick."""
+    front = front_camera()
+    cases: dict[str, HardCase] = {}
+
+    def add(name: str, gaussians: Gaussians, camera: Camera = front, **more: object) -> None:
+        cases[name] = HardCase(gaussians, camera, **more)  # type: ignore[arg-type]
+
+    some = random_gaussians(60, seed=1, spread=0.6, scale=0.1, sh_degree=3)
+    some = replace(some, means=some.means + torch.tensor([0.0, 0.0, 3.0]))
+    plain = replace(some, shN=some.shN[:, :0])
+    behind = replace(plain, means=plain.means * torch.tensor([1.0, 1.0, -1.0]))
+
+    add("no gaussians", plain[:0])
+    add("all culled", behind)
+    add("culled ones first", concatenate(behind[:20], plain))
+    add("random with SH 3", some)
+    add("random in view of an orbit camera", random_gaussians(200, seed=2, sh_degree=2), orbit_camera())
+    add("many tiles", random_gaussians(150, seed=3, scale=0.15), orbit_camera(150, 70))
+
+    add("opacity exactly 1", one_gaussian(opacity=1.0))
+    add("opacity 0", one_gaussian(opacity=0.0))
+    on_pixel = (0.5 / 30.0 * 2.0, 0.5 / 30.0 * 2.0, 2.0)  # projects onto a pixel centre
+    add("opacity exactly 1/255", one_gaussian(mean=on_pixel, opacity=1 / 255))
+    nan, inf = float("nan"), float("inf")
+    for name, value in (("NaN", nan), ("inf", inf), ("-inf", -inf)):
+        for attribute in ("means", "log_scales", "quats", "logit_opacities", "sh0"):
+            tensor = getattr(plain, attribute).clone()
+            tensor[7] = value
+            harmless = attribute == "logit_opacities" or (attribute == "log_scales" and value == -inf)
+            add(
+                f"{name} in {attribute}",
+                replace(plain, **{attribute: tensor}),
+                poisoned=() if harmless and value == value else (7,),
+            )
+    stack = one_gaussian(opacity=0.9)
+    add("400 opaque ones stacked", _stack(stack, 400))
+    add("2000 faint ones stacked", _stack(one_gaussian(opacity=0.012), 2000))
+
+    quat = torch.tensor([0.9, 0.2, -0.3, 0.1])
+    for norm in (0.0, 1e-12, 1e12):
+        add(f"quaternion norm {norm:g}", replace(one_gaussian(), quats=(quat * norm)[None]))
+    for scales in ((0.0, 0.1, 0.2), (0.0, 0.0, 0.2), (0.0, 0.0, 0.0), (4e-9, 4e-9, 4e-9), (1e6, 0.1, 0.1)):
+        add(f"scales {scales}", one_gaussian(scales=scales))
+    for scale in (1e6, 1e18):
+        add(f"scale {scale:g} all around", one_gaussian(scales=(scale, scale, scale)))
+    add("scale inf", concatenate(one_gaussian(scales=(inf, 0.1, 0.1)), plain), poisoned=(0,))
+
+    c, s = 0.9238795, 0.3826834  # half of 45 degrees
+    diagonal = (c, 0.0, 0.0, s)
+    for ratio in (5e3, 1e6):
+        add(
+            f"needle {ratio:g}:1 at 45 degrees",
+            one_gaussian(scales=(1e-3 * ratio, 1e-3, 1e-3), quat=diagonal, mean=(0.01, 0.02, 2.0)),
+        )
+    add(
+        "needle off to the side",
+        one_gaussian(scales=(300.0, 1e-4, 1e-4), quat=diagonal, mean=(9.0, 9.1, 2.0)),
+    )
+
+    for name, z in (("at", 0.01), ("just before", 0.0100001), ("just behind", 0.0099999)):
+        add(f"{name} the near plane", one_gaussian(mean=(0.0, 0.0, z), scales=(1e-3, 1e-3, 1e-3)))
+    add("at the camera centre", one_gaussian(mean=(0.0, 0.0, 0.0)))
+    add("behind the camera", one_gaussian(mean=(0.0, 0.0, -2.0)))
+    add("centre outside, clamp active", one_gaussian(mean=(4.5, 3.0, 2.0), scales=(1.5, 1.0, 1.2)))
+    add("centre outside on the other side", one_gaussian(mean=(-4.5, -3.0, 2.0), scales=(1.5, 1.0, 1.2)))
+    off = torch.tensor([[34.0, 0.0, 9.0], [0.0, 21.0, 17.5], [0.0, 0.0, 1.0]])
+    wide = concatenate(plain, one_gaussian(mean=(3.4, -2.0, 2.0), scales=(1.5, 1.0, 1.2)))
+    add("principal point off centre, fx unequal fy", wide, replace(front, K=off))
+
+    add("far away", one_gaussian(mean=(2e3, 1e3, 1e5), scales=(5e3, 2e3, 1e3)))
+    add("coordinates of 2250", replace(plain, means=plain.means * 750), replace(front))
+    loud = plain.sh0.clone()
+    loud[::3] = 13.0
+    loud[1::3] = -13.0
+    add("colour coefficients of 13", replace(plain, sh0=loud))
+    flat = plain.means.clone()
+    flat[:, 2] = 3.0
+    add("equal depths", replace(plain, means=flat))
+    for width, height in ((1, 1), (17, 5), (33, 9), (64, 16)):
+        add(f"image {width}x{height}", plain, front_camera(width, height, focal=0.75 * width))
+    tiny = replace(plain, log_scales=plain.log_scales - 3.0)
+    add("antialias with tiny splats", tiny, antialiased=True)
+    add("antialias with points", one_gaussian(scales=(0.0, 0.0, 0.0)), antialiased=True)
+    add("antialias with large splats", plain, antialiased=True)
+    return cases
+
+
+def _stack(layer: Gaussians, count: int) -> Gaussians:
+    stack = layer[torch.zeros(count, dtype=torch.int64)]
+    rng = torch.Generator().manual_seed(5)
+    depth = torch.linspace(2.0, 3.0, count)[torch.randperm(count, generator=rng)]
+    return replace(
+        stack,
+        means=torch.stack([torch.zeros(count), torch.zeros(count), depth], dim=1),
+        sh0=torch.randn(count, 3, generator=rng),
+    )
