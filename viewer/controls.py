@@ -60,6 +60,20 @@ def dolly(camera: ViewCamera, dy: float, radius: float) -> ViewCamera:
     return zoom(camera, -dy * DOLLY_PER_PIXEL / ZOOM_PER_STEP, radius)
 
 
+def drag(camera: ViewCamera, does: str, dx: float, dy: float, height: float, radius: float) -> ViewCamera:
+    """One step of a drag of `DRAGS`; see the function that it names."""
+    match does:
+        case "orbit":
+            return orbit(camera, dx, dy)
+        case "look":
+            return look(camera, dx, dy)
+        case "pan":
+            return pan(camera, dx, dy, height)
+        case "dolly":
+            return dolly(camera, dy, radius)
+    raise KeyError(does)
+
+
 def fly(
     camera: ViewCamera,
     right: float,

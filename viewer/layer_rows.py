@@ -45,7 +45,7 @@ def _row(scene: Gaussians, gdf: Gdf) -> LayerRow:
         swatch=_mean_colour(scene, gdf),
         recorded=gdf.field.recorded,
         instruction=gdf.instruction,
-        bounds=bounds_of(scene.means[members].numpy()),
+        bounds=bounds_of(scene[members]),
     )
 
 

@@ -7,13 +7,15 @@ not from a cross product with the view direction.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from progdf.camera import Camera, intrinsics
+from progdf.framing import guess_up, scene_sphere
+from progdf.gaussians import Gaussians
 
 from .state import Vec3, ViewCamera
 
@@ -145,15 +147,13 @@ def look_from(camera: ViewCamera, position: Vec3, pivot: Vec3) -> ViewCamera:
     return replace(turned, distance=max(math.dist(position, pivot), 1e-9))
 
 
-def bounds_of(means: NDArray[np.float32]) -> Bounds:
-    """Median centre and 97th-percentile radius of finite centres [N,3]: stray far Gaussians do not count."""
-    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
-    if not len(finite):
+def bounds_of(scene: Gaussians) -> Bounds:
+    """What frames the bulk of a scene, or of one layer's members; far strays do not count."""
+    if not len(scene):
         return Bounds()
-    centre = np.median(finite, axis=0)
-    radius = float(np.quantile(np.linalg.norm(finite - centre, axis=1), 0.97))
+    centre, radius = scene_sphere(scene)
     x, y, z = (float(c) for c in centre)
-    return Bounds((x, y, z), min(max(radius, 1e-6), FARTHEST))
+    return Bounds((x, y, z), radius) if math.isfinite(x + y + z + radius) else Bounds()
 
 
 def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera:
@@ -166,3 +166,11 @@ def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera
     if 0.0 < aspect < 1.0:
         half = math.atan(math.tan(half) * aspect)
     return replace(camera, pivot=bounds.centre, distance=1.05 * bounds.radius / math.sin(half))
+
+
+def first_camera(
+    scene: Gaussians, cameras: Sequence[Camera] = (), aspect: float = 1.5, fov_y: float = 45.0
+) -> ViewCamera:
+    """What one sees first: all of the scene, upright, from the front and a little above."""
+    x, y, z = (float(c) for c in guess_up(scene, cameras)) if len(scene) else (0.0, 1.0, 0.0)
+    return frame(ViewCamera(up=(x, y, z), azimuth=20.0, fov_y=fov_y), bounds_of(scene), aspect)

@@ -1,0 +1,144 @@
+"""What is drawn over the picture: timings, the list of bindings, messages, the word "Original"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from imgui_bundle import imgui
+
+from . import controls
+from .ui_context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32
+from .workspace import Message
+
+MOUSE_HELP = (
+    ("Left drag", "orbit"),
+    ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
+    ("Right drag", "pan; look around while flying"),
+    ("Wheel", "zoom"),
+    ("Double click", "turn around the surface under the cursor"),
+    ("W A S D Q E", "fly; Shift ten times faster, Alt slower"),
+    ("Shift on a slider", "ten times finer"),
+    ("Ctrl+click a slider", "type a value"),
+    ("\\ held", "the original"),
+)
+
+
+@dataclass(frozen=True)
+class Area:
+    """The part of the window that shows the picture, window pixels."""
+
+    width: float
+    height: float
+
+
+def timings(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
+    """A small table at the upper left: names, and figures aligned at the right."""
+    size, pad, gap = SMALL_PX * ui.scale, 8.0 * ui.scale, 14.0 * ui.scale
+    names = max((_wide(name, size, ui) for name, _ in lines), default=0.0)
+    figures = max((_wide(figure, size, ui) for _, figure in lines), default=0.0)
+    step = size * 1.35
+    left = top = 10.0 * ui.scale
+    right = left + names + figures + gap + 2 * pad
+    bottom = top + step * len(lines) + 2 * pad - (step - size)
+    canvas = imgui.get_background_draw_list()
+    canvas.add_rect_filled(
+        imgui.ImVec2(left, top), imgui.ImVec2(right, bottom), u32(PALETTE.scrim), 5 * ui.scale
+    )
+    for i, (name, figure) in enumerate(lines):
+        y = top + pad + i * step
+        _text(left + pad, y, name, size, PALETTE.dim, ui)
+        _text(right - pad - _wide(figure, size, ui), y, figure, size, PALETTE.text, ui)
+
+
+def banner(text: str, area: Area, ui: UiContext) -> None:
+    """A word at the top centre of the picture."""
+    size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
+    wide = _wide(text, size, ui)
+    x, y = (area.width - wide) / 2, 14.0 * ui.scale
+    corners = imgui.ImVec2(x - 1.5 * pad, y - pad / 2), imgui.ImVec2(x + wide + 1.5 * pad, y + size + pad / 2)
+    imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
+    _text(x, y, text, size, PALETTE.text, ui)
+
+
+def message(shown: Message, area: Area, ui: UiContext) -> bool:
+    """One line at the bottom left, wrapped where the window is narrow; True once its cross was clicked."""
+    pad = 12.0 * ui.scale
+    widest = min(area.width - 2 * pad, 640.0 * ui.scale)
+    imgui.set_next_window_pos(imgui.ImVec2(pad, area.height - pad), 0, imgui.ImVec2(0.0, 1.0))
+    imgui.set_next_window_size_constraints(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(widest, area.height))
+    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, 5.0 * ui.scale)
+    imgui.begin("message", None, _FLOATING)
+    cross = imgui.calc_text_size("×").x + 2 * imgui.get_style().frame_padding.x
+    room = widest - cross - 2 * pad - imgui.get_style().item_spacing.x
+    wrap = imgui.calc_text_size(shown.text).x > room
+    imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
+    imgui.align_text_to_frame_padding()
+    colour = PALETTE.error if shown.error else PALETTE.text
+    imgui.text_colored(imgui.ImVec4(*colour), shown.text)
+    imgui.pop_text_wrap_pos()
+    imgui.same_line()
+    closed = bool(imgui.small_button("×"))
+    imgui.end()
+    imgui.pop_style_var()
+    imgui.pop_style_color()
+    return closed
+
+
+def bindings(area: Area, ui: UiContext) -> None:
+    """The list of bindings, made from the table, in the middle of the picture."""
+    imgui.set_next_window_pos(imgui.ImVec2(area.width / 2, area.height / 2), 0, imgui.ImVec2(0.5, 0.5))
+    imgui.set_next_window_size_constraints(
+        imgui.ImVec2(0.0, 0.0), imgui.ImVec2(area.width - 16 * ui.scale, area.height - 16 * ui.scale)
+    )
+    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
+    imgui.begin("bindings", None, _FLOATING)
+    imgui.push_font(None, SMALL_PX)
+    for column, rows in enumerate((MOUSE_HELP, key_help())):
+        if column:
+            imgui.same_line(0.0, 28.0 * ui.scale)
+        imgui.begin_group()
+        wide = max(imgui.calc_text_size(chord).x for chord, _ in rows) + 14.0 * ui.scale
+        start = imgui.get_cursor_pos_x()
+        for chord, does in rows:
+            imgui.text(chord)
+            imgui.same_line(start + wide)
+            imgui.text_disabled(does)
+        imgui.end_group()
+    imgui.pop_font()
+    imgui.end()
+    imgui.pop_style_var()
+    imgui.pop_style_color()
+
+
+def key_help() -> tuple[tuple[str, str], ...]:
+    """Chord and help of every key that has a help text, in the words of a person."""
+    names = {"1": "1–9", "Shift+1": "Shift+1–9", "Right": "← →", "Shift+Right": "Shift+← →"}
+    names |= {"Ctrl+Right": "Ctrl+← →", "Escape": "Esc"}
+    return tuple((names.get(key.chord, key.chord), key.help) for key in controls.KEYS if key.help)
+
+
+_FLOATING = (
+    imgui.WindowFlags_.no_decoration.value
+    | imgui.WindowFlags_.always_auto_resize.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_focus_on_appearing.value
+    | imgui.WindowFlags_.no_nav.value
+    | imgui.WindowFlags_.no_move.value
+)
+
+
+def _wide(text: str, size: float, ui: UiContext) -> float:
+    imgui.push_font(ui.fonts.regular, size / ui.scale)
+    wide = float(imgui.calc_text_size(text).x)
+    imgui.pop_font()
+    return wide
+
+
+def _text(
+    x: float, y: float, text: str, size: float, colour: tuple[float, float, float, float], ui: UiContext
+) -> None:
+    at = imgui.ImVec2(round(x), round(y))
+    imgui.get_background_draw_list().add_text(ui.fonts.regular, size, at, u32(colour), text)

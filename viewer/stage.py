@@ -1,0 +1,279 @@
+"""One window's content: input → workspace → picture → screen. Knows imgui and GL, but no windowing system.
+
+The window (app.py) and the tests feed imgui's io and call `frame`: a scripted mouse goes a real one's way.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+
+import moderngl
+from imgui_bundle import imgui
+
+from progdf.errors import ProgdfError
+
+from . import controls, inputs, overlay, panel, workspace
+from .engine import Engine
+from .gl.screen import PictureTarget, read_rgb
+from .pick import surface_point
+from .pictures import save_picture
+from .state import ViewCamera, ViewState
+from .turntable import to_camera
+from .ui_context import PALETTE, UiContext
+from .workspace import Message, SceneFacts
+
+SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
+LINGER_S = 0.65  # one more frame after this, for tooltips
+BLINK_S = 0.3  # while a text field is open
+MESSAGE_S, ERROR_S = 6.0, 15.0
+
+
+class Stage:
+    """Draws frames of one engine into the framebuffer it is given.
+
+    Args:
+        context: the GL context of the engine
+        engine: draws the picture
+        facts: of the open scene
+        view: what to show first
+        scale: window pixels per design pixel (see UiContext)
+        pictures: folder into which saved pictures go
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        engine: Engine,
+        facts: SceneFacts,
+        view: ViewState,
+        scale: float = 1.0,
+        pictures: Path = Path(),
+    ) -> None:
+        self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
+        self.ui = UiContext(scale)
+        imgui.backends.opengl3_init("#version 330")
+        self.work = workspace.opened(view)
+        self.frames = 0  # all that were drawn
+        self.drawn = 0  # those with a new picture of the splats
+        self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
+        self._target = PictureTarget(context)
+        self._drag: str | None = None
+        self._flying = False
+        self._clock = 0.0
+        self._unsettled, self._linger = SETTLE_FRAMES, True
+
+    def close(self) -> None:
+        """Free what the stage made; the engine and the context are the caller's."""
+        self.ui.make_current()
+        imgui.backends.opengl3_shutdown()
+        self.ui.close()
+        self._target.release()
+
+    def wake(self) -> None:
+        """Something happened: draw until everything has settled."""
+        self._unsettled, self._linger = SETTLE_FRAMES, True
+
+    def rest(self) -> None:
+        """Nothing can be drawn: wait for the next event."""
+        self._unsettled, self._linger = 0, False
+
+    def serve(self, engine: Engine, facts: SceneFacts) -> None:
+        """Draw with another engine from now on (the scene or its edits have changed)."""
+        self.engine, self.facts = engine, facts
+        self._target.fresh = True
+        self.wake()
+
+    def change(self, view: ViewState) -> None:
+        """A new state from outside the window; what it edits can be undone."""
+        self.work = workspace.settled(replace(self.work, view=view))
+        self.wake()
+
+    def restart(self, view: ViewState) -> None:
+        """A new state with nothing to undo."""
+        self.work = workspace.opened(view)
+        self.wake()
+
+    def patience(self) -> float | None:
+        """Seconds the window may wait for an event before the next `frame`; None: for ever."""
+        self.ui.make_current()
+        if self._unsettled > 0:
+            return 0.0
+        if self._flying or inputs.repeating():
+            return 1.0 / 60.0
+        waits = [LINGER_S] if self._linger else []
+        if imgui.get_io().want_text_input:
+            waits.append(BLINK_S)
+        if self.work.message is not None:
+            waits.append(max(self.work.message.until - self._clock, 0.0))
+        return min(waits, default=None)
+
+    def tell(self, text: str, error: bool = False) -> None:
+        """Show one line at the bottom of the picture for a while."""
+        until = self._clock + (ERROR_S if error else MESSAGE_S)
+        self.work = replace(self.work, message=Message(" ".join(text.split()), until, error))
+        self.wake()
+
+    def frame(
+        self,
+        screen: moderngl.Framebuffer,
+        size: tuple[int, int],
+        seconds: float,
+        fly_keys: frozenset[str] = frozenset(),
+        arrived: float | None = None,
+    ) -> None:
+        """Handle the input that imgui's io holds, and draw.
+
+        Args:
+            screen: where to draw
+            size: its width and height in pixels: io.display_size times io.display_framebuffer_scale
+            seconds: since the last frame
+            fly_keys: which of controls.FLY_KEYS are down, by their physical place
+            arrived: time.perf_counter() when the input came; now if None
+        """
+        arrived = time.perf_counter() if arrived is None else arrived
+        self.ui.make_current()
+        imgui.get_io().delta_time = max(seconds, 1e-5)
+        self._clock += max(seconds, 0.0)
+        self._linger = self._linger and self._unsettled > 0
+        self._unsettled = max(self._unsettled - 1, 0)
+        before = self.work
+        imgui.backends.opengl3_new_frame()
+        imgui.new_frame()
+        self._handle_input(fly_keys, seconds)
+        if not imgui.is_any_item_active() and self._drag is None and not inputs.repeating():
+            self.work = workspace.settled(self.work)
+        if self.work != before:
+            self.wake()
+        self._draw_picture()
+        self._draw_overlays()
+        imgui.render()
+        screen.use()
+        screen.clear(*PALETTE.panel)
+        self._target.show(screen)
+        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
+        self.frames += 1
+        if _strengths(self.work.view) != _strengths(before.view):
+            self.context.finish()
+            self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
+        self._save_pictures(screen, size)
+
+    def _area(self) -> overlay.Area:
+        """The part of the window that shows the picture."""
+        display = imgui.get_io().display_size
+        wide = panel.width(self.ui) if self.work.view.panel else 0.0
+        return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
+
+    def _picture_size(self) -> tuple[int, int]:
+        """The picture's size in framebuffer pixels."""
+        area, density = self._area(), imgui.get_io().display_framebuffer_scale
+        return max(round(area.width * density.x), 1), max(round(area.height * density.y), 1)
+
+    def _handle_input(self, fly_keys: frozenset[str], seconds: float) -> None:
+        io = imgui.get_io()
+        for action in inputs.actions_pressed():
+            self._perform(action)
+        self._flying = bool(fly_keys) and not (io.want_text_input or io.key_ctrl or io.key_super)
+        if self._flying:
+            flown = inputs.fly(self.work.view.camera, fly_keys, seconds, self.facts.bounds.radius)
+            self.work = workspace.with_camera(self.work, flown)
+        if self.work.view.panel:
+            self._panel()
+        self.work = workspace.with_camera(self.work, self._moved_by_mouse(self.work.view.camera))
+
+    def _perform(self, action: str) -> None:
+        area = self._area()
+        self.work = workspace.perform(self.work, action, self.facts, area.width / area.height)
+
+    def _panel(self) -> None:
+        facts, past = self.facts, self.work.past
+        shown = panel.PanelInput(
+            facts.title, facts.count, facts.rows, self.work.focus, len(past.past), len(past.future)
+        )
+        result = panel.draw(self.work.view, shown, self.ui)
+        self.work = replace(self.work, view=result.state, focus=result.focus)
+        for action in result.actions:
+            self._perform(action)
+
+    def _moved_by_mouse(self, camera: ViewCamera) -> ViewCamera:
+        io, radius, scale = imgui.get_io(), self.facts.bounds.radius, self.ui.scale
+        if not inputs.any_button_down():
+            self._drag = None
+        if not io.want_capture_mouse:
+            if imgui.is_mouse_double_clicked(0):
+                return self._pivot_picked(camera)
+            self._drag = inputs.drag_begun(camera.mode) or self._drag
+            if io.mouse_wheel:
+                camera = controls.zoom(camera, io.mouse_wheel, radius)
+        dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
+        if self._drag and (dx or dy):
+            camera = controls.drag(camera, self._drag, dx, dy, self._area().height / scale, radius)
+        return camera
+
+    def _pivot_picked(self, camera: ViewCamera) -> ViewCamera:
+        mouse, density = imgui.get_io().mouse_pos, imgui.get_io().display_framebuffer_scale
+        point = surface_point(
+            self.engine.gaussians(self._shown()),
+            to_camera(camera, *self._picture_size()),
+            mouse.x * density.x,
+            mouse.y * density.y,
+        )
+        return camera if point is None else controls.pivot_on(camera, point, self.facts.bounds.radius)
+
+    def _shown(self) -> ViewState:
+        return workspace.original(self.work.view) if inputs.holds_original() else self.work.view
+
+    def _draw_picture(self) -> None:
+        """The splats, only where what is shown is not the picture that is already there."""
+        view, size = self._shown(), self._picture_size()
+        self._target.fit(size)
+        if self._target.fresh or self.engine.needs_draw(view, size):
+            self.timings = self.engine.draw(view, self._target.framebuffer, size)
+            self._target.fresh = False
+            self.drawn += 1
+
+    def _draw_overlays(self) -> None:
+        area, work = self._area(), self.work
+        if inputs.holds_original():
+            overlay.banner("Original", area, self.ui)
+        if work.view.overlay:
+            overlay.timings(self._figures(), self.ui)
+        if work.help:
+            overlay.bindings(area, self.ui)
+        if work.message is not None:
+            closed = overlay.message(work.message, area, self.ui)
+            if closed or self._clock >= work.message.until:
+                self.work = replace(work, message=None)
+                self.wake()
+
+    def _figures(self) -> list[tuple[str, str]]:
+        return []
+
+    def take_requests(self) -> tuple[str, ...]:
+        """What the window shall do now; asked for once each."""
+        requests, self.work = self.work.requests, replace(self.work, requests=())
+        return requests
+
+    def _save_pictures(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
+        if "picture" in self.work.requests:
+            self._save(self._target.framebuffer, self._target.framebuffer.size)
+        if "window_picture" in self.work.requests:
+            self._save(screen, size)
+        left = tuple(r for r in self.work.requests if r not in ("picture", "window_picture"))
+        self.work = replace(self.work, requests=left)
+
+    def _save(self, source: moderngl.Framebuffer, size: tuple[int, int]) -> None:
+        try:
+            path = save_picture(self.pictures, Path(self.facts.title).stem, read_rgb(source, size))
+        except ProgdfError as error:
+            self.tell(str(error), error=True)
+        except OSError as error:
+            self.tell(f"no picture was saved in {self.pictures.resolve()}: {error.strerror}", error=True)
+        else:
+            self.tell(f"Saved {path.resolve()}")
+
+
+def _strengths(view: ViewState) -> list[float]:
+    return [layer.strength for layer in view.layers]

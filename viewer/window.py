@@ -1,0 +1,158 @@
+"""A glfw window with OpenGL 3.3: opened, listened to, scaled, closed. Nothing of ours is drawn here."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from imgui_bundle import imgui  # before glfw: it makes glfw load the library that imgui was built with
+
+# isort: split
+import glfw
+
+from progdf.errors import ProgdfError
+
+from . import controls
+
+LEAST = (640, 400)
+_FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
+_HINTS = (
+    (glfw.CONTEXT_VERSION_MAJOR, 3),
+    (glfw.CONTEXT_VERSION_MINOR, 3),
+    (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+    (glfw.OPENGL_FORWARD_COMPAT, True),
+    (glfw.SCALE_TO_MONITOR, True),
+    (glfw.DEPTH_BITS, 0),
+    (glfw.STENCIL_BITS, 0),
+)
+
+
+class Window:
+    """The window, with its GL context current.
+
+    Args:
+        title: in the title bar
+        size: width and height at 1×
+
+    Raises:
+        ProgdfError: there is no display, or no OpenGL 3.3 on it.
+    """
+
+    def __init__(self, title: str, size: tuple[int, int]) -> None:
+        errors: list[str] = []
+        glfw.set_error_callback(lambda _, text: errors.append(_decoded(text)))
+        if not glfw.init():
+            raise _no_window("no window can be opened here", errors)
+        for hint, value in _HINTS:
+            glfw.window_hint(hint, value)
+        self.handle: Any = glfw.create_window(*size, title, None, None)
+        if not self.handle:
+            glfw.terminate()
+            raise _no_window("no window with OpenGL 3.3 can be opened here", errors)
+        glfw.set_window_size_limits(self.handle, *LEAST, glfw.DONT_CARE, glfw.DONT_CARE)
+        glfw.make_context_current(self.handle)
+        glfw.swap_interval(1)
+        self._windowed: tuple[int, int, int, int] | None = None
+
+    def close(self) -> None:
+        glfw.destroy_window(self.handle)
+        glfw.terminate()
+
+    def listen(
+        self, wake: Callable[[], None], dropped: Callable[[Sequence[Path]], None], redraw: Callable[[], None]
+    ) -> None:
+        """Hand on events, and let imgui listen too. Call with the imgui context current.
+
+        Args:
+            wake: something happened
+            dropped: files were dropped on the window
+            redraw: draw at once (while a window is being resized, some systems run no event loop but this)
+        """
+
+        def on_event(*_: object) -> None:
+            wake()
+
+        def on_drop(_: object, names: Sequence[str]) -> None:
+            dropped([Path(name) for name in names])
+
+        def on_refresh(_: object) -> None:
+            redraw()
+
+        for listen in (
+            glfw.set_cursor_pos_callback,
+            glfw.set_cursor_enter_callback,
+            glfw.set_mouse_button_callback,
+            glfw.set_scroll_callback,
+            glfw.set_key_callback,
+            glfw.set_char_callback,
+            glfw.set_window_focus_callback,
+            glfw.set_window_iconify_callback,
+            glfw.set_framebuffer_size_callback,
+        ):
+            listen(self.handle, on_event)
+        callback: Any = on_drop  # glfw's own annotation has the arguments of the C function
+        glfw.set_drop_callback(self.handle, callback)
+        glfw.set_window_refresh_callback(self.handle, on_refresh)
+        # imgui's own callbacks call the ones that were there before
+        imgui.backends.glfw_init_for_opengl(ctypes.cast(self.handle, ctypes.c_void_p).value or 0, True)
+
+    def wait(self, patience: float | None) -> None:
+        """Handle events: at once (0), for so many seconds at most, or when the next one comes (None)."""
+        if patience is None:
+            glfw.wait_events()
+        elif patience > 0.0:
+            glfw.wait_events_timeout(patience)
+        else:
+            glfw.poll_events()
+
+    @property
+    def closing(self) -> bool:
+        return bool(glfw.window_should_close(self.handle))
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Size of the framebuffer; (0, 0) while minimised."""
+        width, height = glfw.get_framebuffer_size(self.handle)
+        return int(width), int(height)
+
+    @property
+    def ui_scale(self) -> float:
+        """Window coordinates per design pixel: the screen's density, less what the coordinates hide of it."""
+        content = float(glfw.get_window_content_scale(self.handle)[0])
+        pixels, coordinates = self.pixels[0], int(glfw.get_window_size(self.handle)[0])
+        return max(content * coordinates / pixels, 0.5) if pixels else 1.0
+
+    def fly_keys(self) -> frozenset[str]:
+        """Which flight keys are down, by their physical place."""
+        return frozenset(n for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS)
+
+    def present(self) -> None:
+        glfw.swap_buffers(self.handle)
+
+    def rename(self, title: str) -> None:
+        glfw.set_window_title(self.handle, title)
+
+    def toggle_full_screen(self) -> None:
+        if self._windowed is not None:
+            no_monitor: Any = None
+            glfw.set_window_monitor(self.handle, no_monitor, *self._windowed, glfw.DONT_CARE)
+            self._windowed = None
+            return
+        monitor = glfw.get_primary_monitor()
+        if monitor:
+            self._windowed = (*glfw.get_window_pos(self.handle), *glfw.get_window_size(self.handle))
+            mode = glfw.get_video_mode(monitor)
+            glfw.set_window_monitor(
+                self.handle, monitor, 0, 0, mode.size.width, mode.size.height, mode.refresh_rate
+            )
+
+
+def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
+    why = f" ({errors[-1]})" if errors else ""
+    return ProgdfError(f"{what}{why}; `progdf render` makes pictures without one")
+
+
+def _decoded(text: str | bytes) -> str:
+    return text.decode(errors="replace") if isinstance(text, bytes) else text

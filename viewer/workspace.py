@@ -1,0 +1,178 @@
+"""What the window knows besides the picture's state, and every action on it as a pure function.
+
+Keys, panel buttons and tests all go through `perform`; what only the window itself can do (write a file, go
+full screen) is left in `requests` for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from . import controls, history, turntable
+from .history import History
+from .layer_rows import LayerRow
+from .state import LayerState, ViewCamera, ViewState
+from .turntable import Bounds
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What does not change while a scene is open.
+
+    Args:
+        title: the scene's name
+        count: Gaussians in the scene
+        bounds: what `frame` shows with no layer focused
+        rows: one per .gdf, indexed by `LayerState.gdf`
+    """
+
+    title: str
+    count: int
+    bounds: Bounds
+    rows: Sequence[LayerRow]
+
+
+@dataclass(frozen=True)
+class Message:
+    """One line for the person, shown until this time of the window's clock in seconds."""
+
+    text: str
+    until: float
+    error: bool = False
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """The state on screen, how it came about, and what is focused.
+
+    Args:
+        view: what decides the picture
+        past: undo and redo
+        home: the first camera
+        focus: the focused layer, an index into `view.layers`, or None
+        help: whether the list of bindings is shown
+        message: the line at the bottom, or None
+        requests: what the window has still to do: "picture", "window_picture", "full_screen"
+    """
+
+    view: ViewState
+    past: History
+    home: ViewCamera
+    focus: int | None = None
+    help: bool = False
+    message: Message | None = None
+    requests: tuple[str, ...] = ()
+
+
+def opened(view: ViewState) -> Workspace:
+    """A workspace on a fresh state; the first layer is focused."""
+    return Workspace(view, history.begin(view), view.camera, 0 if view.layers else None)
+
+
+def original(view: ViewState) -> ViewState:
+    """The same view without any edit."""
+    return replace(view, layers=tuple(replace(layer, enabled=False) for layer in view.layers))
+
+
+def settled(workspace: Workspace) -> Workspace:
+    """Call when no gesture is under way: what it changed becomes one undo entry."""
+    past = history.record(workspace.past, workspace.view)
+    return workspace if past is workspace.past else replace(workspace, past=past)
+
+
+def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
+    """The workspace after an action of `controls.KEYS`.
+
+    Args:
+        action: its name, with an argument after a colon where it has one
+        facts: of the open scene
+        aspect: width / height of the picture
+
+    Raises:
+        KeyError: there is no such action.
+    """
+    name, _, argument = action.partition(":")
+    if name in REQUESTS:
+        return replace(workspace, requests=(*workspace.requests, name))
+    if name in ("frame", "home"):
+        return _framed(workspace, facts, aspect) if name == "frame" else _home(workspace)
+    return ACTIONS[name](workspace, argument)
+
+
+def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
+    """Looking from elsewhere; never an undo entry."""
+    return replace(workspace, view=replace(workspace.view, camera=camera))
+
+
+def _framed(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
+    if workspace.focus is None:
+        return _home(workspace)
+    layer = workspace.view.layers[workspace.focus]
+    bounds = facts.rows[layer.gdf].bounds
+    return with_camera(workspace, turntable.frame(workspace.view.camera, bounds, aspect))
+
+
+def _home(workspace: Workspace) -> Workspace:
+    """The first view; the up axis and the mode chosen since then stay."""
+    camera = workspace.view.camera
+    return with_camera(workspace, replace(workspace.home, up=camera.up, mode=camera.mode))
+
+
+def _focus(workspace: Workspace, number: str) -> Workspace:
+    index = int(number) - 1
+    return replace(workspace, focus=index) if index < len(workspace.view.layers) else workspace
+
+
+def _toggle(workspace: Workspace, number: str) -> Workspace:
+    return _with_layer(workspace, int(number) - 1, lambda layer: replace(layer, enabled=not layer.enabled))
+
+
+def _hide(workspace: Workspace, _: str) -> Workspace:
+    return workspace if workspace.focus is None else _toggle(workspace, str(workspace.focus + 1))
+
+
+def _nudge(workspace: Workspace, by: str) -> Workspace:
+    def moved(layer: LayerState) -> LayerState:
+        # rounded, so that steps forth and back end on the number they began with
+        return replace(layer, strength=round(min(1.0, max(0.0, layer.strength + float(by))), 6))
+
+    return workspace if workspace.focus is None else _with_layer(workspace, workspace.focus, moved)
+
+
+def _with_layer(workspace: Workspace, index: int, change: Callable[[LayerState], LayerState]) -> Workspace:
+    layers = list(workspace.view.layers)
+    if index >= len(layers):
+        return workspace
+    layers[index] = change(layers[index])
+    return replace(workspace, view=replace(workspace.view, layers=tuple(layers)))
+
+
+def _undo(workspace: Workspace, _: str) -> Workspace:
+    past, view = history.undo(workspace.past, workspace.view)
+    return replace(workspace, past=past, view=view)
+
+
+def _redo(workspace: Workspace, _: str) -> Workspace:
+    past, view = history.redo(workspace.past, workspace.view)
+    return replace(workspace, past=past, view=view)
+
+
+def _fly(workspace: Workspace, _: str) -> Workspace:
+    return with_camera(workspace, controls.toggle_fly(workspace.view.camera))
+
+
+REQUESTS = ("picture", "window_picture", "full_screen")
+ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
+    "focus": _focus,
+    "unfocus": lambda workspace, _: replace(workspace, focus=None),
+    "toggle": _toggle,
+    "hide": _hide,
+    "nudge": _nudge,
+    "undo": _undo,
+    "redo": _redo,
+    "fly": _fly,
+    "help": lambda workspace, _: replace(workspace, help=not workspace.help),
+    "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
+    "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
+}
