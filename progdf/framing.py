@@ -30,8 +30,8 @@ _ENOUGH = 64
 def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
     """Centre [3] and radius (> 0) of the bulk of a scene, world units.
 
-    The median of the means, and the distance within which 97 % of them lie: far strays do not count. A scene of
-    one or a few Gaussians is as large as these are: twice the median of their longest axes at least.
+    The median of the means, and the distance within which 97 % of them lie: far strays do not count. A scene
+    of one or a few Gaussians is as large as these are: twice the median of their longest axes at least.
     """
     scene = _sample(scene)
     means = scene.means

@@ -63,7 +63,7 @@ class LoadReport:
             (self.bad_opacities, "NaN opacity"),
             (self.bad_colours, "NaN or infinite colour"),
         )
-        hidden = ", ".join(f"{_n(rows)} with {what}" for rows, what in reasons if rows)
+        hidden = ", ".join(f"{grouped(rows)} with {what}" for rows, what in reasons if rows)
         phrases = (
             (self.hidden, f"made invisible: {hidden}"),
             (self.bad_sh, "with NaN or infinite SH coefficients, which were set to 0"),
@@ -80,9 +80,9 @@ class LoadReport:
         phrases = []
         if self.ignored_properties:
             phrases.append(f"properties {', '.join(self.ignored_properties)}")
-        phrases += [f"element '{name}' ({_n(rows)} rows)" for name, rows in self.ignored_elements]
+        phrases += [f"element '{name}' ({grouped(rows)} rows)" for name, rows in self.ignored_elements]
         if self.trailing_bytes:
-            phrases.append(f"{_n(self.trailing_bytes)} bytes after the last row")
+            phrases.append(f"{grouped(self.trailing_bytes)} bytes after the last row")
         return tuple(phrases)
 
     def lines(self) -> list[str]:
@@ -103,13 +103,13 @@ class LoadReport:
 
 def counted(count: int) -> str:
     """1 as "1 Gaussian", 12345 as "12 345 Gaussians"."""
-    return f"{_n(count)} Gaussian{'' if count == 1 else 's'}"
+    return f"{grouped(count)} Gaussian{'' if count == 1 else 's'}"
 
 
 def _size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
 
 
-def _n(number: int) -> str:
+def grouped(number: int) -> str:
     """12345 as 12 345."""
     return f"{number:,}".replace(",", " ")

@@ -88,9 +88,10 @@ def _unit(quats: Tensor) -> tuple[Tensor, Tensor]:
     lengths = quats.norm(dim=1)
     lengths = torch.where((lengths - 1).abs() <= UNIT_TOLERANCE, 1.0, lengths)
     ordinary = (lengths > LEAST_QUAT) & lengths.isfinite()
-    if bool(ordinary.all()):
-        return quats / lengths[:, None], lengths
-    return torch.where((lengths == 1)[:, None], quats, normalize_quats(quats)), lengths
+    unit = quats / lengths[:, None]
+    if not bool(ordinary.all()):
+        unit[~ordinary] = normalize_quats(quats[~ordinary])
+    return unit, lengths
 
 
 def _all_good(scene: Gaussians, lengths: Tensor) -> bool:
