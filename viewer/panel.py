@@ -26,7 +26,7 @@ UPS: tuple[tuple[str, Vec3], ...] = (
 BLEND_HELP = {
     "normalised": "Overlapping edits share a Gaussian by their weights; never more than a full edit.",
     "sum": "Overlapping edits add up.",
-    "over": "An upper layer covers what lies below it, as far as its strength goes.",
+    "over": "A later edit covers the ones above it in the list, as far as its strength goes.",
 }
 
 
