@@ -1,0 +1,217 @@
+"""One engine, on screen and headless: state → compose → upload → sort → draw, published together.
+
+It compares the state with the one it last drew and does only the work between them: a camera move composes
+nothing, a change of colour sorts nothing, the same state draws nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.checkpoint import Gdf
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.layers import Gains, Layer
+
+from .edited import EditedScene
+from .headless import is_software
+from .painters import CpuPainter, GlPainter, Image, Painter
+from .sort import back_to_front
+from .state import ViewState
+from .turntable import to_camera
+
+DRAWS = ("auto", "gl", "cpu")
+
+
+@dataclass(frozen=True)
+class FrameTimings:
+    """Where the time of one picture went: wall clock, milliseconds, the GPU's work waited for.
+
+    Args:
+        compose_ms: strengths → attributes
+        upload_ms: attributes → where they are drawn from
+        sort_ms: depth order (the CPU rasteriser sorts within `draw_ms`)
+        draw_ms: the picture
+        changed: Gaussians whose attributes were composed anew
+        drawn: Gaussians in front of the camera; all of them where the CPU rasteriser draws
+    """
+
+    compose_ms: float = 0.0
+    upload_ms: float = 0.0
+    sort_ms: float = 0.0
+    draw_ms: float = 0.0
+    changed: int = 0
+    drawn: int = 0
+
+    @property
+    def total_ms(self) -> float:
+        return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms
+
+
+@dataclass(frozen=True)
+class _Edits:
+    """What decides the attributes: the layers that do something, and how they go together."""
+
+    layers: tuple[tuple[int, float, Gains], ...] = ()
+    blend: str = ""
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """What decides the picture."""
+
+    edits: _Edits
+    background: tuple[float, float, float]
+    viewmat: bytes
+    K: bytes
+    size: tuple[int, int]
+
+
+class Engine:
+    """Draws one scene under its edits.
+
+    Args:
+        ctx: the GL context that pictures are drawn or shown in; None draws on the CPU, for `image` only
+        scene: the original
+        gdfs: the edits that `LayerState.gdf` counts
+        draw: "gl", "cpu", or "auto": "gl" where OpenGL has hardware behind it
+
+    Raises:
+        ProgdfError: an edit was made for another scene.
+        ValueError: `draw` is unknown, or "gl" without a context.
+    """
+
+    def __init__(
+        self,
+        ctx: moderngl.Context | None,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf] = (),
+        draw: str = "auto",
+    ) -> None:
+        if draw not in DRAWS:
+            raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
+        if draw == "gl" and ctx is None:
+            raise ValueError("draw is 'gl', which needs a context")
+        self.gdfs = tuple(gdfs)
+        self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
+        self.timings = FrameTimings()
+        """Of the last picture."""
+        self._edited = EditedScene(scene, self.gdfs)
+        self._edits = _Edits()
+        self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
+        self._ordered_for: bytes | None = None
+        self._picture: _Picture | None = None
+        self._painter: Painter
+        if self.draws_with == "gl":
+            assert ctx is not None
+            self._painter = GlPainter(ctx)
+        else:
+            self._painter = CpuPainter(ctx)
+        self._painter.upload(self._edited.gaussians)
+
+    def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
+        """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
+        return self._wanted(view, camera or to_camera(view.camera, *size)) != self._picture
+
+    def draw(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> FrameTimings:
+        """Bring the picture up to date and show it in the lower left `size` pixels of `framebuffer`.
+
+        Raises:
+            ProgdfError: a layer of `view` means nothing; the last picture stays.
+        """
+        self.timings = self._bring(view, to_camera(view.camera, *size))
+        self._painter.show(framebuffer)
+        return self.timings
+
+    def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
+        """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colours are.
+
+        Args:
+            view: what to draw
+            size: width, height in pixels
+            camera: takes the place of the view's own camera and of `size`
+
+        Returns:
+            [H,W,3] float32
+
+        Raises:
+            ProgdfError: a layer of `view` means nothing.
+        """
+        self.timings = self._bring(view, camera or to_camera(view.camera, *size))
+        return self._painter.pixels()
+
+    def gaussians(self, view: ViewState) -> Gaussians:
+        """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
+        self._compose(_edits(view))
+        return self._edited.gaussians
+
+    def release(self) -> None:
+        """Give back what lives in the context; the context is the caller's."""
+        self._painter.release()
+
+    def _wanted(self, view: ViewState, camera: Camera) -> _Picture:
+        return _Picture(
+            _edits(view),
+            view.background,
+            camera.viewmat.numpy().tobytes(),
+            camera.K.numpy().tobytes(),
+            (camera.width, camera.height),
+        )
+
+    def _bring(self, view: ViewState, camera: Camera) -> FrameTimings:
+        """Do what lies between the last picture and this one."""
+        wanted = self._wanted(view, camera)
+        if wanted == self._picture:
+            return FrameTimings(drawn=self.timings.drawn)
+        compose_ms, upload_ms, changed = self._compose(wanted.edits)
+        started = time.perf_counter()
+        if self._painter.wants_order and self._ordered_for != wanted.viewmat:
+            self._order = back_to_front(self._edited.gaussians.means.numpy(), camera)
+            self._ordered_for = wanted.viewmat
+        sorted_at = time.perf_counter()
+        self._painter.draw(camera, view.background, self._order)
+        drawn_at = time.perf_counter()
+        self._picture = wanted
+        return FrameTimings(
+            compose_ms,
+            upload_ms,
+            1e3 * (sorted_at - started),
+            1e3 * (drawn_at - sorted_at),
+            changed,
+            len(self._order) if self._painter.wants_order else len(self._edited.gaussians),
+        )
+
+    def _compose(self, edits: _Edits) -> tuple[float, float, int]:
+        """Bring attributes up to date; gives ms for composing and uploading, and how many rows changed."""
+        if edits == self._edits:
+            return 0.0, 0.0, 0
+        started = time.perf_counter()
+        layers = [Layer(self._gdf(index), strength, True, gains) for index, strength, gains in edits.layers]
+        change = self._edited.compose(layers, edits.blend or "normalised")
+        composed = time.perf_counter()
+        self._edits, self._picture = edits, None
+        if "means" in change.attributes:
+            self._ordered_for = None
+        self._painter.update(self._edited.gaussians, change.attributes, change.rows)
+        uploaded = time.perf_counter()
+        return 1e3 * (composed - started), 1e3 * (uploaded - composed), len(change.rows)
+
+    def _gdf(self, index: int) -> Gdf:
+        if not 0 <= index < len(self.gdfs):
+            raise ProgdfError(
+                f"a layer asks for edit {index + 1} of {len(self.gdfs)}; open its .gdf file too"
+            )
+        return self.gdfs[index]
+
+
+def _edits(view: ViewState) -> _Edits:
+    """Layers that are off or at strength 0 do not count, so that touching them does no work."""
+    layers = tuple((l.gdf, l.strength, l.gains) for l in view.layers if l.enabled and l.strength != 0.0)
+    return _Edits(layers, view.blend) if layers else _Edits()

@@ -1,0 +1,29 @@
+"""A finished picture on its way into a window's framebuffer."""
+
+from __future__ import annotations
+
+import moderngl
+
+from .programs import load_program
+
+
+class Presenter:
+    """Copies a picture whose row 0 is on top into a framebuffer whose row 0 is at the bottom."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self.ctx = ctx
+        self._program = load_program(ctx, "present.vert", "present.frag")
+        self._vao = ctx.vertex_array(self._program, [])
+
+    def show(self, picture: moderngl.Texture, framebuffer: moderngl.Framebuffer) -> None:
+        """Fill the lower left corner of `framebuffer` with `picture`, pixel by pixel."""
+        framebuffer.use()
+        self.ctx.viewport = (0, 0, picture.width, picture.height)
+        self.ctx.enable_only(moderngl.NOTHING)
+        picture.use(0)
+        self._program["picture"] = 0
+        self._vao.render(moderngl.TRIANGLES, vertices=3)
+
+    def release(self) -> None:
+        self._vao.release()
+        self._program.release()

@@ -1,0 +1,129 @@
+"""The scene on the GPU: raw attributes in textures, of which only what changed is sent again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.gaussians import ATTRIBUTES, Gaussians
+
+from .layout import SPLAT_TEXTURES, SPLATS_PER_ROW
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an attribute lies: the texture and the first of its float channels."""
+
+    texture: str
+    channel: int
+
+
+_PLACES = {
+    "means": _Place("mean_logit", 0),
+    "logit_opacities": _Place("mean_logit", 3),
+    "log_scales": _Place("log_scale", 0),
+    "quats": _Place("quat", 0),
+    "sh0": _Place("sh0", 0),
+    "shN": _Place("shN", 0),
+}
+_SHOWN_SH = 15  # coefficients above degree 3 ride along in the scene and are not shown
+_GAP = 4  # texture rows: uploading so many untouched ones costs less than another call
+
+
+class SplatTextures:
+    """The raw attributes of a scene in textures, with a copy in memory that partial uploads are taken from.
+
+    Args:
+        ctx: where they live
+        count: N
+        sh_coefficients: K of shN that are shown: 0, 3, 8 or 15
+    """
+
+    def __init__(self, ctx: moderngl.Context, count: int, sh_coefficients: int) -> None:
+        self.count = count
+        self.sh_coefficients = sh_coefficients
+        self.rows = max(1, -(-count // SPLATS_PER_ROW))
+        self._channels = dict.fromkeys(SPLAT_TEXTURES, 4) | {"shN": 3 * max(1, sh_coefficients)}
+        self._memory = {
+            name: np.zeros((self.rows * SPLATS_PER_ROW, channels), np.float32)
+            for name, channels in self._channels.items()
+            if name != "shN" or sh_coefficients
+        }
+        self.textures: dict[str, moderngl.Texture] = {}
+        for name in self._channels:
+            size = (SPLATS_PER_ROW, self.rows)
+            components = 4
+            if name == "shN":
+                size = (SPLATS_PER_ROW * sh_coefficients, self.rows) if sh_coefficients else (1, 1)
+                components = 3
+            texture = ctx.texture(size, components, dtype="f4")
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            self.textures[name] = texture
+
+    def write(
+        self, scene: Gaussians, attributes: Iterable[str] = ATTRIBUTES, rows: NDArray[np.int64] | None = None
+    ) -> int:
+        """Upload what changed.
+
+        Args:
+            scene: the present values, N rows
+            attributes: names of `ATTRIBUTES` that changed
+            rows: sorted indices of the Gaussians that changed; None is all
+
+        Returns:
+            Bytes sent.
+        """
+        touched = []
+        for attribute in attributes:
+            place = _PLACES[attribute]
+            if place.texture not in self._memory or (rows is not None and not len(rows)):
+                continue
+            source = getattr(scene, attribute).detach()
+            if attribute == "shN":
+                source = source[:, : self.sh_coefficients].flatten(1)
+            values = source[:, None] if source.ndim == 1 else source
+            target = torch.from_numpy(self._memory[place.texture])
+            columns = target[: self.count, place.channel : place.channel + values.shape[1]]
+            if rows is None:
+                columns.copy_(values)
+            else:
+                index = torch.from_numpy(rows)
+                columns[index] = values[index].to(columns.dtype)
+            if place.texture not in touched:
+                touched.append(place.texture)
+        return sum(self._send(name, rows) for name in touched)
+
+    def _send(self, name: str, rows: NDArray[np.int64] | None) -> int:
+        texture, memory = self.textures[name], self._memory[name]
+        sent = 0
+        for first, last in [(0, self.rows)] if rows is None else row_runs(rows):
+            part = memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
+            texture.write(part, viewport=(0, first, texture.width, last - first))
+            sent += part.nbytes
+        return sent
+
+    def bind(self, program: moderngl.Program) -> None:
+        """Make them what the samplers of `include/raw_splats.glsl` read."""
+        for unit, (name, texture) in enumerate(self.textures.items()):
+            texture.use(unit)
+            program[name] = unit
+        program["sh_coefficients"] = self.sh_coefficients
+
+    def release(self) -> None:
+        for texture in self.textures.values():
+            texture.release()
+
+
+def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """Texture rows [first, last) that hold the Gaussians `rows` (sorted), near ones joined."""
+    touched = rows // SPLATS_PER_ROW
+    breaks = np.flatnonzero(np.diff(touched) > _GAP)
+    firsts = touched[np.concatenate([[0], breaks + 1])]
+    lasts = touched[np.concatenate([breaks, [len(touched) - 1]])]
+    for first, last in zip(firsts, lasts, strict=True):
+        yield int(first), int(last) + 1
