@@ -87,8 +87,8 @@ def depth_order(depths: Array, candidates: Array, parts: int) -> Array:
 @kernel(inline=True)
 def row_bounds(splat: Array, window: Array) -> tuple[int, int]:
     """First pixel row and one past the last whose centres the splat may reach, within the window."""
-    top = max(math.ceil(splat[MY] - splat[EXTENT_Y] - 0.5 - 1e-6), float(window[1]))
-    bottom = min(math.floor(splat[MY] + splat[EXTENT_Y] - 0.5 + 1e-6) + 1.0, float(window[3]))
+    top = max(np.ceil(splat[MY] - splat[EXTENT_Y] - 0.5 - 1e-6), float(window[1]))
+    bottom = min(np.floor(splat[MY] + splat[EXTENT_Y] - 0.5 + 1e-6) + 1.0, float(window[3]))
     if not top < bottom:
         return 0, 0
     return int(top), int(bottom)
@@ -115,8 +115,8 @@ def tile_columns(splat: Array, side: float, y_first: int, y_last: int, window: A
     left = splat[MX] - splat[SLOPE] * left_at - math.sqrt(max(0.0, splat[R2] - v * v)) * splat[INV_L11]
     v = splat[L22] * right_at
     right = splat[MX] - splat[SLOPE] * right_at + math.sqrt(max(0.0, splat[R2] - v * v)) * splat[INV_L11]
-    first = max(math.ceil(left - 0.5 - 1e-6), float(window[0]))
-    last = min(math.floor(right - 0.5 + 1e-6), float(window[2] - 1))
+    first = max(np.ceil(left - 0.5 - 1e-6), float(window[0]))
+    last = min(np.floor(right - 0.5 + 1e-6), float(window[2] - 1))
     if not first <= last:
         return 0, 0
     return int(first) // TILE_W, int(last) // TILE_W + 1

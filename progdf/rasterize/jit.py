@@ -23,6 +23,10 @@ log = logging.getLogger("progdf")
 FAST = {"nnan", "ninf", "nsz", "contract", "reassoc", "afn"}
 """Float flags of the pixel loops: all but `arcp`, which costs a factor of 10 in gradient accuracy and buys nothing."""
 
+if config.THREADING_LAYER == "default":
+    # OpenMP's threads spin between launches: with a busy neighbour, or torch's own threads, 1 ms becomes 90 ms
+    config.THREADING_LAYER = "workqueue"
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 _lock = threading.RLock()
 

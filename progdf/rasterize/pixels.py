@@ -88,11 +88,11 @@ def row_support(splat: Array, x: int, y: int, first: int, end: int) -> tuple[int
         return 0, 0, 0.0, 0.0, 0.0
     centre = splat[MX] - splat[SLOPE] * dy - x - 0.5
     half = math.sqrt(rest) * splat[INV_L11]
-    start = max(math.ceil(centre - half), float(first))
-    stop = min(math.floor(centre + half) + 1.0, float(end))
+    start = max(np.ceil(centre - half), float(first))
+    stop = min(np.floor(centre + half) + 1.0, float(end))
     if not start < stop:
         return 0, 0, 0.0, 0.0, 0.0
     # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far peaks (needles,
     # giants) lie where l11 is small
-    peak = min(max(math.floor(centre + 0.5), -65536.0), 65536.0)
+    peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
     return int(start), int(stop), peak, splat[L11] * (peak - centre), v

@@ -103,8 +103,10 @@ def project(
         tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K)
     )
     used = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
-    usable = means.isfinite().all(1) & scales.isfinite().all(1) & used.isfinite().flatten(1).all(1)
+    usable = means.isfinite().all(1) & scales.isfinite().all(1)
     usable = usable & opacities.isfinite() & (opacities >= ALPHA_MIN)
+    colored = used.isfinite().flatten(1).all(1)
+    quats = torch.where(quats.isfinite().all(1, keepdim=True), quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     rows = usable.nonzero()[:, 0]
     points = means[rows] @ rotation.T + translation
@@ -138,7 +140,7 @@ def project(
     low, high = (means2d - extents).detach(), (means2d + extents).detach()
     x0, y0, x1, y1 = crop
     shown = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
-    shown = shown & (opacity.detach() >= ALPHA_MIN)
+    shown = shown & (opacity.detach() >= ALPHA_MIN) & colored[rows]
     depths = torch.zeros_like(opacities).index_copy(0, rows, z).detach().float()
     # float32 depth, ties by index: what a viewer can sort by, and the same in every engine
     order = z.detach().float().argsort(stable=True)
