@@ -101,10 +101,9 @@ def bindings(area: Area, ui: UiContext) -> None:
             imgui.same_line(0.0, 28.0 * ui.scale)
         imgui.begin_group()
         wide = max(imgui.calc_text_size(chord).x for chord, _ in rows) + 14.0 * ui.scale
-        start = imgui.get_cursor_pos_x()
         for chord, does in rows:
             imgui.text(chord)
-            imgui.same_line(start + wide)
+            imgui.same_line(wide)  # from the group's left edge
             imgui.text_disabled(does)
         imgui.end_group()
     imgui.pop_font()

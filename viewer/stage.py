@@ -11,13 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import moderngl
+import numpy as np
 from imgui_bundle import imgui
+from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 
 from . import controls, inputs, overlay, panel, workspace
-from .engine import Engine
-from .gl.screen import PictureTarget, read_rgb
+from .engine import Engine, FrameTimings
+from .gl.screen import read_rgb
 from .pick import surface_point
 from .pictures import save_picture
 from .state import ViewCamera, ViewState
@@ -58,8 +60,8 @@ class Stage:
         self.work = workspace.opened(view)
         self.frames = 0  # all that were drawn
         self.drawn = 0  # those with a new picture of the splats
+        self.timings = FrameTimings()  # of the picture on screen
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
-        self._target = PictureTarget(context)
         self._drag: str | None = None
         self._flying = False
         self._clock = 0.0
@@ -70,7 +72,6 @@ class Stage:
         self.ui.make_current()
         imgui.backends.opengl3_shutdown()
         self.ui.close()
-        self._target.release()
 
     def wake(self) -> None:
         """Something happened: draw until everything has settled."""
@@ -83,7 +84,6 @@ class Stage:
     def serve(self, engine: Engine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
         self.engine, self.facts = engine, facts
-        self._target.fresh = True
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -147,12 +147,10 @@ class Stage:
             self.work = workspace.settled(self.work)
         if self.work != before:
             self.wake()
-        self._draw_picture()
+        self._draw_picture(screen)
         self._draw_overlays()
         imgui.render()
         screen.use()
-        screen.clear(*PALETTE.panel)
-        self._target.show(screen)
         imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
         self.frames += 1
         if _strengths(self.work.view) != _strengths(before.view):
@@ -225,13 +223,15 @@ class Stage:
     def _shown(self) -> ViewState:
         return workspace.original(self.work.view) if inputs.holds_original() else self.work.view
 
-    def _draw_picture(self) -> None:
-        """The splats, only where what is shown is not the picture that is already there."""
+    def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
+        """The splats; the engine works only where what is shown is another picture than its last one."""
         view, size = self._shown(), self._picture_size()
-        self._target.fit(size)
-        if self._target.fresh or self.engine.needs_draw(view, size):
-            self.timings = self.engine.draw(view, self._target.framebuffer, size)
-            self._target.fresh = False
+        screen.use()
+        screen.clear(*PALETTE.panel)
+        new = self.engine.needs_draw(view, size)
+        timings = self.engine.draw(view, screen, size)
+        if new:
+            self.timings = timings
             self.drawn += 1
 
     def _draw_overlays(self) -> None:
@@ -249,7 +249,20 @@ class Stage:
                 self.wake()
 
     def _figures(self) -> list[tuple[str, str]]:
-        return []
+        """What the overlay shows of the picture on screen."""
+        t = self.timings
+        lines = [
+            ("frame", f"{t.total_ms:.1f} ms"),
+            ("  compose", f"{t.compose_ms:.1f} ms"),
+            ("  upload", f"{t.upload_ms:.1f} ms"),
+            ("  sort", f"{t.sort_ms:.1f} ms"),
+            ("  draw", f"{t.draw_ms:.1f} ms"),
+        ]
+        if self.latencies_ms:
+            median, late = np.percentile(self.latencies_ms, (50, 95))
+            lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
+        lines.append(("splats", f"{panel.grouped(t.drawn)} of {panel.grouped(self.facts.count)}"))
+        return [*lines, ("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[self.engine.draws_with])]
 
     def take_requests(self) -> tuple[str, ...]:
         """What the window shall do now; asked for once each."""
@@ -258,15 +271,16 @@ class Stage:
 
     def _save_pictures(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         if "picture" in self.work.requests:
-            self._save(self._target.framebuffer, self._target.framebuffer.size)
+            image = self.engine.image(self._shown(), self._picture_size())
+            self._save(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
         if "window_picture" in self.work.requests:
-            self._save(screen, size)
+            self._save(read_rgb(screen, size))
         left = tuple(r for r in self.work.requests if r not in ("picture", "window_picture"))
         self.work = replace(self.work, requests=left)
 
-    def _save(self, source: moderngl.Framebuffer, size: tuple[int, int]) -> None:
+    def _save(self, image: NDArray[np.uint8]) -> None:
         try:
-            path = save_picture(self.pictures, Path(self.facts.title).stem, read_rgb(source, size))
+            path = save_picture(self.pictures, Path(self.facts.title).stem, image)
         except ProgdfError as error:
             self.tell(str(error), error=True)
         except OSError as error:
