@@ -83,7 +83,7 @@ def _skip(name: str, file: BinaryIO, header: PlyHeader, element: Element) -> Non
                     continue
                 found = file.read(kind.itemsize)
                 length = int(np.frombuffer(found, kind)[0]) if len(found) == kind.itemsize else -1
-                if length < 0 or length * int(column.type[1]) > header.file_size - file.tell():
+                if length < 0:
                     raise _cut_short(name, element)
                 file.seek(length * int(column.type[1]), os.SEEK_CUR)
 

@@ -234,6 +234,7 @@ def test_a_broken_sh_coefficient_costs_only_itself(tmp_path: Path) -> None:
 
 def test_an_exactly_flat_gaussian_stays_visible(tmp_path: Path) -> None:
     scene, report = damaged(tmp_path, {"scale_2": (4, -np.inf)})
+    assert bool(scene.log_scales.isfinite().all())
     assert float(scene.scales[4, 2]) < 1e-8
     assert float(scene.logit_opacities[4]) == float(scene_of().logit_opacities[4])
     assert report.flat_scales == 1
@@ -291,6 +292,17 @@ def lacking(*names: str) -> dict[str, np.ndarray]:
 )
 def test_a_missing_property_is_named(lost: tuple[str, ...], said: str, tmp_path: Path) -> None:
     assert said in refusal(write(tmp_path / "scene.ply", lacking(*lost)))
+
+
+def test_a_gap_in_the_sh_properties_is_named(tmp_path: Path) -> None:
+    columns = {("f_rest_45" if k == "f_rest_44" else k): v for k, v in table_of(scene_of()).items()}
+    assert "without f_rest_44" in refusal(write(tmp_path / "scene.ply", columns))
+
+
+def test_an_element_after_the_gaussians_must_fit_behind_them(tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of()), after=[camera_element()])
+    path.write_bytes(path.read_bytes().replace(b"camera 1", b"camera 2"))
+    assert "promises 2 rows of 'camera'" in refusal(path)
 
 
 def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
@@ -355,14 +367,21 @@ def test_a_false_count_is_refused_and_allocates_nothing(count: bytes, text: bool
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_a_list_that_claims_more_than_the_file_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "length"), [("uint", 4_000_000_000), ("int", -1)])
+def test_a_list_of_impossible_length_is_refused(kind: str, length: int, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, scene_of())
     head, body = path.read_bytes().split(b"element vertex", 1)
-    face = b"element face 1\nproperty list uint double corners\n"
+    face = b"element face 1\nproperty list %s double corners\n" % kind.encode()
     columns, rows = body.split(b"end_header\n", 1)
     content = (
-        head + face + b"element vertex" + columns + b"end_header\n" + struct.pack("<I", 4_000_000_000) + rows
+        head
+        + face
+        + b"element vertex"
+        + columns
+        + b"end_header\n"
+        + struct.pack("<i" if length < 0 else "<I", length)
+        + rows
     )
     path.write_bytes(content)
     assert "ends within" in refusal(path)
