@@ -51,9 +51,9 @@ class _Target:
 class SplatRenderer:
     """Draws a scene into an RGBA32F texture; row 0 of it is the first row of the picture.
 
-    The CPU engine (as 3DGS) leaves out a Gaussian that would bring a pixel's transmittance to 1e-4 or below, and
-    all behind it. Blending from the back cannot know what will cover a pixel, so here they count: a difference of
-    at most 0.01 of a colour, 76 to 80 dB in a picture. Without that rule the two agree to 120 dB and more.
+    The CPU engine (as 3DGS) leaves out a Gaussian that would bring a pixel's transmittance to 1e-4 or below,
+    and all behind it. Blending from the back cannot know what will cover a pixel, so here they count: at most
+    0.01 of a colour, 76 to 80 dB in a picture. Without that rule the two agree to 120 dB and more.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
