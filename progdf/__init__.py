@@ -4,10 +4,26 @@ from __future__ import annotations
 
 from progdf.camera import Camera
 from progdf.camera_files import load_cameras
+from progdf.checkpoint import Gdf, load_gdf, save_gdf
+from progdf.compose import Layer, compose
 from progdf.gaussians import Gaussians
 from progdf.ply import load_ply, save_ply
 from progdf.rasterize import rasterize, render
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "Gaussians", "__version__", "load_cameras", "load_ply", "rasterize", "render", "save_ply"]
+__all__ = [
+    "Camera",
+    "Gaussians",
+    "Gdf",
+    "Layer",
+    "__version__",
+    "compose",
+    "load_cameras",
+    "load_gdf",
+    "load_ply",
+    "rasterize",
+    "render",
+    "save_gdf",
+    "save_ply",
+]

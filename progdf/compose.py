@@ -1,39 +1,100 @@
-"""Several edits on one scene: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s)."""
+"""Several edits on one scene: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s) (method.md 6).
+
+`compose` is the plain form that states the rules. `progdf.composer.Composer` gives the same numbers while a
+slider is dragged, in buffers that are made once.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
+import torch
 from torch import Tensor
 
-from progdf.checkpoint import Gdf
+from progdf.checkpoint import verify
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.layers import BLENDS, Gains, Layer, check_layers
 
-BLENDS = ("normalised", "sum", "over")
+__all__ = ["BLENDS", "Gains", "Layer", "compose"]
 
-
-@dataclass(frozen=True)
-class Gains:
-    """How much of each kind of change a layer lets through; 1 is the edit as trained, 0 none."""
-
-    geometry: float = 1.0
-    opacity: float = 1.0
-    colour: float = 1.0
+NOTHING = -0.0
+"""The number that added to any other, −0.0 included, leaves every bit as it was."""
 
 
-@dataclass(frozen=True)
-class Layer:
-    """One edit in the stack.
+def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised") -> Gaussians:
+    """The scene under a stack of edits.
+
+    With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:
+
+    - "normalised": Σ m g Δ(s) / max(1, Σ m s). One layer alone is untouched, order does not matter, and it
+      is the plain sum while the strengths on a Gaussian add up to no more than 1.
+    - "sum": Σ m g Δ(s).
+    - "over": in the order given, Δ ← Δ · (1 − m s) + m g Δ(s); the last layer lies on top.
+
+    In Σ m s and 1 − m s, s is held to 0..1: an overshoot exaggerates its own edit and does not dim the
+    others.
 
     Args:
-        gdf: the edit
-        strength: slider value s, 0..1; above 1 is extrapolation
-        enabled: a disabled layer does nothing at all
-        gains: per-attribute gains
-        weights: soft membership times painted weight per member, 0..1; None is 1 everywhere. [M] float32
-    """
+        scene: the original
+        layers: edits of this scene, the lowest first
+        blend: one of `BLENDS`
 
-    gdf: Gdf
-    strength: float = 1.0
-    enabled: bool = True
-    gains: Gains = Gains()
-    weights: Tensor | None = None
+    Returns:
+        New Gaussians; attributes that no layer moves are the scene's own tensors. Rows outside all members,
+        rows of weight 0, and everything at strength 0 keep their bytes. One layer at strength 1 gives Θ0 +
+        full exactly.
+
+    Raises:
+        ProgdfError: an edit belongs to another scene, a strength is not a number, the blend rule is unknown.
+        ValueError: weights do not fit.
+    """
+    check_layers(layers, blend)
+    for layer in layers:
+        verify(layer.gdf, scene)
+    active = [layer for layer in layers if layer.active]
+    if not active or not len(scene):
+        return scene
+    weights = [_weights(layer) for layer in active]
+    reached = [layer.gdf.region.members[m != 0] for layer, m in zip(active, weights, strict=True)]
+    rows = torch.unique(torch.cat(reached))
+    crowd = torch.zeros(len(rows))  # Σ m s
+    for layer, m in zip(active, weights, strict=True):
+        index, selected = _places(rows, layer.gdf.region.members, m)
+        crowd[index] += m[selected] * layer.cover
+
+    changed: dict[str, Tensor] = {}
+    for name in ATTRIBUTES:
+        movers = [name in layer.gdf.field.attributes and layer.gain(name) != 0 for layer in active]
+        if not any(movers):
+            continue
+        old: Tensor = getattr(scene, name)
+        total = torch.full((len(rows), old[0].numel()), NOTHING)
+        for layer, m, moves in zip(active, weights, movers, strict=True):
+            index, selected = _places(rows, layer.gdf.region.members, m)
+            share = m[selected, None]
+            below = total[index]
+            if blend == "over":
+                below = below * (1 - share * layer.cover)
+            if moves:
+                offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[selected]
+                below = below + share * layer.gain(name) * offsets
+            total[index] = below
+        if blend == "normalised":
+            total = total / crowd.clamp(min=1.0)[:, None]
+        new = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
+        changed[name] = old.index_copy(0, rows, new)
+    return replace(scene, **changed)
+
+
+def _weights(layer: Layer) -> Tensor:
+    """Weight of every member. [M] float32"""
+    if layer.weights is None:
+        return torch.ones(len(layer.gdf.region))
+    return layer.weights.float()
+
+
+def _places(rows: Tensor, members: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Where in `rows` a layer's members of weight ≠ 0 lie, and which members these are. [m], [m] int64"""
+    selected = weights.nonzero()[:, 0]
+    return torch.searchsorted(rows, members[selected]), selected

@@ -3,5 +3,7 @@
 from __future__ import annotations
 
 from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.keyframes import fit_keyframes
+from progdf.field.separable import fit_separable
 
-__all__ = ["AttributeBases", "BakedField"]
+__all__ = ["AttributeBases", "BakedField", "fit_keyframes", "fit_separable"]

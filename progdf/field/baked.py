@@ -15,6 +15,9 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices
 
+REST_TYPES = (torch.int8, torch.float16, torch.float32)
+"""How bases 1..R may be stored."""
+
 
 @dataclass(frozen=True)
 class AttributeBases:
@@ -33,14 +36,25 @@ class AttributeBases:
     coefficients: Tensor
 
     def __post_init__(self) -> None:
+        if self.full.ndim != 2 or self.rest.ndim != 3:
+            raise ValueError(
+                f"full is {list(self.full.shape)}, rest {list(self.rest.shape)}; expected [M,c], [R,M,c]"
+            )
         members, width = self.full.shape
         ranks = self.rest.shape[0]
+        if self.rest.dtype not in REST_TYPES:
+            raise ValueError(f"rest is {self.rest.dtype}, expected int8, float16 or float32")
+        for name in ("full", "step", "coefficients"):
+            if getattr(self, name).dtype != torch.float32:
+                raise ValueError(f"{name} is {getattr(self, name).dtype}, expected float32")
         if tuple(self.rest.shape[1:]) != (members, width) or tuple(self.step.shape) != (ranks, width):
             raise ValueError(
                 f"rest {list(self.rest.shape)} or step {list(self.step.shape)} does not fit full"
             )
         if self.coefficients.ndim != 2 or self.coefficients.shape[1] != 1 + ranks:
             raise ValueError(f"coefficients is {list(self.coefficients.shape)}, expected [S, {1 + ranks}]")
+        if not len(self.coefficients):
+            raise ValueError("coefficients has no nodes")
         ends = self.coefficients[[0, -1]]
         if bool(ends[0].any()) or bool(ends[1, 1:].any()) or float(ends[1, 0]) != 1.0:
             raise ValueError("coefficients must be 0 at s = 0 and 1, 0, …, 0 at s = 1")
@@ -71,11 +85,16 @@ class BakedField:
     recorded: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.nodes.ndim != 1 or self.nodes.dtype != torch.float32:
+            raise ValueError(f"nodes is {list(self.nodes.shape)} {self.nodes.dtype}, expected float32 [S]")
         if len(self.nodes) < 2 or float(self.nodes[0]) != 0.0 or float(self.nodes[-1]) != 1.0:
             raise ValueError("nodes must run from 0 to 1")
         if bool((self.nodes[1:] <= self.nodes[:-1]).any()):
             raise ValueError("nodes must ascend")
         slices = attribute_slices(self.channels)
+        counts = {bases.full.shape[0] for bases in self.attributes.values()}
+        if len(counts) > 1:
+            raise ValueError(f"the attributes have different numbers of members: {sorted(counts)}")
         for name, bases in self.attributes.items():
             if name not in slices or slices[name].stop - slices[name].start != bases.full.shape[1]:
                 raise ValueError(f"{name} has {bases.full.shape[1]} channels, which do not fit a packed row")
@@ -108,6 +127,18 @@ class BakedField:
         share = (s - left_s) / (right_s - left_s)
         return table[right - 1] + share * (table[right] - table[right - 1])
 
+    def attribute_offsets(self, name: str, s: float) -> Tensor:
+        """Offsets of one attribute at strength `s`, raw space; exactly 0 at 0, `full` at 1. [M,c] float32"""
+        bases = self.attributes[name]
+        weights = self.coefficients(name, s)
+        if not bool(weights.any()):
+            return torch.zeros_like(bases.full)
+        total = weights[0] * bases.full
+        for k in range(bases.rest.shape[0]):
+            if float(weights[1 + k]) != 0.0:
+                total = total + (weights[1 + k] * bases.step[k]) * bases.rest[k].float()
+        return total
+
     def offsets(self, s: float) -> Tensor:
         """Offsets of the raw parameters at strength `s`, packed as in `gaussians.pack`. [M,C] float32
 
@@ -115,13 +146,6 @@ class BakedField:
         """
         packed = torch.zeros(self.members, self.channels)
         slices = attribute_slices(self.channels)
-        for name, bases in self.attributes.items():
-            weights = self.coefficients(name, s)
-            if not bool(weights.any()):
-                continue
-            total = weights[0] * bases.full
-            for k in range(bases.rest.shape[0]):
-                if float(weights[1 + k]) != 0.0:
-                    total = total + (weights[1 + k] * bases.step[k]) * bases.rest[k].float()
-            packed[:, slices[name]] = total
+        for name in self.attributes:
+            packed[:, slices[name]] = self.attribute_offsets(name, s)
         return packed

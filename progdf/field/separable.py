@@ -1,0 +1,209 @@
+"""The separable field: Δ_i(s) = Σ_k B_ik a_k(s), one small sum per attribute, fitted by weighted SVD
+(method.md 5).
+
+Basis 0 is the recorded end in float32, so that s = 1 has no error. What it leaves is a matrix of snapshots
+× numbers whose leading singular vectors are bases 1..R; those are kept as int8, and the coefficients are
+solved again for the bases as stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.field.baked import AttributeBases, BakedField
+from progdf.gaussians import attribute_slices
+
+LEVELS = 127
+"""Largest int8 level that is used; −128 is left out to keep the levels symmetric."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """One attribute's trajectory, taken apart.
+
+    Args:
+        offsets: recorded offsets. [T,M,c] float32
+        weights: how much an error of each number shows, ≥ 0. [M,c] float32
+        mix: bases 1, 2, … as sums of what basis 0 leaves at the snapshots, strongest first. [T,R] float32
+        lead: a_0 at the snapshots when it stands alone. [T] float32
+        energy: weighted squared error at each snapshot with the first 0, 1, … R of them. [R+1,T] float64
+    """
+
+    offsets: Tensor
+    weights: Tensor
+    mix: Tensor
+    lead: Tensor
+    energy: Tensor
+
+    @property
+    def largest_rank(self) -> int:
+        """The rank beyond which nothing is left to explain."""
+        return int(self.mix.shape[1])
+
+
+def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
+    """Refuse what is no trajectory.
+
+    Raises:
+        ValueError: strengths do not ascend from 0 to 1, offsets are not [T,M,C], do not start at 0, or have a
+            number that is not finite.
+    """
+    count = len(strengths)
+    if offsets.ndim != 3 or offsets.shape[0] != count or strengths.ndim != 1:
+        raise ValueError(f"offsets is {list(offsets.shape)} for {count} strengths, expected [T,M,C]")
+    if count < 2 or float(strengths[0]) != 0 or float(strengths[-1]) != 1:
+        raise ValueError("strengths must run from 0 to 1")
+    if bool((strengths[1:] <= strengths[:-1]).any()):
+        raise ValueError("strengths must ascend")
+    if not bool(torch.isfinite(offsets).all()):
+        raise ValueError("an offset is not finite")
+    if bool(offsets[0].any()):
+        raise ValueError("the offsets at strength 0 must be 0")
+
+
+def channel_weights(weights: Tensor | None, members: int, channels: int) -> Tensor:
+    """Weights as [M,C] float32, from None (all 1), [M] (visibility) or [M,C] (sensitivity)."""
+    if weights is None:
+        return torch.ones(members, channels)
+    spread = weights.float() if weights.ndim == 2 else weights.float()[:, None].expand(members, channels)
+    if tuple(spread.shape) != (members, channels):
+        raise ValueError(f"weights is {list(weights.shape)}, expected [{members}] or [{members}, {channels}]")
+    if not bool(torch.isfinite(spread).all()) or bool((spread < 0).any()):
+        raise ValueError("weights must be finite and not negative")
+    return spread
+
+
+def moving_attributes(offsets: Tensor, stillness: Mapping[str, float] | None = None) -> dict[str, slice]:
+    """The attributes that move at all, and their columns.
+
+    Args:
+        offsets: recorded offsets. [T,M,C]
+        stillness: largest |offset| of an attribute that still counts as standing still; 0 where not named
+    """
+    limits = stillness or {}
+    return {
+        name: columns
+        for name, columns in attribute_slices(offsets.shape[2]).items()
+        if offsets[:, :, columns].numel()
+        and float(offsets[:, :, columns].abs().max()) > limits.get(name, 0.0)
+    }
+
+
+def spectrum(offsets: Tensor, weights: Tensor, emphasis: Tensor | None = None) -> Spectrum:
+    """Take one attribute's trajectory apart by a weighted SVD.
+
+    Args:
+        offsets: [T,M,c] float32, first row 0
+        weights: [M,c] ≥ 0
+        emphasis: how much each snapshot counts, > 0; None is evenly. [T]
+    """
+    snapshots = len(offsets)
+    rows = offsets.flatten(1) * weights.sqrt().flatten()
+    end = rows[-1]
+    power = (end @ end).double()
+    lead = (rows @ end).double() / power if power > 0 else torch.linspace(0, 1, snapshots).double()
+    lead[0], lead[-1] = 0.0, 1.0
+    residual = torch.addcmul(rows, lead.float()[:, None], end, value=-1)
+    residual[[0, -1]] = 0.0
+    root = torch.ones(snapshots).double() if emphasis is None else emphasis.double().sqrt()
+    # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
+    gram = (residual @ residual.T).double()
+    values, vectors = torch.linalg.eigh(root[:, None] * gram * root)
+    values, vectors = values.flip(0).clamp(min=0), vectors.flip(1)
+    rank = min(int((values > 1e-9 * values[0]).sum()), max(snapshots - 2, 0))
+    values, vectors = values[:rank], vectors[:, :rank]
+    explained = (vectors.square() * values).T / root.square()
+    explained = torch.cat([torch.zeros(1, snapshots).double(), explained.cumsum(0)])
+    energy = (gram.diagonal() - explained).clamp(min=0)
+    return Spectrum(offsets, weights, (root[:, None] * vectors).float(), lead.float(), energy)
+
+
+def bases(taken: Spectrum, rank: int, rest_type: torch.dtype = torch.int8) -> AttributeBases:
+    """The first `rank` further bases as stored, with coefficients solved for what is stored.
+
+    Args:
+        taken: the attribute's trajectory
+        rank: number of bases beside the full offset, ≥ 0; more than there are is all of them
+        rest_type: int8, float16 or float32
+    """
+    mix = taken.mix[:, : min(rank, taken.largest_rank)]
+    full = taken.offsets[-1].contiguous()
+    shape = (mix.shape[1], *full.shape)
+    residual = taken.offsets.flatten(1) - taken.lead[:, None] * full.flatten()
+    rest, step = stored_bases((mix.T @ residual).reshape(shape), rest_type)
+    table = solved_coefficients(taken.offsets, full, rest.float() * step[:, None], taken.weights)
+    return AttributeBases(full, rest, step, table)
+
+
+def stored_bases(exact: Tensor, rest_type: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Bases in their stored type, and what one unit is worth. [R,M,c] -> [R,M,c], [R,c] float32"""
+    largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
+    if rest_type == torch.int8:
+        step = largest / LEVELS
+        step = torch.where(step > 0, step, torch.ones_like(step))
+        return (exact / step[:, None]).round().clamp(-LEVELS, LEVELS).to(torch.int8), step
+    step = torch.where(largest > 0, largest, torch.ones_like(largest))  # keeps float16 away from its limits
+    return (exact / step[:, None]).to(rest_type), step
+
+
+def solved_coefficients(offsets: Tensor, full: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
+    """Least squares for a_0 … a_R at every snapshot; both ends are given, not solved. [T,1+R] float32
+
+    Args:
+        offsets: [T,M,c]
+        full: basis 0. [M,c]
+        rest: bases 1..R in real units. [R,M,c]
+        weights: [M,c]
+    """
+    root = weights.sqrt().flatten()
+    columns = torch.cat([full[None], rest]).flatten(1) * root
+    scale = columns.norm(dim=1).clamp(min=1e-30)
+    columns = columns / scale[:, None]
+    rows = offsets.flatten(1) * root
+    normal = (columns @ columns.T).double()
+    table: Tensor = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-7, hermitian=True)
+    table = (table / scale).float()
+    if not bool(full.any()):
+        table[:, 0] = 0.0  # nothing to scale; the end is still a_0 = 1
+    table[0] = 0.0
+    table[-1] = 0.0
+    table[-1, 0] = 1.0
+    return table
+
+
+def fit_separable(
+    strengths: Tensor,
+    offsets: Tensor,
+    ranks: Mapping[str, int],
+    weights: Tensor | None = None,
+    recorded: Sequence[float] | None = None,
+    rest_type: torch.dtype = torch.int8,
+) -> BakedField:
+    """The separable field of a trajectory with given ranks.
+
+    Args:
+        strengths: of the snapshots, ascending from 0 to 1. [T]
+        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
+        ranks: number of bases beside the full offset, by attribute; 0 where not named
+        weights: how much an error shows: visibility [M] or sensitivity [M,C]; None is evenly
+        recorded: strengths for the slider's ticks; `strengths` when None
+        rest_type: how bases 1..R are stored: int8, float16 or float32
+
+    Returns:
+        A field with the snapshots as nodes; attributes that never move are absent.
+
+    Raises:
+        ValueError: no trajectory, or weights that do not fit.
+    """
+    check_trajectory(strengths, offsets)
+    spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
+    attributes = {
+        name: bases(spectrum(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type)
+        for name, columns in moving_attributes(offsets).items()
+    }
+    ticks = strengths.tolist() if recorded is None else recorded
+    return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
