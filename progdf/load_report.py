@@ -91,7 +91,7 @@ class LoadReport:
         if self.sh_degree == 4:
             sh += " (band 4 is kept, and not shown)"
         lines = [
-            f"{self.file}: {counted(self.count)}, {sh}, {self.format}, {_size(self.file_bytes)}",
+            f"{self.file}: {counted(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
             *(f"ignored: {phrase}" for phrase in self.ignored),
         ]
         if self.scaled_quats:
@@ -106,10 +106,11 @@ def counted(count: int) -> str:
     return f"{grouped(count)} Gaussian{'' if count == 1 else 's'}"
 
 
-def _size(count: int) -> str:
+def file_size(count: int) -> str:
+    """Bytes for a person: "4.7 MB", "1.8 kB"."""
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
 
 
 def grouped(number: int) -> str:
-    """12345 as 12 345."""
+    """12345 as "12 345"."""
     return f"{number:,}".replace(",", " ")

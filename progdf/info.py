@@ -1,0 +1,121 @@
+"""`progdf info FILE`: what a scene, an edit or a camera file holds, told by its content."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from progdf.camera_files import load_cameras
+from progdf.checkpoint import load_gdf
+from progdf.errors import ProgdfError
+from progdf.files import open_failure
+from progdf.load_report import counted, file_size, grouped
+from progdf.ply import load_ply_with_report
+from progdf.survey import survey
+
+
+@dataclass(frozen=True)
+class Options:
+    """Tell what a .ply scene, a .gdf edit or a camera file holds, an edit with its error report.
+
+    Args:
+        file: the file; its content decides what it is, not its name
+    """
+
+    file: Annotated[Path, tyro.conf.Positional]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
+    path = tyro.cli(Options, args=list(argv), prog="progdf info").file
+    for line in _DESCRIBE[kind_of(path)](path):
+        print(line)
+    return 0
+
+
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """ "ply", "gdf" or "cameras", by content; by name where the content says nothing.
+
+    Raises:
+        ProgdfError: it cannot be read, or is nothing we know.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            start = file.read(64)
+    except OSError as error:
+        raise open_failure(path, error) from None
+    if start[:3] == b"ply":
+        return "ply"
+    if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
+        return "gdf"
+    if start.lstrip()[:1] in (b"{", b"["):
+        return "cameras"
+    suffix = Path(path).suffix.lower().lstrip(".")
+    if suffix in ("ply", "gdf"):
+        return suffix  # its reader knows best what is wrong
+    raise ProgdfError(f"{path} is nothing progdf knows; give a .ply scene, a .gdf edit or a camera file")
+
+
+def _scene_lines(path: Path) -> Iterator[str]:
+    scene, report = load_ply_with_report(path)
+    yield from report.lines()
+    yield from survey(scene).lines()
+
+
+def _edit_lines(path: Path) -> Iterator[str]:
+    gdf = load_gdf(path)
+    members, count = len(gdf.region), gdf.scene.count
+    yield f"{path.name}: the edit '{gdf.name}', {file_size(path.stat().st_size)}"
+    if gdf.instruction:
+        yield f"asked for: {gdf.instruction}"
+    yield f"scene: {counted(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
+    yield f"region: {gdf.region.name}, {counted(members)} ({members / count:.1%})"
+    bases = ", ".join(f"{name} {1 + part.rest.shape[0]}" for name, part in gdf.field.attributes.items())
+    yield (
+        f"field: {gdf.field.kind}, {gdf.field.bytes_per_member:.4g} bytes per Gaussian, "
+        f"{len(gdf.field.nodes)} nodes; bases: {bases or 'none, nothing moves'}"
+    )
+    if gdf.field.recorded:
+        yield f"recorded: {len(gdf.field.recorded)} snapshots"
+    for head, content in (("option", gdf.options), ("report", gdf.report)):
+        for name, value in _flat(content):
+            yield f"{head}: {name} {value}"
+
+
+def _camera_lines(path: Path) -> Iterator[str]:
+    cameras = load_cameras(path)
+    yield f"{path.name}: {len(cameras)} camera{'' if len(cameras) == 1 else 's'}"
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""
+    yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
+
+
+_DESCRIBE = {"ply": _scene_lines, "gdf": _edit_lines, "cameras": _camera_lines}
+
+
+def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """("field.psnr_worst", "46.9") … of a nested JSON table; long lists are counted, not shown."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{name}.")
+        elif isinstance(value, list) and len(value) > 8:
+            yield f"{above}{name}", f"{grouped(len(value))} values"
+        else:
+            yield f"{above}{name}", _shown(value)
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "not measured"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join(_shown(entry) for entry in value) or "none"
+    return " ".join(str(value).split())
