@@ -109,8 +109,11 @@ class _App:
         screen = self.context.screen
         self.stage.frame(screen, self.window.pixels, seconds, self.window.fly_keys(), arrived)
         self.window.present()
-        if "full_screen" in self.stage.take_requests():
+        requests = self.stage.take_requests()
+        if "full_screen" in requests:
             self.window.toggle_full_screen()
+        if "quit" in requests:
+            self.window.ask_to_close()
 
     def _redraw(self) -> None:
         try:

@@ -189,6 +189,7 @@ KEYS = (
     Key("F10", "overlay", "timings"),
     Key("F11", "full_screen", "full screen"),
     Key("F12", "panel", "hide the panel"),
+    Key("Ctrl+Q", "quit", "quit"),
 )
 
 

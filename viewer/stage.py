@@ -197,17 +197,17 @@ class Stage:
 
     def _moved_by_mouse(self, camera: ViewCamera) -> ViewCamera:
         io, radius, scale = imgui.get_io(), self.facts.bounds.radius, self.ui.scale
+        dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
+        if self._drag and (dx or dy):
+            # also where the button went up within this frame: a slow frame must not lose the end of a drag
+            camera = controls.drag(camera, self._drag, dx, dy, self._area().height / scale, radius)
         if not inputs.any_button_down():
             self._drag = None
         if not io.want_capture_mouse:
             if imgui.is_mouse_double_clicked(0):
                 return self._pivot_picked(camera)
             self._drag = inputs.drag_begun(camera.mode) or self._drag
-            if io.mouse_wheel:
-                camera = controls.zoom(camera, io.mouse_wheel, radius)
-        dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
-        if self._drag and (dx or dy):
-            camera = controls.drag(camera, self._drag, dx, dy, self._area().height / scale, radius)
+            camera = controls.zoom(camera, io.mouse_wheel, radius) if io.mouse_wheel else camera
         return camera
 
     def _pivot_picked(self, camera: ViewCamera) -> ViewCamera:

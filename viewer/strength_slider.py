@@ -64,7 +64,7 @@ def draw(
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(1.0, max(0.0, (mouse - start) / span))
         _anchor(label, mouse, value)
-    elif held:
+    elif held or imgui.is_item_deactivated():  # a slow frame may hold the last move and the release
         fine = imgui.get_io().key_shift
         if storage.get_bool(_slot(label, "fine")) != fine:
             _anchor(label, mouse, value)

@@ -171,6 +171,12 @@ def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera
 def first_camera(
     scene: Gaussians, cameras: Sequence[Camera] = (), aspect: float = 1.5, fov_y: float = 45.0
 ) -> ViewCamera:
-    """What one sees first: all of the scene, upright, from the front and a little above."""
+    """What one sees first: all of the scene, upright, from the front and a little above.
+
+    An up axis within two degrees of a world axis is that axis: nobody holds a camera straighter.
+    """
     x, y, z = (float(c) for c in guess_up(scene, cameras)) if len(scene) else (0.0, 1.0, 0.0)
+    for i, c in enumerate((x, y, z)):
+        if abs(c) > math.cos(math.radians(2.0)):
+            x, y, z = (math.copysign(1.0, c) if j == i else 0.0 for j in range(3))
     return frame(ViewCamera(up=(x, y, z), azimuth=20.0, fov_y=fov_y), bounds_of(scene), aspect)

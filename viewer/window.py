@@ -107,6 +107,9 @@ class Window:
         else:
             glfw.poll_events()
 
+    def ask_to_close(self) -> None:
+        glfw.set_window_should_close(self.handle, True)
+
     @property
     def closing(self) -> bool:
         return bool(glfw.window_should_close(self.handle))

@@ -53,7 +53,7 @@ class Workspace:
         focus: the focused layer, an index into `view.layers`, or None
         help: whether the list of bindings is shown
         message: the line at the bottom, or None
-        requests: what the window has still to do: "picture", "window_picture", "full_screen"
+        requests: what the window has still to do: "picture", "window_picture", "full_screen", "quit"
     """
 
     view: ViewState
@@ -162,7 +162,7 @@ def _fly(workspace: Workspace, _: str) -> Workspace:
     return with_camera(workspace, controls.toggle_fly(workspace.view.camera))
 
 
-REQUESTS = ("picture", "window_picture", "full_screen")
+REQUESTS = ("picture", "window_picture", "full_screen", "quit")
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": lambda workspace, _: replace(workspace, focus=None),
