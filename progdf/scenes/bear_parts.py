@@ -1,0 +1,100 @@
+"""The bear's anatomy: where each ellipsoid sits. The bear is two units high, y is up, it looks along +z."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from progdf.scenes.surface import Part, ball, dome, ring
+
+LABELS = ("body", "head", "ears", "arms", "legs", "scarf", "plinth", "grass")
+
+Triple = tuple[float, float, float]
+
+
+def turned(degrees: Triple) -> Tensor:
+    """Rotation about x, then y, then z, in degrees. [3,3]"""
+    matrix = torch.eye(3)
+    for axis, angle in enumerate(degrees):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        one = torch.eye(3)
+        i, j = [(1, 2), (2, 0), (0, 1)][axis]
+        one[i, i], one[j, j], one[i, j], one[j, i] = c, c, -s, s
+        matrix = one @ matrix
+    return matrix
+
+
+def _ellipsoid(
+    name: str,
+    label: str,
+    centre: Triple,
+    radii: Triple,
+    turn: Triple = (0.0, 0.0, 0.0),
+    weight: float = 1.0,
+    exponent: float = 2.0,
+    casts_shadow: bool = True,
+) -> Part:
+    matrix = turned(turn) @ torch.diag(torch.tensor(radii))
+    return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow)
+
+
+def _pair(
+    name: str, label: str, centre: Triple, radii: Triple, turn: Triple = (0, 0, 0), weight: float = 1.0
+) -> list[Part]:
+    """The part on the +x side and its mirror image; `turn` is that of the +x side."""
+    x, y, z = centre
+    mirrored = (turn[0], -turn[1], -turn[2])
+    return [
+        _ellipsoid(name, label, (x, y, z), radii, turn, weight),
+        _ellipsoid(name, label, (-x, y, z), radii, mirrored, weight),
+    ]
+
+
+def bear_parts() -> list[Part]:
+    """Every part of the scene, the bear first, the lawn last."""
+    return [
+        _ellipsoid("body", "body", (0.0, 0.57, 0.0), (0.50, 0.60, 0.45)),
+        _ellipsoid("tail", "body", (0.0, 0.17, -0.44), (0.13, 0.13, 0.13)),
+        _ellipsoid("head", "head", (0.0, 1.47, 0.05), (0.47, 0.415, 0.42), weight=1.5),
+        _ellipsoid("muzzle", "head", (0.0, 1.365, 0.40), (0.215, 0.165, 0.19), weight=2.2),
+        _ellipsoid("nose", "head", (0.0, 1.44, 0.575), (0.085, 0.060, 0.055), weight=5.0, casts_shadow=False),
+        *[
+            _ellipsoid(
+                "eye", "head", (x, 1.545, 0.425), (0.050, 0.056, 0.040), weight=7.0, casts_shadow=False
+            )
+            for x in (0.17, -0.17)
+        ],
+        *_pair("ear", "ears", (0.335, 1.815, 0.02), (0.175, 0.175, 0.085), (0, 18, -24), weight=1.5),
+        *_pair("arm", "arms", (0.505, 0.72, 0.14), (0.155, 0.395, 0.17), (-24, 0, 16)),
+        *_pair("leg", "legs", (0.285, 0.185, 0.44), (0.195, 0.40, 0.195), (84, 16, 0)),
+        *_pair("foot", "legs", (0.355, 0.235, 0.80), (0.195, 0.235, 0.115), (-12, 16, 0), weight=1.3),
+        Part(
+            "scarf",
+            "scarf",
+            ring(0.27),
+            torch.tensor([0.0, 1.10, 0.03]),
+            turned((6.0, 0.0, 0.0)) @ torch.diag(torch.tensor([0.350, 0.42, 0.330])),
+            weight=3.5,
+            casts_shadow=False,
+        ),
+        _ellipsoid("knot", "scarf", (0.13, 1.035, 0.405), (0.085, 0.075, 0.06), (0, 0, -15), 3.5, 2.6, False),
+        _ellipsoid(
+            "end", "scarf", (0.205, 0.825, 0.437), (0.088, 0.235, 0.027), (10, 8, 14), 3.5, 5.0, False
+        ),
+        _ellipsoid(
+            "end", "scarf", (0.075, 0.845, 0.462), (0.088, 0.200, 0.027), (10, 2, -8), 3.5, 5.0, False
+        ),
+        _ellipsoid("plinth", "plinth", (0.0, -0.15, 0.20), (1.20, 0.16, 1.20), exponent=7.0, weight=0.55),
+        Part(
+            "grass",
+            "grass",
+            dome(0.27),
+            torch.tensor([0.0, -0.24, 0.20]),
+            torch.diag(torch.tensor([3.6, 3.6, 3.6])),
+            weight=0.35,
+            density=lambda radius: 1 / (0.08 + radius) ** 1.1,
+            casts_shadow=False,
+        ),
+    ]
