@@ -105,6 +105,8 @@ def _is_shown(parts: Sequence[Part], own: Part, at: Samples) -> Tensor:
     for part in parts:
         if part is not own and (part.name == "grass" or part.touches(own)):
             shown &= part.depth(at.points) <= 0.6 * at.spacing.clamp_max(0.03)
+            if part.clears and not own.clears:
+                shown &= part.level(at.points) > 1 + part.clears
     return shown
 
 
@@ -149,7 +151,7 @@ def _standing(part: Part) -> float:
     """The share of a part's Gaussians that are hairs or blades."""
     if part.name == "grass":
         return 0.55
-    return 0.22 if part.name in FUR else 0.10 if part.name in WOOL else 0.0
+    return 0.22 if part.name in FUR else 0.05 if part.name in WOOL else 0.0
 
 
 def _lay(
@@ -163,6 +165,11 @@ def _lay(
     swirl = torch.stack([noise(at.points + 3.1 * k, table, 2.5) for k in range(3)], dim=1)
     flow = torch.tensor([0.0, 1.0 if part.name == "grass" else -1.0, 0.0]) + 0.7 * swirl
     flow = flow + 0.35 * torch.randn(n, 3, generator=random)
+    if part.name in WOOL:  # along the stripes, which keeps their edges crisp
+        forth = torch.stack([at.local[:, 2], torch.zeros(n), -at.local[:, 0]], dim=1) @ part.matrix.T
+        flow = (
+            torch.linalg.cross(at.normals, forth) if part.name == "scarf" else part.matrix[:, 0].expand(n, 3)
+        )
     along = flow - (flow * at.normals).sum(1, keepdim=True) * at.normals
     along = along / along.norm(dim=1, keepdim=True).clamp_min(1e-6)
     rise = 1.6 if part.name == "grass" else 0.45
@@ -172,9 +179,8 @@ def _lay(
     across = across / across.norm(dim=1, keepdim=True).clamp_min(1e-6)
     frame = torch.stack([along, across, torch.linalg.cross(along, across)], dim=2)
 
-    flat = (
-        torch.tensor([0.85, 0.58, 0.16] if furry else [0.62, 0.62, 0.14]) * h / (1 - _standing(part)) ** 0.5
-    )
+    shape = [0.85, 0.58, 0.16] if furry else [0.80, 0.50, 0.14] if part.name in WOOL else [0.62, 0.62, 0.14]
+    flat = torch.tensor(shape) * h / (1 - _standing(part)) ** 0.5
     hair = torch.tensor([0.95, 0.24, 0.16]) * h
     if part.name == "grass":
         hair = torch.cat([0.45 * h + 0.022, 0.16 * h, 0.10 * h], dim=1)
