@@ -93,8 +93,8 @@ def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
 
 LEFT = SIZE[0] - panel.WIDTH_PX
 START, SPAN = LEFT + 12 + 10 + 7, panel.WIDTH_PX - 2 * (12 + 10 + 7)
-TRACKS = (136.0, 234.0)  # heights of the two sliders' tracks
-EYES = (109.0, 207.0)
+TRACKS = (136.0, 233.0)  # heights of the two sliders' tracks
+EYES = (109.0, 206.0)
 
 
 def at(strength: float) -> float:

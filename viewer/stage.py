@@ -239,7 +239,7 @@ class Stage:
         if inputs.holds_original():
             overlay.banner("Original", area, self.ui)
         if work.view.overlay:
-            overlay.timings(self._figures(), self.ui)
+            overlay.timings(self.figures(), self.ui)
         if work.help:
             overlay.bindings(area, self.ui)
         if work.message is not None:
@@ -248,7 +248,7 @@ class Stage:
                 self.work = replace(work, message=None)
                 self.wake()
 
-    def _figures(self) -> list[tuple[str, str]]:
+    def figures(self) -> list[tuple[str, str]]:
         """What the overlay shows of the picture on screen."""
         t = self.timings
         lines = [

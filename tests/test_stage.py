@@ -1,0 +1,344 @@
+"""The whole interface, headless: real widgets, real engine, a scripted hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+from PIL import Image
+from ui_rig import Rig, bear, first_view, rig
+
+from viewer.turntable import axes, eye
+
+pytestmark = pytest.mark.gl
+VIEW = (170.0, 270.0)  # the middle of the picture
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig() as made:
+        yield made
+
+
+def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(hand: Rig) -> None:
+    before = hand.picture()
+    hand.drag(hand.slider(0, 0.5), hand.slider(0, 1.0))
+    assert hand.strengths == [1.0, 0.5]
+    assert np.abs(hand.picture().astype(int) - before).max() > 20
+    assert len(hand.stage.work.past.past) == 1
+    hand.key(imgui.Key.mod_ctrl, imgui.Key.z)
+    assert hand.strengths == [0.5, 0.5]
+    assert np.array_equal(hand.picture(), before)
+    hand.key(imgui.Key.mod_ctrl, imgui.Key.mod_shift, imgui.Key.z)
+    assert hand.strengths == [1.0, 0.5]
+
+
+def test_every_step_of_a_drag_is_on_screen_in_the_frame_that_handled_it(hand: Rig) -> None:
+    hand.move(*hand.slider(0, 0.5))
+    hand.press()
+    for strength in (0.6, 0.8, 0.3):
+        hand.move(*hand.slider(0, strength))
+        shown = hand.picture()
+        image = hand.stage.engine.image(hand.stage.work.view, (340, 540))
+        assert np.abs(shown - np.clip(image, 0, 1) * 255).max() <= 0.51
+    hand.release()
+
+
+def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand: Rig) -> None:
+    hand.move(*hand.slider(0, 0.5))
+    hand.io.add_mouse_button_event(0, True)
+    for strength in (0.6, 0.7, 0.9):
+        hand.io.add_mouse_pos_event(*hand.slider(0, strength))
+    hand.io.add_mouse_button_event(0, False)
+    drawn = hand.stage.drawn
+    hand.frame(4)
+    assert hand.strengths[0] == pytest.approx(0.9, abs=0.005)
+    assert hand.stage.drawn <= drawn + 2, "values on the way are not drawn one by one"
+    assert len(hand.stage.work.past.past) == 1
+
+
+def test_a_slow_frame_that_holds_a_whole_orbit_still_turns_the_camera(hand: Rig) -> None:
+    before = hand.stage.work.view.camera
+    hand.move(*VIEW)
+    hand.io.add_mouse_button_event(0, True)
+    hand.io.add_mouse_pos_event(VIEW[0] + 50, VIEW[1])
+    hand.io.add_mouse_button_event(0, False)
+    hand.frame(4)
+    assert hand.stage.work.view.camera.azimuth == pytest.approx(before.azimuth - 15.0)
+
+
+def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
+    hand.frame()  # the one that tooltips get
+    drawn, frames = hand.stage.drawn, hand.stage.frames
+    assert hand.stage.patience() is None
+    assert (hand.stage.drawn, hand.stage.frames) == (drawn, frames)
+
+
+def test_moving_the_mouse_draws_the_interface_but_no_splats(hand: Rig) -> None:
+    drawn = hand.stage.drawn
+    for x in range(20, 600, 40):
+        hand.move(x, 100.0)
+    assert hand.stage.drawn == drawn == 1
+
+
+def test_the_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
+    hand.drag(VIEW, (VIEW[0] + 40, VIEW[1] + 10))
+    moved = hand.stage.work.view.camera
+    assert hand.stage.work.past.past == ()
+    hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.8))
+    hand.key(imgui.Key.mod_ctrl, imgui.Key.z)
+    assert hand.stage.work.view.camera == moved
+
+
+def test_a_drag_that_begins_on_the_picture_goes_on_over_the_panel(hand: Rig) -> None:
+    azimuth = hand.stage.work.view.camera.azimuth
+    hand.drag((300.0, 136.0), (500.0, 136.0))
+    assert hand.strengths == [0.5, 0.5]
+    assert hand.stage.work.view.camera.azimuth == pytest.approx(azimuth - 60.0)
+
+
+def test_a_drag_that_begins_on_a_slider_does_not_turn_the_camera(hand: Rig) -> None:
+    before = hand.stage.work.view.camera
+    hand.drag(hand.slider(1, 0.5), VIEW)
+    assert hand.stage.work.view.camera == before
+    assert hand.strengths == [0.5, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("button", "modifier", "kept"),
+    [
+        (2, None, "pivot"),
+        (2, imgui.Key.mod_shift, "angles"),
+        (2, imgui.Key.mod_ctrl, "pivot"),
+        (1, None, "angles"),
+    ],
+    ids=["middle orbits", "Shift+middle pans", "Ctrl+middle dollies", "right pans"],
+)
+def test_the_other_buttons_do_what_the_table_says(
+    hand: Rig, button: int, modifier: imgui.Key | None, kept: str
+) -> None:
+    before = hand.stage.work.view.camera
+    if modifier is not None:
+        hand.hold(modifier)
+    hand.drag(VIEW, (VIEW[0] + 30, VIEW[1] + 30), button)
+    after = hand.stage.work.view.camera
+    assert after != before
+    if kept == "pivot":
+        assert after.pivot == before.pivot
+        assert (after.distance != before.distance) == (modifier is not None)
+    else:
+        assert (after.azimuth, after.elevation, after.distance) == (
+            before.azimuth,
+            before.elevation,
+            before.distance,
+        )
+
+
+def test_right_drag_looks_around_while_flying(hand: Rig) -> None:
+    hand.key(imgui.Key.v)
+    before = hand.stage.work.view.camera
+    hand.drag(VIEW, (VIEW[0] + 30, VIEW[1]), button=1)
+    after = hand.stage.work.view.camera
+    assert eye(after) == pytest.approx(eye(before))
+    assert after.pivot != before.pivot
+
+
+def test_the_wheel_zooms_over_the_picture_and_only_scrolls_over_the_panel(hand: Rig) -> None:
+    distance = hand.stage.work.view.camera.distance
+    hand.wheel(500.0, 300.0, 2.0)
+    assert hand.stage.work.view.camera.distance == distance
+    hand.wheel(*VIEW, 2.0)
+    assert hand.stage.work.view.camera.distance < distance
+
+
+def test_a_double_click_on_the_bear_makes_its_surface_the_pivot(hand: Rig) -> None:
+    before = hand.stage.work.view.camera
+    hand.double_click(170.0, 150.0)
+    after = hand.stage.work.view.camera
+    assert after.pivot != before.pivot
+    assert eye(after) == pytest.approx(eye(before), abs=1e-6)
+    assert np.linalg.norm(after.pivot) < 2.0, "on the bear, not behind it"
+
+
+def test_a_double_click_on_the_background_leaves_the_pivot(hand: Rig) -> None:
+    before = hand.stage.work.view.camera
+    hand.double_click(20.0, 20.0)
+    assert hand.stage.work.view.camera == before
+
+
+def test_holding_backslash_shows_the_original_and_letting_go_brings_the_edit_back() -> None:
+    with rig(first_view(bear(), 0.0, 0.0)) as untouched:
+        original = untouched.picture()
+    with rig() as hand:
+        edited = hand.picture()
+        hand.hold(imgui.Key.backslash)
+        shown = hand.picture()
+        assert np.array_equal(shown[60:], original[60:]), "below the word Original"
+        assert not np.array_equal(shown[:60], original[:60])
+        hand.hold(imgui.Key.backslash, False)
+        assert np.array_equal(hand.picture(), edited)
+        assert hand.stage.work.past.past == ()
+
+
+@pytest.mark.parametrize(
+    ("keys", "change"),
+    [
+        ((imgui.Key.right_arrow,), 0.01),
+        ((imgui.Key.down_arrow,), -0.01),
+        ((imgui.Key.mod_shift, imgui.Key.left_arrow), -0.1),
+        ((imgui.Key.mod_ctrl, imgui.Key.up_arrow), 0.001),
+    ],
+)
+def test_arrows_step_the_focused_strength(hand: Rig, keys: tuple[imgui.Key, ...], change: float) -> None:
+    hand.key(imgui.Key._2)
+    hand.key(*keys)
+    assert hand.strengths == pytest.approx([0.5, 0.5 + change], abs=1e-9)
+    assert len(hand.stage.work.past.past) == 1
+
+
+def test_a_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
+    hand.hold(imgui.Key.right_arrow)
+    assert hand.stage.patience() == pytest.approx(1 / 60) or hand.stage.patience() == 0.0
+    hand.frame(60)
+    hand.hold(imgui.Key.right_arrow, False)
+    hand.settle()
+    assert hand.strengths[0] > 0.55
+    assert len(hand.stage.work.past.past) == 1
+
+
+def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
+    hand.key(imgui.Key._2)
+    assert hand.stage.work.focus == 1
+    hand.key(imgui.Key.mod_shift, imgui.Key._1)
+    assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, True]
+    hand.key(imgui.Key._9)
+    assert hand.stage.work.focus == 1, "there is no ninth layer"
+    hand.key(imgui.Key.h)
+    assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, False]
+
+
+def test_a_text_field_owns_the_keys(hand: Rig) -> None:
+    hand.hold(imgui.Key.mod_ctrl)
+    hand.move(*hand.slider(0, 0.2))
+    hand.press()
+    hand.release()
+    hand.hold(imgui.Key.mod_ctrl, False)
+    assert hand.io.want_text_input
+    before = hand.stage.work.view.camera
+    hand.key(imgui.Key.v)
+    hand.frame(5, fly="W")
+    assert hand.stage.work.view.camera == before
+
+
+def test_f_frames_the_focused_layer_and_with_none_goes_home(hand: Rig) -> None:
+    home = hand.stage.work.view.camera
+    hand.key(imgui.Key._2)
+    hand.key(imgui.Key.f)
+    framed = hand.stage.work.view.camera
+    assert framed.distance < 0.5 * home.distance
+    assert axes(framed) == axes(home)
+    hand.key(imgui.Key.escape)
+    hand.key(imgui.Key.f)
+    assert hand.stage.work.view.camera == home
+    hand.key(imgui.Key.f)
+    hand.drag(VIEW, (VIEW[0] + 30, VIEW[1]))
+    hand.key(imgui.Key.mod_shift, imgui.Key.f)
+    assert hand.stage.work.view.camera == home
+
+
+def test_w_flies_ahead_and_s_comes_back(hand: Rig) -> None:
+    home = hand.stage.work.view.camera
+    hand.frame(10, fly="W")
+    ahead = hand.stage.work.view.camera
+    assert np.dot(np.subtract(eye(ahead), eye(home)), axes(home).back) < 0
+    assert hand.stage.patience() != None, "frames go on while a key is held"  # noqa: E711
+    hand.frame(10, fly="S")
+    assert eye(hand.stage.work.view.camera) == pytest.approx(eye(home))
+
+
+def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Path) -> None:
+    with rig(pictures=tmp_path) as hand:
+        shown = hand.picture()
+        hand.key(imgui.Key.f2)
+        hand.key(imgui.Key.mod_shift, imgui.Key.f2)
+        first, second = sorted(tmp_path.iterdir())
+        assert (first.name, second.name) == ("bear_001.png", "bear_002.png")
+        assert np.array_equal(np.asarray(Image.open(first)), shown)
+        assert np.asarray(Image.open(second)).shape == (540, 640, 3)
+        message = hand.stage.work.message
+        assert message is not None
+        assert str(second) in message.text
+
+
+def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_path: Path) -> None:
+    with rig(pictures=tmp_path / "gone") as hand:
+        hand.key(imgui.Key.f2)
+        message = hand.stage.work.message
+        assert message is not None
+        assert message.error
+        assert "\n" not in message.text
+        hand.frame()
+
+
+def test_messages_leave_by_themselves(hand: Rig) -> None:
+    hand.stage.tell("hello")
+    hand.settle()
+    assert hand.stage.patience() is not None
+    hand.stage.frame(hand.screen, hand.pixels, 7.0)
+    assert hand.stage.work.message is None
+
+
+def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
+    hand.key(imgui.Key.f10)
+    assert hand.stage.work.view.overlay
+    assert hand.stage.drawn == 1, "showing figures draws no splats"
+    hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
+    names = [name.strip() for name, _ in hand.stage.figures()]
+    assert {"frame", "sort", "draw", "slider p50 / p95", "splats"} <= set(names)
+    assert hand.stage.timings.total_ms > 0.0
+
+
+def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:
+    hand.key(imgui.Key.f12)
+    assert hand.stage.work.view.panel is False
+    background = np.array(bear().demo.background) * 255
+    assert np.abs(hand.image()[5, -5] - background).max() <= 1
+
+
+@pytest.mark.parametrize(("points", "density", "scale"), [((640, 400), 2.0, 1.0), ((1280, 800), 1.0, 2.0)])
+def test_the_picture_has_the_framebuffers_pixels_on_a_dense_screen(
+    points: tuple[int, int], density: float, scale: float
+) -> None:
+    with rig(points=points, density=density, scale=scale) as hand:
+        image = hand.stage.engine.image(hand.stage.work.view, (680, 800))
+        assert hand.image().shape == (800, 1280, 3)
+        assert np.abs(hand.image()[:, :680] - np.clip(image, 0, 1) * 255).max() <= 0.51
+
+
+def test_a_new_size_of_the_window_is_drawn_at_once(hand: Rig) -> None:
+    hand.pixels = hand.points = (500, 300)
+    hand.io.display_size = imgui.ImVec2(500, 300)
+    hand.screen = hand.stage.context.simple_framebuffer((500, 300))
+    hand.frame()
+    image = hand.stage.engine.image(hand.stage.work.view, (200, 300))
+    assert np.abs(hand.image()[:, :200] - np.clip(image, 0, 1) * 255).max() <= 0.51
+
+
+def test_a_window_narrower_than_the_panel_survives(hand: Rig) -> None:
+    hand.io.display_size = imgui.ImVec2(200, 100)
+    hand.screen = hand.stage.context.simple_framebuffer((200, 100))
+    hand.pixels = (200, 100)
+    hand.frame(3)
+
+
+def test_an_unknown_layer_count_needs_no_scene(hand: Rig) -> None:
+    hand.stage.restart(replace(hand.stage.work.view, layers=()))
+    hand.settle()
+    assert hand.stage.work.focus is None
+    hand.key(imgui.Key.right_arrow)
+    hand.key(imgui.Key.h)
+    assert hand.strengths == []
