@@ -106,7 +106,7 @@ def _is_shown(parts: Sequence[Part], own: Part, at: Samples) -> Tensor:
         if part is not own and (part.name == "grass" or part.touches(own)):
             shown &= part.depth(at.points) <= 0.6 * at.spacing.clamp_max(0.03)
             if part.clears and not own.clears:
-                shown &= part.level(at.points) > 1 + part.clears
+                shown &= part.shape.level(part.to_local(at.points)) > 1 + part.clears
     return shown
 
 

@@ -43,6 +43,11 @@ def paint(part: Part, at: Samples, table: Tensor) -> Paint:
         return _stone(at, table)
     if part.name == "grass":
         return _lawn(at, table)
+    if part.name == "pad":
+        color = _between("#d59a78", "#f0c4a2", 0.5 + 0.5 * noise(at.points, table, 22.0, 2))
+        return Paint(color, _bumps(at.points, table, 25.0, 0.2), *_shine(at.points, 0.12, 0.03))
+    if part.name == "mouth":
+        return Paint(_flat("#2b1710", at.points), torch.zeros_like(at.points), *_shine(at.points, 0.0, 0.02))
     return _glass(part, at)
 
 
@@ -56,13 +61,6 @@ def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
     color = brown
     if part.name == "muzzle":
         color = _mix(brown, cream, _step(at.local[:, 2] + ragged, -0.10, 0.10))
-        # a mouth: a short line down from the nose and two curves
-        x, y = at.local[:, 0], at.local[:, 1]
-        stem = _step(0.055 - x.abs(), 0.0, 0.03) * _step(0.22 - y, 0.0, 0.05) * _step(y + 0.36, 0.0, 0.05)
-        smile = _step(0.06 - (y + 0.36 + 0.55 * (x.abs() - 0.30) ** 2 - 0.05).abs(), 0.0, 0.04)
-        smile = smile * _step(0.52 - x.abs(), 0.0, 0.05)
-        front = (at.local[:, 2] > 0.3).float()
-        color = _mix(color, _flat("#2b1710", p), torch.maximum(stem, smile) * front * 0.9)
     elif part.name == "body":
         belly = torch.hypot(p[:, 0] / 0.31, (p[:, 1] - 0.50) / 0.36)
         front = _step(at.normals[:, 2], 0.0, 0.25)
@@ -73,24 +71,11 @@ def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
         color = _mix(
             brown, rose, _step(0.46 - inner + 1.2 * ragged, -0.08, 0.08) * (at.local[:, 2] > 0).float()
         )
-    elif part.name == "foot":
-        color = _mix(brown, _between("#d8a07c", "#efc3a0", 0.5 + 0.5 * tufts), _pads(at.local))
     elif part.name in ("head", "arm"):
         color = _mix(
             brown, _between("#55301a", "#8a5228", 0.5 + 0.5 * tufts), 0.35 * _step(patches, 0.1, 0.5)
         )
     return Paint(color, _bumps(p, table, 15.0, 0.34), *_shine(p, velvet=0.17, gloss=0.02))
-
-
-def _pads(local: Tensor) -> Tensor:
-    """The sole's big pad and four toes, on the side the foot turns to +z. [N,3] -> [N] in 0..1"""
-    x, y = local[:, 0], local[:, 1]
-    pad = 1.0 - torch.hypot(x / 0.50, (y + 0.22) / 0.40)
-    for i in range(4):
-        angle = math.radians(38 + 104 / 3 * i)
-        toe = 1.0 - torch.hypot(x - 0.66 * math.cos(angle), y + 0.02 - 0.64 * math.sin(angle)) / 0.155
-        pad = torch.maximum(pad, toe)
-    return _step(pad, 0.0, 0.12) * (local[:, 2] > 0).float()
 
 
 def _wool(part: Part, at: Samples, table: Tensor) -> Paint:
@@ -100,7 +85,7 @@ def _wool(part: Part, at: Samples, table: Tensor) -> Paint:
         turns, ribs = 13 * along, 150 * along
     else:
         along = at.local[:, 1] * torch.linalg.svdvals(part.matrix)[0]
-        turns, ribs = along / 0.135 + 0.25, along / 0.0145
+        turns, ribs = along / (0.30 if part.name == "knot" else 0.135), along / 0.0145
     red = stripe_profile(turns, width=0.52, softness=0.05)
     color = _mix(_between("#e9dfcc", "#fffaf0", 0.6 + 0.4 * noise(p, table, 25.0)), _flat("#c8102e", p), red)
     knit = (ribs * 2 * math.pi).sin() * _step(0.013 - at.spacing, 0.0, 0.006)
@@ -135,7 +120,7 @@ def _glass(part: Part, at: Samples) -> Paint:
     color = _flat("#17100d" if part.name == "eye" else "#1d1412", p)
     towards = torch.tensor([-0.42, 0.52, 0.74] if part.name == "eye" else [-0.25, 0.80, 0.55])
     towards = towards / towards.norm()
-    size = 0.955 if part.name == "eye" else 0.965
+    size = 0.93 if part.name == "eye" else 0.965
     light = _step(at.local @ towards, size - 0.02, size + 0.005)
     small = _step(at.local @ torch.tensor([0.40, -0.45, 0.80]) / 1.0012, 0.968, 0.985)
     if part.name == "eye":

@@ -35,9 +35,38 @@ def _ellipsoid(
     weight: float = 1.0,
     exponent: float = 2.0,
     casts_shadow: bool = True,
+    clears: float = 0.0,
 ) -> Part:
     matrix = turned(turn) @ torch.diag(torch.tensor(radii))
-    return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow)
+    return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow, clears)
+
+
+def _detail(name: str, label: str, centre: Triple, radii: Triple, turn: Triple = (0.0, 0.0, 0.0)) -> Part:
+    """A small part drawn finely, with no fur over it and no shadow of its own."""
+    return _ellipsoid(name, label, centre, radii, turn, 7.0, casts_shadow=False, clears=0.16)
+
+
+def _pads(foot: Part) -> list[Part]:
+    """The sole's big pad and four toes, set into the side of the foot that faces the viewer."""
+    sizes = foot.matrix.norm(dim=0)
+    turn = foot.matrix / sizes
+    places = [((0.0, -0.055), (0.095, 0.085))]
+    places += [
+        ((0.132 * math.cos(angle), 0.012 + 0.135 * math.sin(angle)), (0.036, 0.036))
+        for angle in (math.radians(28 + 124 / 3 * i) for i in range(4))
+    ]
+    pads = []
+    for (x, y), (wide, tall) in places:
+        z = float(sizes[2]) * math.sqrt(1 - (x / float(sizes[0])) ** 2 - (y / float(sizes[1])) ** 2)
+        outward = torch.tensor([x, y, z]) / sizes**2
+        outward = outward / outward.norm()
+        side = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), outward)
+        side = side / side.norm()
+        frame = turn @ torch.stack([side, torch.linalg.cross(outward, side), outward], dim=1)
+        matrix = frame @ torch.diag(torch.tensor([wide, tall, 0.022]))
+        centre = foot.centre + turn @ torch.tensor([x, y, z])
+        pads.append(Part("pad", foot.label, ball(), centre, matrix, 3.0, None, False, 0.08))
+    return pads
 
 
 def _pair(
@@ -54,22 +83,23 @@ def _pair(
 
 def bear_parts() -> list[Part]:
     """Every part of the scene, the bear first, the lawn last."""
+    feet = _pair("foot", "legs", (0.355, 0.235, 0.80), (0.195, 0.235, 0.115), (-12, 16, 0), weight=1.3)
     return [
         _ellipsoid("body", "body", (0.0, 0.57, 0.0), (0.50, 0.60, 0.45)),
         _ellipsoid("tail", "body", (0.0, 0.17, -0.44), (0.13, 0.13, 0.13)),
         _ellipsoid("head", "head", (0.0, 1.47, 0.05), (0.47, 0.415, 0.42), weight=1.5),
         _ellipsoid("muzzle", "head", (0.0, 1.365, 0.40), (0.215, 0.165, 0.19), weight=2.2),
-        _ellipsoid("nose", "head", (0.0, 1.44, 0.575), (0.085, 0.060, 0.055), weight=5.0, casts_shadow=False),
-        *[
-            _ellipsoid(
-                "eye", "head", (x, 1.545, 0.425), (0.050, 0.056, 0.040), weight=7.0, casts_shadow=False
-            )
-            for x in (0.17, -0.17)
-        ],
+        _detail("nose", "head", (0.0, 1.44, 0.575), (0.085, 0.060, 0.055)),
+        _detail("mouth", "head", (0.0, 1.345, 0.583), (0.010, 0.052, 0.016)),
+        _detail("mouth", "head", (0.05, 1.292, 0.562), (0.056, 0.010, 0.016), (0, 20, 26)),
+        _detail("mouth", "head", (-0.05, 1.292, 0.562), (0.056, 0.010, 0.016), (0, -20, -26)),
+        _detail("eye", "head", (0.17, 1.545, 0.432), (0.052, 0.060, 0.042)),
+        _detail("eye", "head", (-0.17, 1.545, 0.432), (0.052, 0.060, 0.042)),
         *_pair("ear", "ears", (0.335, 1.815, 0.02), (0.175, 0.175, 0.085), (0, 18, -24), weight=1.5),
         *_pair("arm", "arms", (0.505, 0.72, 0.14), (0.155, 0.395, 0.17), (-24, 0, 16)),
         *_pair("leg", "legs", (0.285, 0.185, 0.44), (0.195, 0.40, 0.195), (84, 16, 0)),
-        *_pair("foot", "legs", (0.355, 0.235, 0.80), (0.195, 0.235, 0.115), (-12, 16, 0), weight=1.3),
+        *feet,
+        *[pad for foot in feet for pad in _pads(foot)],
         Part(
             "scarf",
             "scarf",

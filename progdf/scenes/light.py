@@ -115,4 +115,5 @@ def _unshadowed(local: Tensor, part: Part) -> Tensor:
     share = ((closest - 1 + blur) / (2 * blur)).clamp(0, 1)
     passed = share * share * (3 - 2 * share)
     begins = (world_ahead / 0.03).clamp(0, 1)
-    return 1 - (1 - passed) * begins
+    left: Tensor = 1 - (1 - passed) * begins
+    return left

@@ -55,8 +55,8 @@ def ring(tube: float) -> Shape:
     curve = torch.stack([1 + tube * angle.cos(), -tube * angle.sin()], dim=1)
 
     def level(local: Tensor) -> Tensor:
-        aside: Tensor = torch.hypot(torch.hypot(local[:, 0], local[:, 2]) - 1, local[:, 1])
-        return aside / tube
+        share: Tensor = torch.hypot(torch.hypot(local[:, 0], local[:, 2]) - 1, local[:, 1]) / tube
+        return share
 
     def nearest(local: Tensor) -> Tensor:
         flat = local * torch.tensor([1.0, 0.0, 1.0])
