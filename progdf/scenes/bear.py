@@ -105,7 +105,7 @@ def _is_shown(parts: Sequence[Part], own: Part, at: Samples) -> Tensor:
     for part in parts:
         if part is not own and (part.name == "grass" or part.touches(own)):
             shown &= part.depth(at.points) <= 0.6 * at.spacing.clamp_max(0.03)
-            if part.clears and not own.clears:
+            if part.clears and (not own.clears or part.name == "glint"):
                 shown &= part.shape.level(part.to_local(at.points)) > 1 + part.clears
     return shown
 
@@ -135,7 +135,7 @@ def _clothe(
     light = irradiance(at.points, leaning, parts, part)
     strand = _strands(part, n, random)
     albedo = linear_from_srgb((coat.color * (1 + 0.05 * grain[:, None] + 0.10 * strand[:, None])).clamp(0, 1))
-    color = develop(albedo * light)
+    color = coat.color if part.name == "glint" else develop(albedo * light)
     glow, band = sheen(at.normals, coat.velvet, coat.gloss, 0.35 + 0.65 * color)
     means, quats, log_scales = _lay(part, at, table, strand, random)
     opacity = (0.97 - 0.10 * torch.rand(n, generator=random) - 0.25 * strand).clamp(0.05, 0.99)
@@ -179,10 +179,11 @@ def _lay(
     across = across / across.norm(dim=1, keepdim=True).clamp_min(1e-6)
     frame = torch.stack([along, across, torch.linalg.cross(along, across)], dim=2)
 
-    shape = [0.85, 0.58, 0.16] if furry else [0.80, 0.50, 0.14] if part.name in WOOL else [0.62, 0.62, 0.14]
+    shape = [0.85, 0.58, 0.16] if furry else [0.80, 0.50, 0.14] if part.name in WOOL else [0.64, 0.64, 0.14]
     flat = torch.tensor(shape) * h / (1 - _standing(part)) ** 0.5
     hair = torch.tensor([0.95, 0.24, 0.16]) * h
     if part.name == "grass":
+        flat = 1.3 * flat
         hair = torch.cat([0.45 * h + 0.022, 0.16 * h, 0.10 * h], dim=1)
     scales = torch.where(stands > 0, hair, flat) * torch.exp(0.12 * torch.randn(n, 3, generator=random))
     lift = (0.5 * hair[:, :1] if part.name == "grass" else 0.25 * h) * stands

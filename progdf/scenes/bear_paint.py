@@ -46,6 +46,8 @@ def paint(part: Part, at: Samples, table: Tensor) -> Paint:
     if part.name == "pad":
         color = _between("#d59a78", "#f0c4a2", 0.5 + 0.5 * noise(at.points, table, 22.0, 2))
         return Paint(color, _bumps(at.points, table, 25.0, 0.2), *_shine(at.points, 0.12, 0.03))
+    if part.name == "glint":
+        return Paint(_flat("#ffffff", at.points), torch.zeros_like(at.points), *_shine(at.points, 0.0, 0.0))
     if part.name == "mouth":
         return Paint(_flat("#2b1710", at.points), torch.zeros_like(at.points), *_shine(at.points, 0.0, 0.02))
     return _glass(part, at)
@@ -115,18 +117,13 @@ def _lawn(at: Samples, table: Tensor) -> Paint:
 
 
 def _glass(part: Part, at: Samples) -> Paint:
-    """Eyes and nose: nearly black, with a painted window of light."""
+    """Eyes and nose: nearly black; the nose mirrors the sky a little."""
     p = at.points
     color = _flat("#17100d" if part.name == "eye" else "#1d1412", p)
-    towards = torch.tensor([-0.42, 0.52, 0.74] if part.name == "eye" else [-0.25, 0.80, 0.55])
-    towards = towards / towards.norm()
-    size = 0.93 if part.name == "eye" else 0.965
-    light = _step(at.local @ towards, size - 0.02, size + 0.005)
-    small = _step(at.local @ torch.tensor([0.40, -0.45, 0.80]) / 1.0012, 0.968, 0.985)
-    if part.name == "eye":
-        light = torch.maximum(light, 0.45 * small)
-    color = _mix(color, _flat("#ffffff", p), light)
-    return Paint(color, torch.zeros_like(p), *_shine(p, 0.0, 0.16))
+    if part.name == "nose":
+        shine = at.local @ torch.tensor([-0.252, 0.806, 0.554])
+        color = _mix(color, _flat("#cfc9c6", p), 0.7 * _step(shine, 0.90, 0.985))
+    return Paint(color, torch.zeros_like(p), *_shine(p, 0.0, 0.12))
 
 
 def _shine(points: Tensor, velvet: float, gloss: float) -> tuple[Tensor, Tensor]:

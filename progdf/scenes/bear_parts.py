@@ -46,6 +46,14 @@ def _detail(name: str, label: str, centre: Triple, radii: Triple, turn: Triple =
     return _ellipsoid(name, label, centre, radii, turn, 7.0, casts_shadow=False, clears=0.16)
 
 
+def _eye(x: float) -> list[Part]:
+    """An eye and the window it mirrors, up on the side that the lamp is on."""
+    return [
+        _detail("eye", "head", (x, 1.545, 0.432), (0.052, 0.060, 0.042)),
+        _detail("glint", "head", (x - 0.017, 1.567, 0.468), (0.014, 0.015, 0.006)),
+    ]
+
+
 def _pads(foot: Part) -> list[Part]:
     """The sole's big pad and four toes, set into the side of the foot that faces the viewer."""
     sizes = foot.matrix.norm(dim=0)
@@ -90,11 +98,11 @@ def bear_parts() -> list[Part]:
         _ellipsoid("head", "head", (0.0, 1.47, 0.05), (0.47, 0.415, 0.42), weight=1.5),
         _ellipsoid("muzzle", "head", (0.0, 1.365, 0.40), (0.215, 0.165, 0.19), weight=2.2),
         _detail("nose", "head", (0.0, 1.44, 0.575), (0.085, 0.060, 0.055)),
-        _detail("mouth", "head", (0.0, 1.345, 0.583), (0.010, 0.052, 0.016)),
-        _detail("mouth", "head", (0.05, 1.292, 0.562), (0.056, 0.010, 0.016), (0, 20, 26)),
-        _detail("mouth", "head", (-0.05, 1.292, 0.562), (0.056, 0.010, 0.016), (0, -20, -26)),
-        _detail("eye", "head", (0.17, 1.545, 0.432), (0.052, 0.060, 0.042)),
-        _detail("eye", "head", (-0.17, 1.545, 0.432), (0.052, 0.060, 0.042)),
+        _detail("mouth", "head", (0.0, 1.345, 0.588), (0.011, 0.052, 0.018)),
+        _detail("mouth", "head", (0.05, 1.292, 0.568), (0.056, 0.011, 0.020), (0, 20, 26)),
+        _detail("mouth", "head", (-0.05, 1.292, 0.568), (0.056, 0.011, 0.020), (0, -20, -26)),
+        *_eye(0.17),
+        *_eye(-0.17),
         *_pair("ear", "ears", (0.335, 1.815, 0.02), (0.175, 0.175, 0.085), (0, 18, -24), weight=1.5),
         *_pair("arm", "arms", (0.505, 0.72, 0.14), (0.155, 0.395, 0.17), (-24, 0, 16)),
         *_pair("leg", "legs", (0.285, 0.185, 0.44), (0.195, 0.40, 0.195), (84, 16, 0)),

@@ -60,7 +60,7 @@ def ring(tube: float) -> Shape:
 
     def nearest(local: Tensor) -> Tensor:
         flat = local * torch.tensor([1.0, 0.0, 1.0])
-        core = flat / flat.norm(dim=1, keepdim=True).clamp_min(1e-6)
+        core: Tensor = flat / flat.norm(dim=1, keepdim=True).clamp_min(1e-6)
         return core + (local - core) / level(local).clamp_min(1e-6)[:, None]
 
     return Shape(curve, level, nearest, girth=tube)
