@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 from imgui_bundle import imgui
 
-from viewer import panel, workspace
+from viewer import panel, turntable, workspace
 from viewer.layer_rows import LayerRow
 from viewer.state import LayerState, ViewState
 from viewer.strength_slider import parse_strength
@@ -235,9 +235,20 @@ def test_undo_is_greyed_while_there_is_nothing_to_undo(hand: Hand) -> None:
 
 def test_an_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
-    hand.click(SIZE[0] - 35, 207)
+    hand.click(SIZE[0] - 65, 207)
     assert hand.work.view.camera.up == (0.0, 0.0, -1.0)
     assert hand.work.past.past == (), "where one looks from is not in the undo stack"
+    hand.ui.close()
+
+
+def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
+    hand = hand_on(ViewState())
+    before = turntable.axes(hand.work.view.camera)
+    hand.click(SIZE[0] - 30, 207)
+    after = turntable.axes(hand.work.view.camera)
+    assert hand.work.view.camera.elevation == pytest.approx(0.0)
+    for old, new in ((before.up, after.up), (before.right, after.right)):
+        assert new == pytest.approx(old), "the picture does not turn"
     hand.ui.close()
 
 

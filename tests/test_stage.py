@@ -12,6 +12,7 @@ from imgui_bundle import imgui
 from PIL import Image
 from ui_rig import Rig, bear, first_view, rig
 
+from viewer.state import LayerState
 from viewer.turntable import axes, eye
 
 pytestmark = pytest.mark.gl
@@ -221,6 +222,17 @@ def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
     assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, False]
 
 
+def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
+    layers = tuple(LayerState(i % 2, f"layer {i}", 0.5) for i in range(9))
+    with rig(replace(first_view(bear()), layers=layers)) as hand:
+        top = hand.image()[60:400, 350:]
+        hand.key(imgui.Key._9)
+        hand.frame(5)
+        assert not np.array_equal(hand.image()[60:400, 350:], top)
+        hand.key(imgui.Key.mod_shift, imgui.Key._9)
+        assert not hand.stage.work.view.layers[8].enabled
+
+
 def test_a_text_field_owns_the_keys(hand: Rig) -> None:
     hand.hold(imgui.Key.mod_ctrl)
     hand.move(*hand.slider(0, 0.2))
@@ -255,7 +267,7 @@ def test_w_flies_ahead_and_s_comes_back(hand: Rig) -> None:
     hand.frame(10, fly="W")
     ahead = hand.stage.work.view.camera
     assert np.dot(np.subtract(eye(ahead), eye(home)), axes(home).back) < 0
-    assert hand.stage.patience() != None, "frames go on while a key is held"  # noqa: E711
+    assert hand.stage.patience() is not None, "frames go on while a key is held"
     hand.frame(10, fly="S")
     assert eye(hand.stage.work.view.camera) == pytest.approx(eye(home))
 

@@ -40,6 +40,7 @@ class PanelInput:
         rows: one per .gdf, indexed by `LayerState.gdf`
         focus: the focused layer, an index into `state.layers`, or None
         undos, redos: how many entries there are either way
+        reveal: scroll to the focused layer
     """
 
     title: str
@@ -48,6 +49,7 @@ class PanelInput:
     focus: int | None = None
     undos: int = 0
     redos: int = 0
+    reveal: bool = False
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,8 @@ def _layers(state: ViewState, shown: PanelInput, ui: UiContext) -> tuple[ViewSta
     layers = list(state.layers)
     for i, layer in enumerate(layers):
         layers[i], touched = _layer(i, layer, shown.rows[layer.gdf], focus == i, ui)
+        if shown.reveal and focus == i:
+            imgui.set_scroll_here_y(0.5)
         focus = i if touched else focus
     return replace(state, layers=tuple(layers)), focus
 
@@ -214,7 +218,7 @@ def _swatch(colour: tuple[float, float, float], enabled: bool, ui: UiContext) ->
 def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     _section("View", ui)
-    label = 92.0 * ui.scale
+    label = 82.0 * ui.scale
     camera = state.camera
     _label("Move", label)
     mode = _choice("mode", ("Orbit", "Fly"), ("orbit", "fly").index(camera.mode), ui)
@@ -222,10 +226,12 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     if mode is not None:
         camera = replace(camera, mode=("orbit", "fly")[mode])
     _label("Up axis", label)
-    current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), None)
-    chosen = _choice("up", tuple(name for name, _ in UPS), current, ui)
+    ups = (*UPS, ("View", turntable.axes(camera).up))
+    current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
+    chosen = _choice("up", tuple(name for name, _ in ups), current, ui)
+    _tip("The axis of the scene that is up; View takes what is up in the picture now")
     if chosen is not None:
-        camera = turntable.with_up(camera, UPS[chosen][1])
+        camera = turntable.with_up(camera, ups[chosen][1])
     _label("Lens", label)
     imgui.set_next_item_width(-1.0)
     camera = replace(
@@ -235,9 +241,9 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     _label("Background", label)
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     red, green, blue = imgui.color_edit3("##background", list(state.background), picker)[1]
-    _label("Frame", label)
+    _label("Show", label)
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
-    if imgui.button(f"{Icon.FRAME}  Focus", imgui.ImVec2(half, 0.0)):
+    if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
         actions.append("frame")
     _tip("Frame the focused layer, or the whole scene (F)")
     imgui.same_line(0.0, 6.0 * ui.scale)
@@ -322,6 +328,8 @@ def _choice(name: str, options: Sequence[str], current: int | None, ui: UiContex
     gap = 2.0 * ui.scale
     each = (imgui.get_content_region_avail().x - gap * (len(options) - 1)) / len(options)
     pressed = None
+    imgui.begin_group()
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
     for i, option in enumerate(options):
         if i:
             imgui.same_line(0.0, gap)
@@ -330,6 +338,8 @@ def _choice(name: str, options: Sequence[str], current: int | None, ui: UiContex
         if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
             pressed = i
         imgui.pop_style_color()
+    imgui.pop_style_var()
+    imgui.end_group()
     return pressed
 
 

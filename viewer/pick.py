@@ -39,7 +39,8 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
         dx, dy = local[:, 0] / depth * fx + cx - x, local[:, 1] / depth * fy + cy - y
         widest = scene.log_scales.amax(1).exp().numpy()
         reach = 3.5 * (widest * max(fx, fy) / depth * np.hypot(1.0, np.hypot(dx / fx, dy / fy)) + 1.0)
-        near_ray = np.flatnonzero((depth > near) & (dx * dx + dy * dy < reach * reach))
+        sized = np.isfinite(widest) & np.isfinite(scene.logit_opacities.numpy())
+        near_ray = np.flatnonzero(sized & (depth > near) & (dx * dx + dy * dy < reach * reach))
     if not len(near_ray):
         return None
     alphas = _alphas(
@@ -79,7 +80,7 @@ def _alphas(
     cov = flat @ flat.transpose(0, 2, 1)
     a, b, c = cov[:, 0, 0] + DILATION, cov[:, 0, 1], cov[:, 1, 1] + DILATION
     power = 0.5 * (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / np.maximum(a * c - b * b, 1e-12)
-    alphas = seen.opacities.double().nan_to_num().numpy() * np.exp(-np.clip(power, 0.0, 80.0))
+    alphas = seen.opacities.double().numpy() * np.exp(-np.clip(power, 0.0, 80.0))
     alphas[alphas < ALPHA_MIN] = 0.0
     clamped: np.ndarray = np.minimum(alphas, ALPHA_MAX)
     return clamped

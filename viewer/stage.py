@@ -171,6 +171,7 @@ class Stage:
 
     def _handle_input(self, fly_keys: frozenset[str], seconds: float) -> None:
         io = imgui.get_io()
+        focus = self.work.focus
         for action in inputs.actions_pressed():
             self._perform(action)
         self._flying = bool(fly_keys) and not (io.want_text_input or io.key_ctrl or io.key_super)
@@ -178,17 +179,17 @@ class Stage:
             flown = inputs.fly(self.work.view.camera, fly_keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
-            self._panel()
+            self._panel(reveal=self.work.focus != focus)
         self.work = workspace.with_camera(self.work, self._moved_by_mouse(self.work.view.camera))
 
     def _perform(self, action: str) -> None:
         area = self._area()
         self.work = workspace.perform(self.work, action, self.facts, area.width / area.height)
 
-    def _panel(self) -> None:
+    def _panel(self, reveal: bool) -> None:
         facts, past = self.facts, self.work.past
         shown = panel.PanelInput(
-            facts.title, facts.count, facts.rows, self.work.focus, len(past.past), len(past.future)
+            facts.title, facts.count, facts.rows, self.work.focus, len(past.past), len(past.future), reveal
         )
         result = panel.draw(self.work.view, shown, self.ui)
         self.work = replace(self.work, view=result.state, focus=result.focus)

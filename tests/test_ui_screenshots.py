@@ -1,0 +1,106 @@
+"""What the interface looks like on a software GPU. After --regenerate-screenshots, look at them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+from ui_rig import bear, first_view, rig
+
+from progdf.errors import ProgdfError
+from viewer.headless import headless_context, is_software
+from viewer.state import LayerState, ViewState
+
+Compare = Callable[[str, np.ndarray], None]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def software_gpu() -> None:
+    """Goldens hold for one rasteriser of text and lines; elsewhere they would differ by a hair's breadth."""
+    try:
+        context = headless_context()
+    except ProgdfError as error:
+        pytest.skip(str(error))
+    software = is_software(context)
+    context.release()
+    if not software:
+        pytest.skip("the goldens were drawn by a software GPU")
+
+
+pytestmark = pytest.mark.gl
+SMALLEST = (1024, 640)
+"""The least window size that the layout is made for."""
+
+
+def crowded() -> ViewState:
+    """More layers than fit, names that are too long, one layer hidden."""
+    names = (
+        "scarf",
+        "ears → gold",
+        "an edit with a name that is far too long for its row",
+        "d",
+        "e",
+        "f",
+        "g",
+    )
+    layers = tuple(LayerState(i % 2, name, i / 6, enabled=i != 1) for i, name in enumerate(names))
+    return replace(first_view(bear()), layers=layers)
+
+
+def test_the_window_at_its_smallest(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        screenshot("ui_main", hand.image())
+
+
+def test_the_window_on_a_dense_screen(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), (700, 560), density=2.0) as hand:
+        screenshot("ui_2x", hand.image())
+
+
+def test_a_scaled_desktop_shows_the_same_as_a_dense_screen() -> None:
+    view = first_view(bear(), 0.7, 0.5)
+    with rig(view, (700, 560), density=2.0) as hand:
+        dense = hand.image()
+    with rig(view, (1400, 1120), scale=2.0) as hand:
+        scaled = hand.image()
+    # edges of text may fall between pixels of the one and on pixels of the other
+    assert (np.abs(dense.astype(int) - scaled).max(axis=-1) > 40).mean() < 0.01
+
+
+def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
+    with rig(crowded(), SMALLEST) as hand:
+        screenshot("ui_crowded", hand.image())
+        hand.wheel(900.0, 300.0, -100.0)
+        hand.frame(20)
+        screenshot("ui_crowded_scrolled", hand.image())
+
+
+def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.key(imgui.Key.f1)
+        hand.stage.tell(
+            "shirt.gdf was made for another scene: it has 41 203 Gaussians, bear.ply has 1 500", True
+        )
+        hand.settle()
+        screenshot("ui_help", hand.image())
+
+
+def test_a_scene_without_edits_and_the_original_held(screenshot: Compare) -> None:
+    with rig(first_view(bear()), SMALLEST) as hand:
+        hand.hold(imgui.Key.backslash)
+        hand.settle()
+        screenshot("ui_original", hand.image())
+
+
+def test_a_value_being_typed(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.hold(imgui.Key.mod_ctrl)
+        hand.move(900.0, 136.0)
+        hand.press()
+        hand.release()
+        hand.hold(imgui.Key.mod_ctrl, False)
+        hand.frame(3)
+        screenshot("ui_typing", hand.image())
