@@ -17,11 +17,8 @@ if TYPE_CHECKING:
 _SAMPLE = 100_000
 """Rows that are looked at; a scene with more is sampled evenly."""
 
-_GROUND_HALF_THICKNESS = 0.08
-"""Of the scene's radius: what lies further from the ground plane stands on it (or hangs under it)."""
-
 _LONG_TAIL = 5.0
-_CEILING_COVER = 0.5
+_CEILING_COVER = 0.8
 _LEAST_CELLS = 16
 _ENOUGH = 64
 """Fewer Gaussians tell nothing about the shape of a scene."""
@@ -47,8 +44,8 @@ def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
 
     With cameras: the mean of their up directions, as people hold cameras level; if these agree.
     Without: the axis along which the flat Gaussians face most (floors, tables and the tops of things make the
-    largest part of flat surfaces in a real scene), pointing from the densest plane across it to the side that
-    has more on it. Where nothing decides: −y, the convention of COLMAP and so of most trained scenes.
+    largest part of flat surfaces in a real scene), pointing from the densest plane across it to the side on
+    which the rest stands. Where nothing decides: −y, the convention of COLMAP and so of most trained scenes.
     """
     if cameras:
         mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
@@ -62,14 +59,13 @@ def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
     across = ((sample.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5)
     counts, edges = torch.histogram(across, bins=60, range=(-1.5, 1.5), weight=facing[:, axis])
     ground = float(edges[int(counts.argmax())]) + 0.025
-    mass = sample.opacities * _areas(sample)
-    above = float(mass[across > ground + _GROUND_HALF_THICKNESS].sum())
-    below = float(mass[across < ground - _GROUND_HALF_THICKNESS].sum())
+    # by number, not by area: what stands on a ground is made of many small Gaussians, a lawn of few large
+    lean = float((sample.opacities * (across - ground)).sum())
     up = torch.zeros(3)
-    if above == below:
+    if len(sample) < _ENOUGH or lean == 0:
         up[1] = -1.0
     else:
-        up[axis] = 1.0 if above > below else -1.0
+        up[axis] = math.copysign(1.0, lean)
     return up
 
 
@@ -91,7 +87,7 @@ def front(up: Tensor) -> Tensor:
 def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
     """Whether the scene is probably one to stand inside, which no ring of cameras around it can show.
 
-    Two signs: a ceiling (a slab at the top that covers at least half of the ground plan), or a long tail (the
+    Two signs: a ceiling (a slab at the top that covers most of the ground plan), or a long tail (the
     far 3 % begin more than five times as far out as the middle, as in outdoor captures with a background).
     """
     sample = _sample(scene)

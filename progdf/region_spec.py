@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 import re
+import tokenize
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -27,8 +28,8 @@ from progdf.gaussians import Gaussians
 from progdf.region import (
     Region,
     everything,
-    from_mask,
     from_labels,
+    from_mask,
     inside_box,
     inside_sphere,
     union,
@@ -37,6 +38,9 @@ from progdf.region import (
 
 Kind = Callable[[str, Gaussians], Region]
 """Makes a region from what stands behind `KIND:`."""
+
+_DAMAGED = (ValueError, EOFError, TypeError, OverflowError, SyntaxError, tokenize.TokenError)
+"""What numpy raises for a .npy file with a damaged header, which it reads as a Python literal."""
 
 _NOTHING: Mapping[str, Kind] = {}
 
@@ -87,16 +91,15 @@ def read_labels(path: str, count: int) -> Tensor:
     """
     try:
         # mapped, not read: a header that claims more than the file holds allocates nothing
-        labels = np.load(path, mmap_mode="r", allow_pickle=False)
+        labels = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
         raise open_failure(path, error) from None
-    except (ValueError, EOFError):
+    except _DAMAGED:
         raise ProgdfError(
             f"{path} is not a readable .npy file of labels; save them with numpy.save as integers"
         ) from None
-    if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "iub":
-        what = labels.dtype if isinstance(labels, np.ndarray) else "several arrays"
-        raise ProgdfError(f"{path} holds {what}; one array of integer labels would be right")
+    if labels.dtype.kind not in "iub":
+        raise ProgdfError(f"{path} holds {labels.dtype} numbers; integer labels would be right")
     if labels.shape not in ((count,), (count, 1)):
         shape = "x".join(str(side) for side in labels.shape) or "1"
         raise ProgdfError(
