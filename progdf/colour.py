@@ -97,11 +97,9 @@ def recolor(rgb: Tensor, target: Tensor, strength: Strength = 1.0, reference: Te
     s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(lightness.shape).clamp(0, 1)
 
     out_l = _relight(lightness, ref_l.clamp(0.02, 0.98), (ref_l + s * (new_l - ref_l)).clamp(0.02, 0.98))
-    # chroma proportional to lightness is the same surface in less light; towards white it has to shrink again
+    # chroma in proportion to lightness is the same surface in less light; towards white the gamut narrows it
     end_l = _relight(lightness, ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))
-    fade = torch.minimum(end_l / new_l.clamp_min(0.02), (1 - end_l) / (1 - new_l).clamp_min(0.02)).clamp(
-        0, 1.5
-    )
+    fade = (end_l / new_l.clamp_min(0.02)).clamp(0, 1)
     out_c = chroma + s * (new_c * fade - chroma)
 
     turn = _turn(ref_hue, new_hue) if not (ref_grey or new_grey) else torch.zeros_like(ref_hue)

@@ -3,5 +3,17 @@
 from __future__ import annotations
 
 from progdf.scenes.bear import SMALLEST, DemoScene, bear
+from progdf.scenes.edits import AnalyticEdit, bear_edits, darkened, grown, recolored, striped, swung
 
-__all__ = ["SMALLEST", "DemoScene", "bear"]
+__all__ = [
+    "SMALLEST",
+    "AnalyticEdit",
+    "DemoScene",
+    "bear",
+    "bear_edits",
+    "darkened",
+    "grown",
+    "recolored",
+    "striped",
+    "swung",
+]

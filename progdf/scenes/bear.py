@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -62,7 +63,11 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
     """
     if size < SMALLEST:
         raise ProgdfError(f"{size} Gaussians are too few for a bear; at least {SMALLEST} would be right")
-    parts = bear_parts()
+    with _one_thread():
+        return _grow(bear_parts(), size, seed)
+
+
+def _grow(parts: Sequence[Part], size: int, seed: int) -> DemoScene:
     random = torch.Generator().manual_seed(seed)
     table = lattice(seed)
     counts, shown = _budget(parts, size)
@@ -80,6 +85,17 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
         torch.tensor([0.0, 1.0, 0.0]),
         (0.749, 0.847, 0.945),
     )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Hundreds of small tensor operations: more threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
@@ -181,12 +197,13 @@ def _lay(
 
     shape = [0.85, 0.58, 0.16] if furry else [0.80, 0.50, 0.14] if part.name in WOOL else [0.64, 0.64, 0.14]
     flat = torch.tensor(shape) * h / (1 - _standing(part)) ** 0.5
-    hair = torch.tensor([0.95, 0.24, 0.16]) * h
+    # fur keeps some length however fine the sampling
+    hair = torch.cat([(0.95 * h).clamp_min(0.013), 0.24 * h, 0.16 * h], dim=1)
     if part.name == "grass":
         flat = 1.3 * flat
         hair = torch.cat([0.45 * h + 0.022, 0.16 * h, 0.10 * h], dim=1)
     scales = torch.where(stands > 0, hair, flat) * torch.exp(0.12 * torch.randn(n, 3, generator=random))
-    lift = (0.5 * hair[:, :1] if part.name == "grass" else 0.25 * h) * stands
+    lift = (0.5 * hair[:, :1] if part.name == "grass" else 0.35 * hair[:, :1]) * stands
     jitter = 0.06 * h * torch.randn(n, 1, generator=random)
     means = at.points + (lift + jitter) * at.normals
     return means, _quats(frame), scales.log()

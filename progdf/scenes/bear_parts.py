@@ -41,16 +41,23 @@ def _ellipsoid(
     return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow, clears)
 
 
-def _detail(name: str, label: str, centre: Triple, radii: Triple, turn: Triple = (0.0, 0.0, 0.0)) -> Part:
+def _detail(
+    name: str,
+    label: str,
+    centre: Triple,
+    radii: Triple,
+    turn: Triple = (0.0, 0.0, 0.0),
+    weight: float = 7.0,
+) -> Part:
     """A small part drawn finely, with no fur over it and no shadow of its own."""
-    return _ellipsoid(name, label, centre, radii, turn, 7.0, casts_shadow=False, clears=0.16)
+    return _ellipsoid(name, label, centre, radii, turn, weight, casts_shadow=False, clears=0.16)
 
 
 def _eye(x: float) -> list[Part]:
     """An eye and the window it mirrors, up on the side that the lamp is on."""
     return [
         _detail("eye", "head", (x, 1.545, 0.432), (0.052, 0.060, 0.042)),
-        _detail("glint", "head", (x - 0.017, 1.567, 0.468), (0.014, 0.015, 0.006)),
+        _detail("glint", "head", (x - 0.017, 1.567, 0.468), (0.015, 0.016, 0.006), weight=30.0),
     ]
 
 
