@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import LANES, LOG2_ALPHA_MIN, PLANE, exp2, row_support
-from progdf.rasterize.projection import L11, R2
+from progdf.rasterize.pixels import LANES, PEAK, PLANE, ROW_NUMBERS, START, STOP, TOP, U_PEAK, exp2, find_rows
+from progdf.rasterize.projection import L11
 
 Array = NDArray[Any]
 
@@ -25,13 +25,14 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _G, _B, _LAST = PLANE * np.uint64(2), PLANE * np.uint64(3), PLANE * np.uint64(4)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def blend_row(
     state: Array, base: int, start: int, stop: int, peak: float, u_peak: float, l11: float, top: float,
     red: float, green: float, blue: float, place: float,
 ) -> None:  # fmt: skip
     """Blend one splat into columns start..stop of one row of a tile; alpha = 2^(top − u²). All floats float32."""
-    first, last = np.int32(start), np.int32(stop)
+    if start >= stop:
+        return
     begin = np.uint64(start) // LANES * LANES
     end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES
     for j in range(begin, end):
@@ -39,7 +40,7 @@ def blend_row(
         column = np.int32(j)
         u = u_peak + l11 * (np.float32(column) - peak)
         alpha = min(_ALPHA_MAX, exp2(top - u * u))
-        alpha = alpha if (column >= first) & (column < last) else _ZERO
+        alpha = alpha if (column >= start) & (column < stop) else _ZERO
         before = state[p]
         after = before * (_ONE - alpha)
         taken = after > _T_MIN
@@ -61,6 +62,7 @@ def blend_tile(
     state[plane : 4 * plane] = _ZERO
     state[4 * plane :] = -_ONE
     left, right = max(0, window[0] - x), min(TILE_W, window[2] - x)
+    rows = np.empty(ROW_NUMBERS, np.float32)
     for place in range(members.size):
         if place % _CHECK_EVERY == _CHECK_EVERY - 1:
             highest = _ZERO
@@ -71,15 +73,15 @@ def blend_tile(
         s = members[place]
         splat = splats[s]
         first, end = row_bounds(splat, window)
-        for row in range(max(first, y), min(end, y + TILE_H)):
-            start, stop, peak, u_peak, v = row_support(splat, x, row, left, right)
-            if start < stop:
-                blend_row(
-                    state, (row - y) * TILE_W, start, stop,
-                    np.float32(peak), np.float32(u_peak), np.float32(splat[L11]),
-                    np.float32(splat[R2] + LOG2_ALPHA_MIN - v * v),
-                    rgb[s, 0], rgb[s, 1], rgb[s, 2], np.float32(place),
-                )  # fmt: skip
+        first, end = max(first - y, 0), min(end - y, TILE_H)
+        find_rows(splat, x, y, left, right, rows)
+        l11 = np.float32(splat[L11])
+        red, green, blue = rgb[s, 0], rgb[s, 1], rgb[s, 2]
+        for k in range(np.uint64(first), np.uint64(end)):
+            blend_row(
+                state, k * np.uint64(TILE_W), np.int32(rows[START + k]), np.int32(rows[STOP + k]), rows[PEAK + k], rows[U_PEAK + k], l11,
+                rows[TOP + k], red, green, blue, np.float32(place),
+            )  # fmt: skip
 
 
 @kernel(parallel=True, cache=True)

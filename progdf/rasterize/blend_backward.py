@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
 from progdf.rasterize.conventions import ALPHA_MAX
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import LANES, LOG2_ALPHA_MIN, PLANE, exp2, row_support
-from progdf.rasterize.projection import L11, R2
+from progdf.rasterize.pixels import LANES, PEAK, PLANE, ROW_NUMBERS, START, STOP, TOP, U_PEAK, V, exp2, find_rows
+from progdf.rasterize.projection import L11
 
 Array = NDArray[Any]
 
@@ -32,23 +32,24 @@ _BEHIND, _G0, _G1 = PLANE, PLANE * np.uint64(2), PLANE * np.uint64(3)
 _G2, _LAST = PLANE * np.uint64(4), PLANE * np.uint64(5)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def unblend_row(
     state: Array, base: int, start: int, stop: int, peak: float, u_peak: float, l11: float, top: float,
     red: float, green: float, blue: float, place: float,
 ) -> tuple[float, float, float, float, float, float]:  # fmt: skip
     """Take one splat off columns start..stop of one row; arguments as in `blend_row`. Σ colour (3), Σg, Σgu, Σgu²"""
-    first, last = np.int32(start), np.int32(stop)
+    sum_r = sum_g = sum_b = sum_0 = sum_u = sum_uu = _ZERO
+    if start >= stop:
+        return sum_r, sum_g, sum_b, sum_0, sum_u, sum_uu
     begin = np.uint64(start) // LANES * LANES
     end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES
-    sum_r = sum_g = sum_b = sum_0 = sum_u = sum_uu = _ZERO
     for j in range(begin, end):
         p = np.uint64(base) + j
         column = np.int32(j)
         u = u_peak + l11 * (np.float32(column) - peak)
         raw = exp2(top - u * u)
         alpha = min(_ALPHA_MAX, raw)
-        alpha = alpha if (column >= first) & (column < last) & (place <= state[p + _LAST]) else _ZERO
+        alpha = alpha if (column >= start) & (column < stop) & (place <= state[p + _LAST]) else _ZERO
         inverse = _ONE / (_ONE - alpha)
         before = state[p] * inverse
         g0, g1, g2 = state[p + _G0], state[p + _G1], state[p + _G2]
@@ -86,6 +87,7 @@ def unblend_tile(
     for p in range(5 * plane, 6 * plane):
         deepest = max(deepest, state[p])
     left, right = max(0, window[0] - x), min(TILE_W, window[2] - x)
+    rows = np.empty(ROW_NUMBERS, np.float32)
     for place in range(members.size - 1, -1, -1):
         out = sums[slots[place]]
         out[:] = _ZERO
@@ -94,25 +96,25 @@ def unblend_tile(
         s = members[place]
         splat = splats[s]
         first, end = row_bounds(splat, window)
-        for row in range(max(first, y), min(end, y + TILE_H)):
-            start, stop, peak, u_peak, v = row_support(splat, x, row, left, right)
-            if start < stop:
-                r, g, b, g_0, g_u, g_uu = unblend_row(
-                    state, (row - y) * TILE_W, start, stop,
-                    np.float32(peak), np.float32(u_peak), np.float32(splat[L11]),
-                    np.float32(splat[R2] + LOG2_ALPHA_MIN - v * v),
-                    rgb[s, 0], rgb[s, 1], rgb[s, 2], np.float32(place),
-                )  # fmt: skip
-                w = np.float32(v)
-                out[0] += r
-                out[1] += g
-                out[2] += b
-                out[3] += g_0
-                out[4] += g_u
-                out[5] += g_0 * w
-                out[6] += g_uu
-                out[7] += g_u * w
-                out[8] += g_0 * w * w
+        first, end = max(first - y, 0), min(end - y, TILE_H)
+        find_rows(splat, x, y, left, right, rows)
+        l11 = np.float32(splat[L11])
+        red, green, blue = rgb[s, 0], rgb[s, 1], rgb[s, 2]
+        for k in range(np.uint64(first), np.uint64(end)):
+            r, g, b, g_0, g_u, g_uu = unblend_row(
+                state, k * np.uint64(TILE_W), np.int32(rows[START + k]), np.int32(rows[STOP + k]), rows[PEAK + k], rows[U_PEAK + k], l11,
+                rows[TOP + k], red, green, blue, np.float32(place),
+            )  # fmt: skip
+            v = rows[V + k]
+            out[0] += r
+            out[1] += g
+            out[2] += b
+            out[3] += g_0
+            out[4] += g_u
+            out[5] += g_0 * v
+            out[6] += g_uu
+            out[7] += g_u * v
+            out[8] += g_0 * v * v
 
 
 @kernel(parallel=True, cache=True)

@@ -63,16 +63,18 @@ CACHE = _cache_folder()
 
 
 def kernel(
-    *, fast: bool = False, parallel: bool = False, cache: bool = False, inline: bool = False
+    *, fast: bool = False, contract: bool = False, parallel: bool = False, cache: bool = False, inline: bool = False
 ) -> Callable[[_F], _F]:
     """Compile a function with numba.
 
     Args:
         fast: with the flags of the pixel loops (`FAST`); otherwise strict IEEE
+        contract: strict but for fused multiply-adds
         parallel: `prange` runs on several threads
         cache: keep the machine code on disk; for functions that Python calls
         inline: always inline into the calling kernel
     """
+    flags = FAST if fast else {"contract"} if contract else False
 
     def decorate(function: _F) -> _F:
         before = config.CACHE_DIR
@@ -81,7 +83,7 @@ def kernel(
         )  # read when the decorator runs; other packages' caches stay where they are
         try:
             compiled: _F = numba.njit(
-                fastmath=FAST if fast else False,
+                fastmath=flags,
                 parallel=parallel,
                 cache=cache,
                 nogil=True,

@@ -66,33 +66,42 @@ def exp2(x: float) -> float:
     return _as_float(_as_int(p) + (whole << np.int32(23)))
 
 
-@kernel(inline=True)
-def row_support(splat: Array, x: int, y: int, first: int, end: int) -> tuple[int, int, float, float, float]:
-    """Where a splat is at least 1/255 in one pixel row, decided in float64.
+START, STOP, PEAK, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
+"""Planes of `find_rows`' result."""
+
+ROW_NUMBERS = 6 * TILE_H
+"""Length of `find_rows`' result."""
+
+
+@kernel(fast=True, inline=True)
+def find_rows(splat: Array, x: int, y: int, left: int, right: int, rows: Array) -> None:
+    """Where a splat is at least 1/255 in each pixel row of a tile, decided in float64.
 
     Args:
         splat: [8] float64, see `projection`
-        x: column of the tile's first pixel in the full image
-        y: row in the full image
-        first, end: the columns of the tile to look at, from `x`
-
-    Returns:
-        first column of the support and one past its last, from `x` (equal: there is none);
-        the column nearest to the row's peak, and u there: u = u_peak + l11 · (column − peak);
-        v
+        x, y: the tile's first pixel in the full image
+        left, right: the columns of the tile to look at, from `x`
+        rows: out, six planes of one number per row. START, STOP: first column of the support and one past its last,
+            from `x`; none where STOP is not the greater. PEAK: the column nearest to the row's peak; U_PEAK: u
+            there, so that u = u_peak + l11 · (column − peak). V: v. TOP: log2 of alpha where u is 0. [48] float32
     """
-    dy = y + 0.5 - splat[MY]
-    v = splat[L22] * dy
-    rest = splat[R2] - v * v
-    if not rest >= 0.0:
-        return 0, 0, 0.0, 0.0, 0.0
-    centre = splat[MX] - splat[SLOPE] * dy - x - 0.5
-    half = math.sqrt(rest) * splat[INV_L11]
-    start = max(np.ceil(centre - half), float(first))
-    stop = min(np.floor(centre + half) + 1.0, float(end))
-    if not start < stop:
-        return 0, 0, 0.0, 0.0, 0.0
-    # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far peaks (needles,
-    # giants) lie where l11 is small
-    peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
-    return int(start), int(stop), peak, splat[L11] * (peak - centre), v
+    low, high = np.float64(left), np.float64(right)
+    mx, my, slope, l11 = splat[MX] - x - 0.5, splat[MY] - y - 0.5, splat[SLOPE], splat[L11]
+    inv_l11, l22, r2 = splat[INV_L11], splat[L22], splat[R2]
+    for row in range(np.uint64(TILE_H)):
+        dy = np.float64(np.int32(row)) - my
+        v = l22 * dy
+        rest = r2 - v * v
+        centre = mx - slope * dy
+        half = np.sqrt(max(rest, 0.0)) * inv_l11
+        start = max(np.ceil(centre - half), low)
+        stop = min(np.floor(centre + half) + 1.0, high)
+        # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far peaks
+        # (needles, giants) lie where l11 is small
+        peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
+        rows[START + row] = min(start, high)
+        rows[STOP + row] = max(stop, low) if rest >= 0.0 else low
+        rows[PEAK + row] = peak
+        rows[U_PEAK + row] = l11 * (peak - centre)
+        rows[V + row] = v
+        rows[TOP + row] = rest + LOG2_ALPHA_MIN

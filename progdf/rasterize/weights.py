@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import LOG2_ALPHA_MIN, exp2, row_support
-from progdf.rasterize.projection import L11, R2
+from progdf.rasterize.pixels import PEAK, ROW_NUMBERS, START, STOP, TOP, U_PEAK, exp2, find_rows
+from progdf.rasterize.projection import L11
 
 Array = NDArray[Any]
 
@@ -39,6 +39,7 @@ def weigh(
     tiles = tile_starts.size - 1
     for worker in prange(workers):
         state = np.empty(TILE_H * TILE_W, np.float32)
+        rows = np.empty(ROW_NUMBERS, np.float32)
         for tile in range(worker, tiles, workers):
             x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
             state[:] = _ONE
@@ -47,18 +48,18 @@ def weigh(
                 splat = splats[members[place]]
                 out = sums[slots[place]]
                 first, end = row_bounds(splat, window)
-                for row in range(max(first, y), min(end, y + TILE_H)):
-                    start, stop, peak, u_peak, v = row_support(splat, x, row, left, right)
-                    top = np.float32(splat[R2] + LOG2_ALPHA_MIN - v * v)
-                    for j in range(start, stop):
-                        p = (row - y) * TILE_W + j
-                        u = np.float32(u_peak) + np.float32(splat[L11]) * (np.float32(j) - np.float32(peak))
-                        alpha = min(_ALPHA_MAX, exp2(top - u * u))
+                first, end = max(first - y, 0), min(end - y, TILE_H)
+                find_rows(splat, x, y, left, right, rows)
+                for k in range(np.uint64(first), np.uint64(end)):
+                    for j in range(np.uint64(rows[START + k]), np.uint64(rows[STOP + k])):
+                        p = k * np.uint64(TILE_W) + j
+                        u = rows[U_PEAK + k] + np.float32(splat[L11]) * (np.float32(np.int32(j)) - rows[PEAK + k])
+                        alpha = min(_ALPHA_MAX, exp2(rows[TOP + k] - u * u))
                         before = state[p]
                         after = before * (_ONE - alpha)
                         if after > _T_MIN:
                             weight = alpha * before
-                            m = mask[row, x + j]
+                            m = mask[np.uint64(y) + k, np.uint64(x) + j]
                             state[p] = after
                             out[0] += weight * m
                             out[1] += m
