@@ -53,8 +53,7 @@ def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
             return torch.nn.functional.normalize(mean, dim=0)
     sample = _sample(scene)
     centre, radius = scene_sphere(sample)
-    weights, normals = _flatness(sample)
-    facing = weights[:, None] * normals.abs() ** 4
+    facing = _flatness(sample)[:, None] * normals_of(sample).abs() ** 4
     axis = int(facing.sum(dim=0).argmax())
     across = ((sample.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5)
     counts, edges = torch.histogram(across, bins=60, range=(-1.5, 1.5), weight=facing[:, axis])
@@ -126,19 +125,17 @@ def _areas(scene: Gaussians) -> Tensor:
     return areas.clamp_max(float(_quantile(areas, 0.99)))
 
 
-def _flatness(scene: Gaussians) -> tuple[Tensor, Tensor]:
-    """Visible flat area of each Gaussian, and its normal: the shortest axis. [N], [N,3]"""
-    shortest = scene.log_scales.argmin(dim=1)
-    w, x, y, z = scene.unit_quats.unbind(dim=1)
-    columns = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=1),
-            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=1),
-            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1),
-        ],
-        dim=1,
-    )
-    normals = columns[torch.arange(len(scene)), shortest]
+def _flatness(scene: Gaussians) -> Tensor:
+    """Visible flat area of each Gaussian: nothing for needles and balls. [N]"""
     ordered = scene.log_scales.sort(dim=1).values
     flat = 1 - (ordered[:, 0] - ordered[:, 1]).exp()
-    return _areas(scene) * scene.opacities * flat, normals
+    return _areas(scene) * scene.opacities * flat
+
+
+def normals_of(scene: Gaussians) -> Tensor:
+    """The shortest axis of each Gaussian in the world, of either sign. [N,3], unit length"""
+    axes = torch.eye(3)[scene.log_scales.argmin(dim=1)]
+    w, xyz = scene.unit_quats[:, :1], scene.unit_quats[:, 1:]
+    twice = 2 * torch.linalg.cross(xyz, axes)
+    normals: Tensor = axes + w * twice + torch.linalg.cross(xyz, twice)
+    return normals

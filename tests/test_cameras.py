@@ -20,8 +20,9 @@ import progdf
 from progdf.camera import Camera, orbit_rig, split_held_out
 from progdf.camera_files import load_cameras, save_cameras
 from progdf.errors import ProgdfError
-from progdf.framing import front, guess_up, is_surrounding, scene_sphere
+from progdf.framing import front, guess_up, is_surrounding, normals_of, scene_sphere
 from progdf.gaussians import Gaussians, normalize_quats
+from progdf.rasterize.reference import rotation_matrices
 from progdf.scenes import bear
 from tests.scenes import random_gaussians
 
@@ -165,6 +166,13 @@ def test_up_is_found_however_the_bear_lies(up: Tensor, small_bear: Gaussians) ->
     # y -> up, z -> second, x -> their cross product: a rotation by quarter turns
     rotation = torch.stack([torch.linalg.cross(up, second), up, second], dim=1)
     assert torch.equal(guess_up(turned(small_bear, rotation)), up)
+
+
+def test_normals_are_the_shortest_axes() -> None:
+    scene = random_gaussians(50, seed=4)
+    rotations = rotation_matrices(scene.unit_quats)
+    expected = rotations[torch.arange(50), :, scene.scales.argmin(dim=1)]
+    torch.testing.assert_close(normals_of(scene), expected)
 
 
 def test_cameras_that_agree_tell_the_up_direction(small_bear: Gaussians) -> None:
@@ -346,8 +354,12 @@ BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what m
     "no matrix": (lambda t: t["frames"][3].pop("transform_matrix"), "frame 3"),
     "a row gone": (lambda t: t["frames"][3]["transform_matrix"].pop(0), "no rotation"),
     "ragged matrix": (lambda t: t["frames"][3]["transform_matrix"][1].pop(), "transform_matrix"),
-    "mirrored": (
+    "stretched": (
         lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(slice(0, 3), [9, 0, 0]),
+        "rotation",
+    ),
+    "mirrored": (
+        lambda t: t["frames"][1]["transform_matrix"].insert(0, t["frames"][1]["transform_matrix"].pop(1)),
         "rotation",
     ),
     "NaN": (lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(0, math.nan), "finite"),
