@@ -7,14 +7,14 @@ the box.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.gaussians import Gaussians, unpack
+from progdf.gaussians import ATTRIBUTES, Gaussians, unpack
 from progdf.rasterize import Crop, rasterize
 from progdf.sh import basis, shade
 from trainer.losses import clamp_towards
@@ -55,23 +55,27 @@ class CropScene:
         image, _ = self._draw(self.means, self.quats, self.scales, self.opacities, self.colors)
         return image
 
-    def render(self, packed: Tensor) -> tuple[Tensor, Tensor]:
+    def render(self, packed: Tensor, moving: Collection[str] = ATTRIBUTES) -> tuple[Tensor, Tensor]:
         """The box with these raw values in the region's rows, differentiable in them.
 
         Args:
             packed: member rows as `gaussians.pack` gives them. [M,14] or [M,14+3K]
+            moving: attributes whose values differ from the original's; the others are not looked at
 
         Returns:
             image [h,w,3], 0..1 with the clamp's gradient kept where it points inwards; transmittance [h,w]
         """
         members = unpack(packed, self.member_shN)
-        colors = member_colors(members, self.camera.position)
+
+        def now(name: str, original: Tensor, values: Tensor) -> Tensor:
+            return original.index_copy(0, self.rows, values) if name in moving else original
+
         image, transmittance = self._draw(
-            self.means.index_copy(0, self.rows, members.means),
-            self.quats.index_copy(0, self.rows, members.quats),
-            self.scales.index_copy(0, self.rows, members.scales),
-            self.opacities.index_copy(0, self.rows, members.opacities),
-            self.colors.index_copy(0, self.rows, colors),
+            now("means", self.means, members.means),
+            now("quats", self.quats, members.quats),
+            now("log_scales", self.scales, members.scales),
+            now("logit_opacities", self.opacities, members.opacities),
+            self.colors.index_copy(0, self.rows, member_colors(members, self.camera.position)),
         )
         return clamp_towards(image, 0.0, 1.0), transmittance
 

@@ -1,0 +1,128 @@
+"""What is measured of an edit, always on views that training has not seen, and always on the region's own pixels.
+
+A whole picture of which the region is 3 % would flatter every figure; so errors are taken over the pixels that show
+the region or that the edit changes (method.md 7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians, pack
+from progdf.region import Region
+from trainer.crops import CropScene, crop_scene, render_all
+from trainer.losses import Perceptual
+from trainer.trajectory import Trajectory
+from trainer.views import View, crop
+
+OffsetsAt = Callable[[float], Tensor]
+"""Slider value -> offsets of the members. float -> [M,C]"""
+
+SLIDER_SAMPLES = 25
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Held-out views, ready to be compared.
+
+    Args:
+        original: raw member rows, packed. [M,C]
+        crops: the views' boxes with the scene around the region
+        pixels: which pixels count. [h,w] bool each
+        edited: strength → the editor's pictures of the boxes
+        names: the views' names
+    """
+
+    original: Tensor
+    crops: Sequence[CropScene]
+    pixels: Sequence[Tensor]
+    edited: Mapping[float, Sequence[Tensor]]
+    names: Sequence[str]
+
+    def pictures(self, offsets: Tensor) -> list[Tensor]:
+        """Every view with these offsets. [M,C] -> [h,w,3] each"""
+        return render_all(self.crops, self.original[:, : offsets.shape[1]] + offsets)
+
+    def psnr(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+        """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""
+        error = count = 0.0
+        for a, b, pixels in zip(found, expected, self.pixels, strict=True):
+            error += float((a[pixels] - b[pixels]).double().square().sum())
+            count += 3 * int(pixels.sum())
+        return 99.0 if error <= 0 else min(99.0, -10 * math.log10(error / max(count, 1)))
+
+    def perceptual(self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual) -> float:
+        """Mean perceptual distance of the boxes."""
+        with torch.no_grad():
+            values = [float(measure(a, b, None)) for a, b in zip(found, expected, strict=True)]
+        return sum(values) / max(1, len(values))
+
+    def psnr_curve(self, offsets_at: OffsetsAt, expected: Sequence[Sequence[Tensor]]) -> list[float]:
+        """PSNR at `slider_samples()` to the pictures expected there."""
+        return [
+            self.psnr(self.pictures(offsets_at(s)), pictures)
+            for s, pictures in zip(slider_samples(), expected, strict=True)
+        ]
+
+    def recorded(self, trajectory: Trajectory) -> list[list[Tensor]]:
+        """The trajectory's own pictures at `slider_samples()`."""
+        return [self.pictures(trajectory.at(s)) for s in slider_samples()]
+
+
+def slider_samples() -> list[float]:
+    """Slider values at which errors are taken: even, both ends left out where the error is 0 by construction."""
+    return [(i + 1) / (SLIDER_SAMPLES + 1) for i in range(SLIDER_SAMPLES)]
+
+
+def make_judge(
+    scene: Gaussians,
+    region: Region,
+    views: Sequence[View],
+    edited: Mapping[float, Sequence[Tensor]],
+    background: Tensor,
+    channels: int,
+) -> Judge:
+    """Prepare held-out views.
+
+    Args:
+        scene: the original
+        region: what is edited
+        views: held-out views
+        edited: strength → the editor's whole pictures of these views. [H,W,3]
+        background: rgb. [3]
+        channels: width of a packed row
+    """
+    crops = [crop_scene(scene, region.members, view.camera, view.box, background) for view in views]
+    pixels = []
+    for i, view in enumerate(views):
+        counts = view.mask > 0.05
+        for pictures in edited.values():
+            counts = counts | ((pictures[i] - view.image).abs().amax(dim=2) > 2 / 255)
+        pixels.append(crop(counts, view.box))
+    boxes = {s: [crop(p, v.box) for p, v in zip(ps, views, strict=True)] for s, ps in edited.items()}
+    original = pack(scene[region.members], with_shN=channels > 14)
+    return Judge(original, crops, pixels, boxes, [view.camera.name for view in views])
+
+
+def slider_curve(judge: Judge, offsets_at: OffsetsAt, steps: int = 20) -> tuple[list[float], list[float]]:
+    """Visible change along the slider.
+
+    Returns:
+        mean |picture(s) − picture(0)| at 0, 1/steps … 1, and the chord from each of those to the next
+    """
+    pictures = [judge.pictures(offsets_at(i / steps)) for i in range(steps + 1)]
+    start = pictures[0]
+    return (
+        [_distance(picture, start) for picture in pictures],
+        [_distance(b, a) for a, b in zip(pictures, pictures[1:], strict=False)],
+    )
+
+
+def _distance(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:
+    total = sum(float((x - y).abs().sum()) for x, y in zip(a, b, strict=True))
+    return total / sum(x.numel() for x in a)

@@ -1,0 +1,91 @@
+"""How a run tells what it does: a bar with loss and time left on a terminal, plain lines elsewhere and in log.txt."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+Advance = Callable[[int, str], None]
+"""Steps done so far, and a short word about them (the loss)."""
+
+_EVERY_S = 5.0
+
+
+class RunLog:
+    """Writes what happens to log.txt and, unless quiet, to the screen (stderr); measures each stage's seconds.
+
+    Args:
+        path: log.txt, started anew
+        quiet: the file only
+    """
+
+    def __init__(self, path: Path, quiet: bool = False) -> None:
+        self.seconds: dict[str, float] = {}
+        self._start = time.perf_counter()
+        self._file = path.open("w", encoding="utf-8", buffering=1)
+        self._console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._bar = self._console.is_terminal and not quiet
+
+    def say(self, text: str) -> None:
+        """One line."""
+        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {text}\n")
+        if self._bar:
+            self._console.print(f"[dim]{time.perf_counter() - self._start:6.1f} s[/dim]  {_escaped(text)}")
+        else:
+            self._console.print(_escaped(text), soft_wrap=True)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure a part of the run under `name`; a name that comes again adds up."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+
+    @contextmanager
+    def steps(self, what: str, total: int) -> Iterator[Advance]:
+        """A long stage of `total` steps: a bar on a terminal, a line every few seconds elsewhere."""
+        if self._bar:
+            columns = (
+                SpinnerColumn(),
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[word]}"),
+                TimeRemainingColumn(),
+            )
+            with Progress(*columns, console=self._console, transient=True) as progress:
+                task = progress.add_task(what, total=total, word="")
+                yield lambda done, word: progress.update(task, completed=done, word=word)
+            return
+        begun = last = time.perf_counter()
+
+        def advance(done: int, word: str) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            if now - last >= _EVERY_S and done < total:
+                last = now
+                left = (now - begun) / max(done, 1) * (total - done)
+                self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
+
+        yield advance
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
+
+
+def _escaped(text: str) -> str:
+    return text.replace("[", "\\[")
+
+
+def command_line() -> str:
+    """The command as it was typed."""
+    return " ".join(sys.argv[1:]) if sys.argv else ""
