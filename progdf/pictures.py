@@ -1,0 +1,99 @@
+"""Contact sheets: pictures in a grid, with words at the rows and columns that can be read at any size."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from progdf.files import written_whole
+
+_PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
+_Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[Tensor]],
+    row_labels: Sequence[str] = (),
+    column_labels: Sequence[str] = (),
+    title: str = "",
+    caption: str = "",
+) -> Tensor:
+    """Lay pictures out in a grid.
+
+    Args:
+        rows: the pictures, row by row, all of one size; rows may have different lengths. [H,W,3] in 0..1 each
+        row_labels: a word to the left of each row, or none
+        column_labels: a word above each column, or none
+        title: a line at the top
+        caption: a smaller line at the bottom
+
+    Returns:
+        The sheet. [H',W',3] in 0..1
+
+    Raises:
+        ValueError: no picture, pictures of different sizes, more labels than rows or columns.
+    """
+    sizes = {tuple(image.shape) for row in rows for image in row}
+    if len(sizes) != 1:
+        raise ValueError(f"a contact sheet needs pictures of one size, got {sorted(sizes)}")
+    height, width = next(iter(sizes))[:2]
+    columns = max(len(row) for row in rows)
+    if len(row_labels) > len(rows) or len(column_labels) > columns:
+        raise ValueError(
+            f"{len(row_labels)} row labels for {len(rows)} rows, "
+            f"{len(column_labels)} column labels for {columns} columns"
+        )
+    text = max(12, round(height / 18))
+    gap, font = max(4, round(text / 3)), _font(text)
+    large, small = _font(round(1.4 * text)), _font(max(11, round(0.85 * text)))
+    left = gap + (2 * gap + max(_width(label, font) for label in row_labels) if row_labels else 0)
+    top = gap + (round(2.2 * text) if title else 0)
+    grid_top = top + (round(1.6 * text) if column_labels else 0)
+    full_width = max(
+        left + columns * (width + gap),
+        *(_width(line, f) + 4 * gap for line, f in ((title, large), (caption, small))),
+    )
+    full_height = grid_top + len(rows) * (height + gap) + (round(1.8 * text) if caption else 0)
+
+    page = Image.new("RGB", (full_width, full_height), _PAPER)
+    draw = ImageDraw.Draw(page)
+    if title:
+        draw.text((left, gap + 0.8 * text), title, _INK, large, anchor="lm")
+    for j, label in enumerate(column_labels):
+        middle = left + j * (width + gap) + width / 2
+        draw.text((middle, top + 0.75 * text), label, _INK, font, anchor="mm")
+    for i, row in enumerate(rows):
+        y = grid_top + i * (height + gap)
+        if i < len(row_labels):
+            draw.text((left - 2 * gap, y + height / 2), row_labels[i], _INK, font, anchor="rm")
+        for j, image in enumerate(row):
+            page.paste(to_picture(image), (left + j * (width + gap), y))
+    if caption:
+        draw.text((left, full_height - 0.9 * text), caption, _PALE_INK, small, anchor="lm")
+    return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
+
+
+def to_picture(image: Tensor) -> Image.Image:
+    """[H,W,3], 0..1 (what lies outside is cut) -> 8-bit picture, rounded."""
+    return Image.fromarray((image.detach().clamp(0, 1) * 255.0).round().to(torch.uint8).cpu().numpy())
+
+
+def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
+    """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as beside:
+        to_picture(image).save(beside)
+
+
+def _font(size: int) -> _Font:
+    return ImageFont.load_default(size=size)
+
+
+def _width(line: str, font: _Font) -> int:
+    return round(font.getlength(line))
