@@ -89,7 +89,7 @@ def _edit_lines(path: Path) -> Iterator[str]:
 
 def _camera_lines(path: Path) -> Iterator[str]:
     cameras = load_cameras(path)
-    yield f"{path.name}: {len(cameras)} camera{'' if len(cameras) == 1 else 's'}"
+    yield f"{path.name}: {counted(len(cameras), 'camera')}"
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""
     yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"

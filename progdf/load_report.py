@@ -80,9 +80,9 @@ class LoadReport:
         phrases = []
         if self.ignored_properties:
             phrases.append(f"properties {', '.join(self.ignored_properties)}")
-        phrases += [f"element '{name}' ({grouped(rows)} rows)" for name, rows in self.ignored_elements]
+        phrases += [f"element '{name}' ({counted(rows, 'row')})" for name, rows in self.ignored_elements]
         if self.trailing_bytes:
-            phrases.append(f"{grouped(self.trailing_bytes)} bytes after the last row")
+            phrases.append(f"{counted(self.trailing_bytes, 'byte')} after the last row")
         return tuple(phrases)
 
     def lines(self) -> list[str]:
@@ -95,15 +95,13 @@ class LoadReport:
             *(f"ignored: {phrase}" for phrase in self.ignored),
         ]
         if self.scaled_quats:
-            lines.append(
-                f"normalised: {counted(self.scaled_quats)} had a quaternion that was not of unit length"
-            )
+            lines.append(f"normalised: {counted(self.scaled_quats, 'quaternion')} of another length than 1")
         return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]
 
 
-def counted(count: int) -> str:
+def counted(count: int, noun: str = "Gaussian") -> str:
     """1 as "1 Gaussian", 12345 as "12 345 Gaussians"."""
-    return f"{grouped(count)} Gaussian{'' if count == 1 else 's'}"
+    return f"{grouped(count)} {noun}{'' if count == 1 else 's'}"
 
 
 def file_size(count: int) -> str:

@@ -8,7 +8,7 @@ import torch
 
 from progdf.framing import guess_up, is_surrounding, scene_sphere
 from progdf.gaussians import Gaussians
-from progdf.load_report import grouped
+from progdf.load_report import counted
 
 GIANT = 0.5
 """Of the scene's radius: a Gaussian with a longer axis (one standard deviation) covers most of a picture."""
@@ -60,11 +60,11 @@ class Survey:
             "(longest axis, one standard deviation)",
         ]
         odd = (
-            (self.invisible, "Gaussians too transparent to be drawn (opacity under 1/255)"),
-            (self.giants, f"giants (longer than {GIANT:g} of the scene's radius)"),
-            (self.needles, f"needles ({NEEDLE:g} times as long as wide, and long)"),
+            (self.invisible, "Gaussian", "too transparent to be drawn (opacity under 1/255)"),
+            (self.giants, "giant", f"(longer than {GIANT:g} of the scene's radius)"),
+            (self.needles, "needle", f"({NEEDLE:g} times as long as wide, and long)"),
         )
-        lines += [f"odd: {grouped(rows)} {what}" for rows, what in odd if rows]
+        lines += [f"odd: {counted(rows, noun)} {what}" for rows, noun, what in odd if rows]
         if self.surrounding:
             lines.append(
                 "cameras: a scene to stand inside, which cameras around it cannot frame; give its own"

@@ -80,7 +80,7 @@ def test_check_points_at_odd_gaussians(tmp_path: Path, capsys: pytest.CaptureFix
     scene.logit_opacities[4:9] = -9.0
     save_ply(tmp_path / "scene.ply", scene)
     text = "\n".join(lines_of(capsys, "check", str(tmp_path / "scene.ply")))
-    assert "odd: 1 giants" in text
+    assert "odd: 1 giant " in text
     assert "odd: 3 needles" in text
     assert "odd: 5 Gaussians too transparent" in text
 

@@ -2,8 +2,8 @@
 
     pytest tests/benchmarks/test_bench_ply.py -o addopts= --benchmark-enable
 
-The ways are interleaved in one process; the file lies in the page cache. With benchmarks disabled, as they are by
-default, each runs once on a small scene, so that the benchmark itself stays tested.
+The ways are interleaved in one process; the file lies in the page cache. With benchmarks disabled, as they
+are by default, each runs once on a small scene, so that the benchmark itself stays tested.
 """
 
 from __future__ import annotations
