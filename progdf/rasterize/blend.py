@@ -8,15 +8,16 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
+from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import LANES, PEAK, PLANE, ROW_NUMBERS, START, STOP, TOP, U_PEAK, exp2, find_rows
-from progdf.rasterize.projection import L11
+from progdf.rasterize.pixels import (
+    BATCH, BLUE, CARD, END, FIRST, GREEN, LANES, PEAK, PLANE, RED, START, STEP, STOP, TOP, U_PEAK, exp2, make_cards,
+    tile_bounds,
+)  # fmt: skip
 
 Array = NDArray[Any]
 
-_CHECK_EVERY = 16  # splats between two looks at whether a tile's pixels are done
 _ALPHA_MAX = np.float32(ALPHA_MAX)
 _T_MIN = np.float32(TRANSMITTANCE_MIN)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
@@ -26,19 +27,17 @@ _G, _B, _LAST = PLANE * np.uint64(2), PLANE * np.uint64(3), PLANE * np.uint64(4)
 
 
 @kernel(fast=True, inline=True)
-def blend_row(
-    state: Array, base: int, start: int, stop: int, peak: float, u_peak: float, l11: float, top: float,
-    red: float, green: float, blue: float, place: float,
-) -> None:  # fmt: skip
-    """Blend one splat into columns start..stop of one row of a tile; alpha = 2^(top − u²). All floats float32."""
-    if start >= stop:
-        return
+def blend_row(state: Array, cards: Array, card: int, row: int, place: float) -> None:
+    """Blend one row of a splat into a tile's state; `card` is where its card begins, see `pixels`."""
+    start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
+    peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
+    top, red, green, blue = cards[card + TOP + row], cards[card + RED], cards[card + GREEN], cards[card + BLUE]
     begin = np.uint64(start) // LANES * LANES
-    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES
+    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
-        p = np.uint64(base) + j
+        p = row * np.uint64(TILE_W) + j
         column = np.int32(j)
-        u = u_peak + l11 * (np.float32(column) - peak)
+        u = u_peak + step * (np.float32(column) - peak)
         alpha = min(_ALPHA_MAX, exp2(top - u * u))
         alpha = alpha if (column >= start) & (column < stop) else _ZERO
         before = state[p]
@@ -52,36 +51,27 @@ def blend_row(
         state[p + _LAST] = place if weight > _ZERO else state[p + _LAST]
 
 
-@kernel()
+@kernel(fast=True)
 def blend_tile(
-    state: Array, x: int, y: int, members: Array, splats: Array, rgb: Array, window: Array
+    state: Array, x: int, y: int, members: Array, splats: Array, rgb: Array, bounds: Array, cards: Array
 ) -> None:
-    """Blend a tile whose first pixel is (x, y); state is [5·PLANE] float32, set up here."""
+    """Blend a tile; state is [5·PLANE] float32, set up here, the rest as in `make_cards`."""
     plane = np.int64(PLANE)
     state[:plane] = _ONE
     state[plane : 4 * plane] = _ZERO
     state[4 * plane :] = -_ONE
-    left, right = max(0, window[0] - x), min(TILE_W, window[2] - x)
-    rows = np.empty(ROW_NUMBERS, np.float32)
-    for place in range(members.size):
-        if place % _CHECK_EVERY == _CHECK_EVERY - 1:
-            highest = _ZERO
-            for p in range(plane):
-                highest = max(highest, state[p])
-            if highest <= _ZERO:
-                break
-        s = members[place]
-        splat = splats[s]
-        first, end = row_bounds(splat, window)
-        first, end = max(first - y, 0), min(end - y, TILE_H)
-        find_rows(splat, x, y, left, right, rows)
-        l11 = np.float32(splat[L11])
-        red, green, blue = rgb[s, 0], rgb[s, 1], rgb[s, 2]
-        for k in range(np.uint64(first), np.uint64(end)):
-            blend_row(
-                state, k * np.uint64(TILE_W), np.int32(rows[START + k]), np.int32(rows[STOP + k]), rows[PEAK + k], rows[U_PEAK + k], l11,
-                rows[TOP + k], red, green, blue, np.float32(place),
-            )  # fmt: skip
+    for begin in range(0, members.size, BATCH):
+        end = min(begin + BATCH, members.size)
+        make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
+        for place in range(begin, end):
+            card = np.uint64(place - begin) * CARD
+            for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
+                blend_row(state, cards, card, row, np.float32(place))
+        highest = _ZERO
+        for p in range(plane):
+            highest = max(highest, state[p])
+        if highest <= _ZERO:  # every pixel is done
+            break
 
 
 @kernel(parallel=True, cache=True)
@@ -105,12 +95,15 @@ def blend(
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     for worker in prange(workers):
-        state = np.empty(5 * plane, np.float32)
+        state, cards = np.empty(5 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
+        bounds = np.empty(4, np.int64)
         for tile in range(worker, tiles, workers):
             x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
-            blend_tile(state, x, y, members[tile_starts[tile] : tile_starts[tile + 1]], splats, rgb, window)
-            for row in range(max(y, window[1]), min(y + TILE_H, window[3])):
-                for column in range(max(x, window[0]), min(x + TILE_W, window[2])):
+            tile_bounds(x, y, window, bounds)
+            listed = members[tile_starts[tile] : tile_starts[tile + 1]]
+            blend_tile(state, x, y, listed, splats, rgb, bounds, cards)
+            for row in range(y + bounds[1], y + bounds[3]):
+                for column in range(x + bounds[0], x + bounds[2]):
                     p = (row - y) * TILE_W + column - x
                     i, j = row - window[1], column - window[0]
                     left = abs(state[p])

@@ -13,11 +13,13 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
+from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import LANES, PEAK, PLANE, ROW_NUMBERS, START, STOP, TOP, U_PEAK, V, exp2, find_rows
-from progdf.rasterize.projection import L11
+from progdf.rasterize.pixels import (
+    BATCH, BLUE, CARD, END, FIRST, GREEN, LANES, PEAK, PLANE, RED, START, STEP, STOP, TOP, U_PEAK, V, exp2, make_cards,
+    tile_bounds,
+)  # fmt: skip
 
 Array = NDArray[Any]
 
@@ -33,20 +35,18 @@ _G2, _LAST = PLANE * np.uint64(4), PLANE * np.uint64(5)
 
 
 @kernel(fast=True, inline=True)
-def unblend_row(
-    state: Array, base: int, start: int, stop: int, peak: float, u_peak: float, l11: float, top: float,
-    red: float, green: float, blue: float, place: float,
-) -> tuple[float, float, float, float, float, float]:  # fmt: skip
-    """Take one splat off columns start..stop of one row; arguments as in `blend_row`. Σ colour (3), Σg, Σgu, Σgu²"""
+def unblend_row(state: Array, cards: Array, card: int, row: int, place: float) -> tuple[float, ...]:
+    """Take one row of a splat off a tile's state; as `blend_row`. Returns Σ colour (3), Σg, Σg·u, Σg·u²."""
+    start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
     sum_r = sum_g = sum_b = sum_0 = sum_u = sum_uu = _ZERO
-    if start >= stop:
-        return sum_r, sum_g, sum_b, sum_0, sum_u, sum_uu
+    peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
+    top, red, green, blue = cards[card + TOP + row], cards[card + RED], cards[card + GREEN], cards[card + BLUE]
     begin = np.uint64(start) // LANES * LANES
-    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES
+    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
-        p = np.uint64(base) + j
+        p = row * np.uint64(TILE_W) + j
         column = np.int32(j)
-        u = u_peak + l11 * (np.float32(column) - peak)
+        u = u_peak + step * (np.float32(column) - peak)
         raw = exp2(top - u * u)
         alpha = min(_ALPHA_MAX, raw)
         alpha = alpha if (column >= start) & (column < stop) & (place <= state[p + _LAST]) else _ZERO
@@ -69,52 +69,42 @@ def unblend_row(
     return sum_r, sum_g, sum_b, sum_0, sum_u, sum_uu
 
 
-@kernel()
+@kernel(fast=True)
 def unblend_tile(
-    state: Array,
-    x: int,
-    y: int,
-    members: Array,
-    slots: Array,
-    splats: Array,
-    rgb: Array,
-    window: Array,
+    state: Array, x: int, y: int, members: Array, slots: Array, splats: Array, rgb: Array, bounds: Array, cards: Array,
     sums: Array,
-) -> None:
-    """Take the splats off a tile whose first pixel is (x, y), from its last contributor on. state: [6·PLANE]"""
+) -> None:  # fmt: skip
+    """Take the splats off a tile, from its last contributor on; state is [6·PLANE], the rest as in `make_cards`."""
     plane = np.int64(PLANE)
     deepest = -_ONE
     for p in range(5 * plane, 6 * plane):
         deepest = max(deepest, state[p])
-    left, right = max(0, window[0] - x), min(TILE_W, window[2] - x)
-    rows = np.empty(ROW_NUMBERS, np.float32)
-    for place in range(members.size - 1, -1, -1):
-        out = sums[slots[place]]
-        out[:] = _ZERO
-        if place > deepest:
-            continue
-        s = members[place]
-        splat = splats[s]
-        first, end = row_bounds(splat, window)
-        first, end = max(first - y, 0), min(end - y, TILE_H)
-        find_rows(splat, x, y, left, right, rows)
-        l11 = np.float32(splat[L11])
-        red, green, blue = rgb[s, 0], rgb[s, 1], rgb[s, 2]
-        for k in range(np.uint64(first), np.uint64(end)):
-            r, g, b, g_0, g_u, g_uu = unblend_row(
-                state, k * np.uint64(TILE_W), np.int32(rows[START + k]), np.int32(rows[STOP + k]), rows[PEAK + k], rows[U_PEAK + k], l11,
-                rows[TOP + k], red, green, blue, np.float32(place),
-            )  # fmt: skip
-            v = rows[V + k]
-            out[0] += r
-            out[1] += g
-            out[2] += b
-            out[3] += g_0
-            out[4] += g_u
-            out[5] += g_0 * v
-            out[6] += g_uu
-            out[7] += g_u * v
-            out[8] += g_0 * v * v
+    seen = np.int64(deepest) + 1
+    for place in range(seen, members.size):
+        for k in range(SUMS):
+            sums[slots[place], k] = _ZERO
+    for batch in range((seen + BATCH - 1) // BATCH - 1, -1, -1):
+        begin, end = batch * BATCH, min((batch + 1) * BATCH, seen)
+        make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
+        for place in range(end - 1, begin - 1, -1):
+            card = np.uint64(place - begin) * CARD
+            s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = _ZERO
+            for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
+                r, g, b, g_0, g_u, g_uu = unblend_row(state, cards, card, row, np.float32(place))
+                v = cards[card + V + row]
+                s_r += r
+                s_g += g
+                s_b += b
+                s_0 += g_0
+                s_u += g_u
+                s_v += g_0 * v
+                s_uu += g_uu
+                s_uv += g_u * v
+                s_vv += g_0 * v * v
+            slot = slots[place]
+            sums[slot, 0], sums[slot, 1], sums[slot, 2] = s_r, s_g, s_b
+            sums[slot, 3], sums[slot, 4], sums[slot, 5] = s_0, s_u, s_v
+            sums[slot, 6], sums[slot, 7], sums[slot, 8] = s_uu, s_uv, s_vv
 
 
 @kernel(parallel=True, cache=True)
@@ -133,14 +123,16 @@ def unblend(
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     for worker in prange(workers):
-        state = np.empty(6 * plane, np.float32)
+        state, cards = np.empty(6 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
+        bounds = np.empty(4, np.int64)
         for tile in range(worker, tiles, workers):
             x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
             state[:plane] = _ONE
             state[plane : 5 * plane] = _ZERO
             state[5 * plane :] = -_ONE
-            for row in range(max(y, window[1]), min(y + TILE_H, window[3])):
-                for column in range(max(x, window[0]), min(x + TILE_W, window[2])):
+            tile_bounds(x, y, window, bounds)
+            for row in range(y + bounds[1], y + bounds[3]):
+                for column in range(x + bounds[0], x + bounds[2]):
                     p = (row - y) * TILE_W + column - x
                     i, j = row - window[1], column - window[0]
                     g0, g1, g2 = grad_image[i, j, 0], grad_image[i, j, 1], grad_image[i, j, 2]
@@ -155,4 +147,4 @@ def unblend(
                     state[2 * plane + p], state[3 * plane + p], state[4 * plane + p] = g0, g1, g2
                     state[5 * plane + p] = last[i, j]
             listed = slice(tile_starts[tile], tile_starts[tile + 1])
-            unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, window, sums)
+            unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums)

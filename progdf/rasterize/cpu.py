@@ -99,7 +99,7 @@ def alpha_weights(
         lists, _ = _list_splats(view, gaussians, workers, for_gradients=True)
         sums = np.zeros((len(lists.members), weights.SUMS))
         weights.weigh(
-            lists.splats, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
+            lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
             _float32(mask).numpy(), workers, sums,
         )  # fmt: skip
         weights.gather(lists.ids, lists.per_splat, sums, totals)

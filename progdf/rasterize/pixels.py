@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.projection import INV_L11, L11, L22, MX, MY, R2, SLOPE
+from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
 
@@ -66,42 +66,67 @@ def exp2(x: float) -> float:
     return _as_float(_as_int(p) + (whole << np.int32(23)))
 
 
-START, STOP, PEAK, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
-"""Planes of `find_rows`' result."""
+BATCH = 16
+"""Splats whose cards are made out at once: the pixel loops then branch on numbers that are long known."""
 
-ROW_NUMBERS = 6 * TILE_H
-"""Length of `find_rows`' result."""
+START, STOP, PEAK, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
+"""Where a card holds its rows: first column of the support and one past its last, from the tile's left edge (none
+where the second is not the greater); the column nearest to the row's peak; u there, so that u = u_peak + l11 ·
+(column − peak); v; log2 of alpha where u is 0."""
+
+FIRST, END, STEP, RED, GREEN, BLUE = (np.uint64(6 * TILE_H + k) for k in range(6))
+"""Where a card holds: first row of the support and one past its last, from the tile's top; l11; the colour."""
+
+CARD = np.uint64(64)
+"""float32 numbers of a card."""
 
 
 @kernel(fast=True, inline=True)
-def find_rows(splat: Array, x: int, y: int, left: int, right: int, rows: Array) -> None:
-    """Where a splat is at least 1/255 in each pixel row of a tile, decided in float64.
+def make_cards(
+    members: Array, begin: int, end: int, splats: Array, rgb: Array, x: int, y: int, bounds: Array, cards: Array
+) -> None:
+    """Where some splats of a tile are at least 1/255, row by row, decided in float64.
 
     Args:
-        splat: [8] float64, see `projection`
+        members: the tile's splats. [I] int32
+        begin, end: which of them, at most BATCH
+        splats: [V,8] float64, see `projection`
+        rgb: [V,4] float32
         x, y: the tile's first pixel in the full image
-        left, right: the columns of the tile to look at, from `x`
-        rows: out, six planes of one number per row. START, STOP: first column of the support and one past its last,
-            from `x`; none where STOP is not the greater. PEAK: the column nearest to the row's peak; U_PEAK: u
-            there, so that u = u_peak + l11 · (column − peak). V: v. TOP: log2 of alpha where u is 0. [48] float32
+        bounds: left, top, right, bottom of what to look at, from (x, y). [4] int64
+        cards: out. [BATCH · CARD] float32
     """
-    low, high = np.float64(left), np.float64(right)
-    mx, my, slope, l11 = splat[MX] - x - 0.5, splat[MY] - y - 0.5, splat[SLOPE], splat[L11]
-    inv_l11, l22, r2 = splat[INV_L11], splat[L22], splat[R2]
-    for row in range(np.uint64(TILE_H)):
-        dy = np.float64(np.int32(row)) - my
-        v = l22 * dy
-        rest = r2 - v * v
-        centre = mx - slope * dy
-        half = np.sqrt(max(rest, 0.0)) * inv_l11
-        start = max(np.ceil(centre - half), low)
-        stop = min(np.floor(centre + half) + 1.0, high)
-        # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far peaks
-        # (needles, giants) lie where l11 is small
-        peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
-        rows[START + row] = min(start, high)
-        rows[STOP + row] = max(stop, low) if rest >= 0.0 else low
-        rows[PEAK + row] = peak
-        rows[U_PEAK + row] = l11 * (peak - centre)
-        rows[V + row] = v
-        rows[TOP + row] = rest + LOG2_ALPHA_MIN
+    low, high = np.float64(bounds[0]), np.float64(bounds[2])
+    for place in range(begin, end):
+        at = np.uint64(place - begin) * CARD
+        s = members[place]
+        mx, my, slope, l11 = splats[s, MX] - x - 0.5, splats[s, MY] - y - 0.5, splats[s, SLOPE], splats[s, L11]
+        inv_l11, l22, r2 = splats[s, INV_L11], splats[s, L22], splats[s, R2]
+        for row in range(np.uint64(TILE_H)):
+            dy = np.float64(np.int32(row)) - my
+            v = l22 * dy
+            rest = r2 - v * v
+            centre = mx - slope * dy
+            half = np.sqrt(max(rest, 0.0)) * inv_l11
+            start = max(np.ceil(centre - half), low)
+            stop = min(np.floor(centre + half) + 1.0, high)
+            # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far peaks
+            # (needles, giants) lie where l11 is small
+            peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
+            cards[at + START + row] = min(start, high)
+            cards[at + STOP + row] = max(stop, low) if rest >= 0.0 else low
+            cards[at + PEAK + row] = peak
+            cards[at + U_PEAK + row] = l11 * (peak - centre)
+            cards[at + V + row] = v
+            cards[at + TOP + row] = rest + LOG2_ALPHA_MIN
+        cards[at + FIRST] = max(np.ceil(my - splats[s, EXTENT_Y]), np.float64(bounds[1]))
+        cards[at + END] = min(np.floor(my + splats[s, EXTENT_Y]) + 1.0, np.float64(bounds[3]))
+        cards[at + STEP] = l11
+        cards[at + RED], cards[at + GREEN], cards[at + BLUE] = rgb[s, 0], rgb[s, 1], rgb[s, 2]
+
+
+@kernel(inline=True)
+def tile_bounds(x: int, y: int, window: Array, bounds: Array) -> None:
+    """left, top, right, bottom of the part of a tile that lies in the window, from the tile's first pixel (x, y)."""
+    bounds[0], bounds[1] = max(0, window[0] - x), max(0, window[1] - y)
+    bounds[2], bounds[3] = min(TILE_W, window[2] - x), min(TILE_H, window[3] - y)

@@ -8,11 +8,12 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W, row_bounds
+from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import PEAK, ROW_NUMBERS, START, STOP, TOP, U_PEAK, exp2, find_rows
-from progdf.rasterize.projection import L11
+from progdf.rasterize.pixels import (
+    BATCH, CARD, END, FIRST, PEAK, START, STEP, STOP, TOP, U_PEAK, exp2, make_cards, tile_bounds,
+)  # fmt: skip
 
 Array = NDArray[Any]
 
@@ -21,12 +22,35 @@ SUMS = 4
 
 _ALPHA_MAX = np.float32(ALPHA_MAX)
 _T_MIN = np.float32(TRANSMITTANCE_MIN)
-_ONE = np.float32(1.0)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
+
+@kernel()
+def add_weights(state: Array, cards: Array, card: int, mask: Array, out: Array) -> None:
+    """Blend one splat's transmittance into a tile and add its weights to `out`; mask begins at the tile."""
+    for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
+        peak, u_peak, top = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + TOP + row]
+        for j in range(np.uint64(cards[card + START + row]), np.uint64(cards[card + STOP + row])):
+            p = row * np.uint64(TILE_W) + j
+            u = u_peak + cards[card + STEP] * (np.float32(np.int32(j)) - peak)
+            alpha = min(_ALPHA_MAX, exp2(top - u * u))
+            before = state[p]
+            after = before * (_ONE - alpha)
+            if after > _T_MIN:
+                weight = alpha * before
+                m = mask[row, j]
+                state[p] = after
+                out[0] += weight * m
+                out[1] += m
+                out[2] += weight
+                out[3] += 1.0
+            else:
+                state[p] = -abs(before)
 
 
 @kernel(parallel=True, cache=True)
 def weigh(
-    splats: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array, mask: Array,
+    splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array, mask: Array,
     workers: int, sums: Array,
 ) -> None:  # fmt: skip
     """Add up the weights of every (splat, tile) intersection; the first arguments as in `blend.blend`.
@@ -39,34 +63,16 @@ def weigh(
     tiles = tile_starts.size - 1
     for worker in prange(workers):
         state = np.empty(TILE_H * TILE_W, np.float32)
-        rows = np.empty(ROW_NUMBERS, np.float32)
+        cards, bounds = np.empty(BATCH * np.int64(CARD), np.float32), np.empty(4, np.int64)
         for tile in range(worker, tiles, workers):
             x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
             state[:] = _ONE
-            left, right = max(0, window[0] - x), min(TILE_W, window[2] - x)
-            for place in range(tile_starts[tile], tile_starts[tile + 1]):
-                splat = splats[members[place]]
-                out = sums[slots[place]]
-                first, end = row_bounds(splat, window)
-                first, end = max(first - y, 0), min(end - y, TILE_H)
-                find_rows(splat, x, y, left, right, rows)
-                for k in range(np.uint64(first), np.uint64(end)):
-                    for j in range(np.uint64(rows[START + k]), np.uint64(rows[STOP + k])):
-                        p = k * np.uint64(TILE_W) + j
-                        u = rows[U_PEAK + k] + np.float32(splat[L11]) * (np.float32(np.int32(j)) - rows[PEAK + k])
-                        alpha = min(_ALPHA_MAX, exp2(rows[TOP + k] - u * u))
-                        before = state[p]
-                        after = before * (_ONE - alpha)
-                        if after > _T_MIN:
-                            weight = alpha * before
-                            m = mask[np.uint64(y) + k, np.uint64(x) + j]
-                            state[p] = after
-                            out[0] += weight * m
-                            out[1] += m
-                            out[2] += weight
-                            out[3] += 1.0
-                        else:
-                            state[p] = -abs(before)
+            tile_bounds(x, y, window, bounds)
+            for begin in range(tile_starts[tile], tile_starts[tile + 1], BATCH):
+                end = min(begin + BATCH, tile_starts[tile + 1])
+                make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
+                for place in range(begin, end):
+                    add_weights(state, cards, np.uint64(place - begin) * CARD, mask[y:, x:], sums[slots[place]])
 
 
 @kernel(parallel=True, cache=True)
