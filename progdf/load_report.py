@@ -80,6 +80,10 @@ class LoadReport:
         phrases = []
         if self.ignored_properties:
             phrases.append(f"properties {', '.join(self.ignored_properties)}")
+        if "filter_3D" in self.ignored_properties:
+            phrases.append(
+                "filter_3D is Mip-Splatting's; fuse it into scales and opacities for its exact look"
+            )
         phrases += [f"element '{name}' ({counted(rows, 'row')})" for name, rows in self.ignored_elements]
         if self.trailing_bytes:
             phrases.append(f"{counted(self.trailing_bytes, 'byte')} after the last row")
