@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+_EXPLAINED = {
+    "filter_3D": "filter_3D (Mip-Splatting's: fuse it into the scales and opacities for the exact look)"
+}
+
 
 @dataclass(frozen=True)
 class LoadReport:
@@ -79,11 +83,7 @@ class LoadReport:
         """One phrase for each part of the file that was not used."""
         phrases = []
         if self.ignored_properties:
-            phrases.append(f"properties {', '.join(self.ignored_properties)}")
-        if "filter_3D" in self.ignored_properties:
-            phrases.append(
-                "filter_3D is Mip-Splatting's; fuse it into scales and opacities for its exact look"
-            )
+            phrases.append(f"properties {', '.join(_EXPLAINED.get(p, p) for p in self.ignored_properties)}")
         phrases += [f"element '{name}' ({counted(rows, 'row')})" for name, rows in self.ignored_elements]
         if self.trailing_bytes:
             phrases.append(f"{counted(self.trailing_bytes, 'byte')} after the last row")
