@@ -26,8 +26,8 @@ _BUCKETS = 1 << _DIGIT
 
 
 @kernel(parallel=True, cache=True)
-def depth_order(depths: Array, candidates: Array, parts: int) -> Array:
-    """Indices of the candidates by depth, ties by index.
+def depth_order(depths: Array, candidates: Array, parts: int) -> tuple[Array, Array]:
+    """The candidates and their places in the order of depth, ties by index.
 
     Args:
         depths: > 0. [N] float32
@@ -35,7 +35,7 @@ def depth_order(depths: Array, candidates: Array, parts: int) -> Array:
         parts: in how many parts to work at once
 
     Returns:
-        [V] int64
+        indices of the candidates, ascending [V] int64; rank of each, 0 is nearest [V] int64
     """
     n = depths.size
     bits = depths.view(np.uint32)  # positive floats sort as their bits
@@ -49,15 +49,14 @@ def depth_order(depths: Array, candidates: Array, parts: int) -> Array:
     for p in range(parts):
         found[p + 1] += found[p]
     count = found[parts]
-    keys, ids = np.empty(count, np.uint32), np.empty(count, np.int64)
+    keys, ids, items = np.empty(count, np.uint32), np.empty(count, np.int64), np.empty(count, np.int32)
     for p in prange(parts):
         at = found[p]
         for i in range(p * step, min(n, (p + 1) * step)):
             if candidates[i]:
-                keys[at] = bits[i]
-                ids[at] = i
+                keys[at], ids[at], items[at] = bits[i], i, at
                 at += 1
-    other_keys, other_ids = np.empty(count, np.uint32), np.empty(count, np.int64)
+    other_keys, other_items = np.empty(count, np.uint32), np.empty(count, np.int32)
     place = np.empty((parts, _BUCKETS), np.int64)
     step = (count + parts - 1) // parts
     for digit in range(3):
@@ -77,11 +76,14 @@ def depth_order(depths: Array, candidates: Array, parts: int) -> Array:
                 bucket = (keys[k] >> shift) & np.uint32(_BUCKETS - 1)
                 at = place[p, bucket]
                 place[p, bucket] = at + 1
-                other_keys[at] = keys[k]
-                other_ids[at] = ids[k]
+                other_keys[at], other_items[at] = keys[k], items[k]
         keys, other_keys = other_keys, keys
-        ids, other_ids = other_ids, ids
-    return ids
+        items, other_items = other_items, items
+    ranks = np.empty(count, np.int64)
+    for p in prange(parts):
+        for k in range(p * step, min(count, (p + 1) * step)):
+            ranks[items[k]] = k
+    return ids, ranks
 
 
 @kernel(inline=True)

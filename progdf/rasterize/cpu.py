@@ -48,6 +48,7 @@ class _Lists:
     """What a forward pass found out, kept for the backward pass; see `projection` and `binning` for the layouts."""
 
     ids: Array
+    ranks: Array
     splats: Array
     rgb: Array
     tile_starts: Array
@@ -102,7 +103,7 @@ def alpha_weights(
             lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
             _float32(mask).numpy(), workers, sums,
         )  # fmt: skip
-        weights.gather(lists.ids, lists.per_splat, sums, totals)
+        weights.gather(lists.ids, lists.ranks, lists.per_splat, sums, totals)
     return torch.from_numpy(totals.astype(np.float32))
 
 
@@ -146,11 +147,11 @@ def _list_splats(
         means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
         centres, depths, candidates,
     )  # fmt: skip
-    ids = binning.depth_order(depths, candidates, workers)
+    ids, ranks = binning.depth_order(depths, candidates, workers)
     splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
     visible = np.zeros(n, np.bool_)
     projection.project(
-        ids, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
+        ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
         view.window, view.antialiased, splats, rgb, visible,
     )  # fmt: skip
     tiles = int(view.grid[2] * view.grid[3])
@@ -166,7 +167,7 @@ def _list_splats(
     members = np.empty(total, np.int32)
     slots = np.empty(total if for_gradients else 0, np.int64)
     binning.fill_tiles(splats, view.window, view.grid, counts, per_splat, members, slots)
-    return _Lists(ids, splats, rgb, tile_starts, members, slots, per_splat), [centres, depths, visible]
+    return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), [centres, depths, visible]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -204,14 +205,14 @@ class _Rasterize(torch.autograd.Function):
         grad_image, grad_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads[:2])
         sums = np.empty((len(lists.members), SUMS), np.float32)
         gradients = [np.zeros(array.shape, np.float32) for array in gaussians]
-        grad_camera = np.empty((PARTS, CAMERA))
+        grad_camera = np.zeros((PARTS, CAMERA))
         with running("backward", 10) as workers:
             unblend(
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
                 background, workers, transmittance, ctx.last, grad_image, grad_transmittance, sums,
             )  # fmt: skip
             project_backward(
-                lists.ids, *gaussians, view.degree, view.viewmat, view.intrinsics, view.size, view.antialiased,
+                lists.ids, lists.ranks, *gaussians, view.degree, view.viewmat, view.intrinsics, view.size, view.antialiased,
                 lists.splats, lists.per_splat, sums, *gradients, grad_camera,
             )  # fmt: skip
         results: list[Tensor | None] = [

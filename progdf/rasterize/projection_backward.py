@@ -15,23 +15,154 @@ from numba import prange
 from numpy.typing import NDArray
 
 from progdf.rasterize.blend_backward import SUMS
-from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION, FRUSTUM_MARGIN
+from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION
+from progdf.rasterize.geometry import Footprint, Lens, Vec, blend2, cross, dot, footprint, make_lens, row_times, times, vec
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.projection import R2, UNIT, axes_2d, clamped_tangents, rotation_entries, rotation_matrix
+from progdf.rasterize.projection import R2, UNIT
 from progdf.rasterize.shading import shade_backward
 
 Array = NDArray[Any]
 
 PARTS = 64
-"""The camera's gradients are added up in this many parts, whatever the number of threads: the sum's bits depend on it."""
+"""The camera's gradients are added up in this many parts, whatever the number of threads: their bits depend on it."""
 
 CAMERA = 16
 """Numbers of a part: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
 
 
+@kernel(contract=True, inline=True)
+def _axes_gradient(seen: Footprint, total: Array, antialiased: bool) -> tuple[float, float, Vec, Vec]:
+    """Gradients to the centre in pixels (2) and to the 2D axes p0, p1, from a splat's sums [9]."""
+    # the sums are of g = −dL/dσ, in units of u and v
+    e0, e1 = -total[4] / UNIT, -total[5] / UNIT
+    h00, h01, h11 = -total[6] / (UNIT * UNIT), -total[7] / (UNIT * UNIT), -total[8] / (UNIT * UNIT)
+    sigma_y = math.sqrt(seen.c + DILATION)
+    inv_root = 1.0 / (math.sqrt(seen.det) * sigma_y)
+    l11, l21, l22 = sigma_y * sigma_y * inv_root, -seen.b * inv_root, 1.0 / sigma_y
+    # dL/dM = −L H (LᵀM); the first row of LᵀM is (p1 × (p0 × p1) + ε p0) / root
+    along = blend2(inv_root, cross(seen.p1, seen.normal), DILATION * inv_root, seen.p0)
+    d0 = blend2(-l11 * h00, along, -l11 * h01 * l22, seen.p1)
+    d1 = blend2(-(l21 * h00 + l22 * h01), along, -(l21 * h01 + l22 * h11) * l22, seen.p1)
+    if antialiased and seen.det0 >= ANTIALIAS_FLOOR * seen.det:
+        # opacity · sqrt(det0 / det): d log = (ddet0 / det0 − ddet / det) / 2, det = det0 + ε (a + c) + ε²
+        by_det0 = total[3] * (1.0 / seen.det0 - 1.0 / seen.det)
+        by_trace = -total[3] * DILATION / seen.det
+        d0 = blend2(1.0, d0, by_det0, cross(seen.p1, seen.normal))
+        d0 = blend2(1.0, d0, by_trace, seen.p0)
+        d1 = blend2(1.0, d1, by_det0, cross(seen.normal, seen.p0))
+        d1 = blend2(1.0, d1, by_trace, seen.p1)
+    return -l11 * e0, -(l21 * e0 + l22 * e1), d0, d1
+
+
+@kernel(contract=True, inline=True)
+def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, float, float]:
+    """Gradient to the quaternion as given; d0, d1: gradients to the rows a0ᵀR, a1ᵀR."""
+    q0, q1, q2, q3 = seen.quat
+    v0, v1, v2 = (
+        blend2(seen.a0[0], d0, seen.a1[0], d1),
+        blend2(seen.a0[1], d0, seen.a1[1], d1),
+        blend2(seen.a0[2], d0, seen.a1[2], d1),
+    )
+    gw = 2.0 * (q1 * (v2[1] - v1[2]) + q2 * (v0[2] - v2[0]) + q3 * (v1[0] - v0[1]))
+    gx = 2.0 * (q2 * (v0[1] + v1[0]) + q3 * (v0[2] + v2[0]) + q0 * (v2[1] - v1[2]) - 2.0 * q1 * (v1[1] + v2[2]))
+    gy = 2.0 * (q1 * (v0[1] + v1[0]) + q3 * (v1[2] + v2[1]) + q0 * (v0[2] - v2[0]) - 2.0 * q2 * (v0[0] + v2[2]))
+    gz = 2.0 * (q1 * (v0[2] + v2[0]) + q2 * (v1[2] + v2[1]) + q0 * (v1[0] - v0[1]) - 2.0 * q3 * (v0[0] + v1[1]))
+    radial = gw * q0 + gx * q1 + gy * q2 + gz * q3
+    k = seen.inv_length
+    return (gw - radial * q0) * k, (gx - radial * q1) * k, (gy - radial * q2) * k, (gz - radial * q3) * k
+
+
+@kernel(contract=True, inline=True)
+def _point_gradient(lens: Lens, seen: Footprint, grad_px: float, grad_py: float, ga: Vec, gb: Vec, camera: Array) -> Vec:
+    """Gradient to the point in camera axes; adds the intrinsics' to `camera`. ga, gb: gradients to a0, a1.
+
+    px = fx x/z + cx; a0 = fx/z (W0 − tan_x W2), where tan_x is x/z or a limit ((width − cx) + half)/fx,
+    −(cx + half)/fx; the same for y.
+    """
+    inv_z = seen.inv_z
+    jx, jy = lens.fx * inv_z, lens.fy * inv_z
+    down_a, down_b = dot(ga, lens.rows[2]), dot(gb, lens.rows[2])
+    grad_jx, grad_jy = dot(ga, lens.rows[0]) - seen.tan_x * down_a, dot(gb, lens.rows[1]) - seen.tan_y * down_b
+    slope_x, slope_y = lens.fx * grad_px, lens.fy * grad_py
+    camera[12] += grad_px * seen.x * inv_z + grad_jx * inv_z
+    camera[13] += grad_py * seen.y * inv_z + grad_jy * inv_z
+    camera[14] += grad_px
+    camera[15] += grad_py
+    if seen.free_x:
+        slope_x -= jx * down_a
+    else:
+        camera[12] += jx * down_a * seen.tan_x / lens.fx
+        camera[14] += jx * down_a / lens.fx
+    if seen.free_y:
+        slope_y -= jy * down_b
+    else:
+        camera[13] += jy * down_b * seen.tan_y / lens.fy
+        camera[15] += jy * down_b / lens.fy
+    towards = slope_x * seen.x + slope_y * seen.y + grad_jx * lens.fx + grad_jy * lens.fy
+    return slope_x * inv_z, slope_y * inv_z, -towards * inv_z * inv_z
+
+
+@kernel(contract=True)
+def _project_backward_range(
+    begin: int, end: int, ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array,
+    colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
+    splats: Array, per_splat: Array, sums: Array,
+    grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
+    camera: Array,
+) -> None:  # fmt: skip
+    lens = make_lens(viewmat, intrinsics, size)
+    total, basis, slopes = np.empty(SUMS), np.empty(16), np.zeros((16, 3))
+    for n in range(begin, end):
+        i, s = ids[n], ranks[n]
+        if splats[s, R2] < 0.0 or per_splat[s] == per_splat[s + 1]:
+            continue
+        for k in range(SUMS):
+            total[k] = 0.0
+        for slot in range(per_splat[s], per_splat[s + 1]):
+            for k in range(SUMS):
+                total[k] += sums[slot, k]
+        mean, scale = vec(means, i), vec(scales, i)
+        seen = footprint(
+            lens, mean, np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]),
+            np.float64(quats[i, 3]), scale,
+        )  # fmt: skip
+        grad_opacities[i] = total[3] / np.float64(opacities[i])
+        grad_px, grad_py, d0, d1 = _axes_gradient(seen, total, antialiased)
+        by_scale0, by_scale1 = times(d0, seen.turned0), times(d1, seen.turned1)
+        for k in range(3):
+            grad_scales[i, k] = by_scale0[k] + by_scale1[k]
+        d0, d1 = times(d0, scale), times(d1, scale)
+        by_quat = _quat_gradient(seen, d0, d1)
+        for k in range(4):
+            grad_quats[i, k] = by_quat[k]
+        r0, r1, r2 = seen.rotation
+        ga, gb = (dot(r0, d0), dot(r1, d0), dot(r2, d0)), (dot(r0, d1), dot(r1, d1), dot(r2, d1))
+        point = _point_gradient(lens, seen, grad_px, grad_py, ga, gb, camera)
+        by_mean = row_times(point, lens.rows)
+        jx, jy = lens.fx * seen.inv_z, lens.fy * seen.inv_z
+        for k in range(3):
+            camera[k] += point[0] * mean[k] + jx * ga[k]
+            camera[4 + k] += point[1] * mean[k] + jy * gb[k]
+            camera[8 + k] += point[2] * mean[k] - jx * seen.tan_x * ga[k] - jy * seen.tan_y * gb[k]
+            camera[4 * k + 3] += point[k]
+        if degree < 0:
+            for k in range(3):
+                grad_colors[i, 0, k] = total[k]
+        else:
+            by_rgb = (total[0], total[1], total[2])
+            by_ray = shade_backward(i, colors, degree, mean, lens.eye, by_rgb, basis, slopes, grad_colors)
+            by_mean = blend2(1.0, by_mean, 1.0, by_ray)
+            for row in range(3):  # the eye is −RᵀT
+                camera[4 * row + 3] += dot(by_ray, lens.rows[row])
+                for k in range(3):
+                    camera[4 * row + k] += by_ray[k] * lens.shift[row]
+        for k in range(3):
+            grad_means[i, k] = by_mean[k]
+
+
 @kernel(parallel=True, cache=True)
 def project_backward(
-    ids: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array, degree: int,
+    ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array, degree: int,
     viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
     splats: Array, per_splat: Array, sums: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
@@ -44,184 +175,12 @@ def project_backward(
         per_splat: first row of `sums` of each splat. [V+1] int64
         sums: see `blend_backward`. [I,9] float32
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes of inputs
-        grad_camera: out, [PARTS, CAMERA] float64
+        grad_camera: out, zero on entry. [PARTS, CAMERA] float64
     """
-    count = ids.size
-    fx, fy, cx, cy = intrinsics
-    width, height = size
-    step = (count + PARTS - 1) // PARTS
+    step = (ids.size + PARTS - 1) // PARTS
     for part in prange(PARTS):
-        grad_camera[part] = 0.0
-        total = np.empty(SUMS)
-        camera = grad_camera[part]
-        for s in range(part * step, min(count, (part + 1) * step)):
-            if splats[s, R2] < 0.0 or per_splat[s] == per_splat[s + 1]:
-                continue
-            total[:] = 0.0
-            for slot in range(per_splat[s], per_splat[s + 1]):
-                for k in range(SUMS):
-                    total[k] += sums[slot, k]
-            i = ids[s]
-            m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-            x = viewmat[0, 0] * m0 + viewmat[0, 1] * m1 + viewmat[0, 2] * m2 + viewmat[0, 3]
-            y = viewmat[1, 0] * m0 + viewmat[1, 1] * m1 + viewmat[1, 2] * m2 + viewmat[1, 3]
-            z = viewmat[2, 0] * m0 + viewmat[2, 1] * m1 + viewmat[2, 2] * m2 + viewmat[2, 3]
-            tan_x, tan_y = clamped_tangents(x, y, z, fx, fy, cx, cy, width, height)
-            p0, p1 = axes_2d(i, tan_x, tan_y, z, fx, fy, quats, scales, viewmat)
-            a = p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2]
-            b = p0[0] * p1[0] + p0[1] * p1[1] + p0[2] * p1[2]
-            c = p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2]
-            n0, n1, n2 = (
-                p0[1] * p1[2] - p0[2] * p1[1],
-                p0[2] * p1[0] - p0[0] * p1[2],
-                p0[0] * p1[1] - p0[1] * p1[0],
-            )
-            det0 = n0 * n0 + n1 * n1 + n2 * n2
-            det = det0 + DILATION * (a + c) + DILATION * DILATION
-            root_c = math.sqrt(c + DILATION)
-            root = math.sqrt(det) * root_c
-
-            # dL/dσ-moments: alpha = opacity · exp(−σ), so dL/dσ = −g; the sums are in units of u, v
-            e0, e1 = -total[4] / UNIT, -total[5] / UNIT
-            h00, h01, h11 = -total[6] / (UNIT * UNIT), -total[7] / (UNIT * UNIT), -total[8] / (UNIT * UNIT)
-            l11, l21, l22 = root_c * root_c / root, -b / root, 1.0 / root_c
-            grad_px = -l11 * e0
-            grad_py = -(l21 * e0 + l22 * e1)
-
-            # dL/dM = −L H (LᵀM); the first row of LᵀM is (p1 × (p0 × p1) + ε p0) / root
-            w0 = (p1[1] * n2 - p1[2] * n1 + DILATION * p0[0]) / root
-            w1 = (p1[2] * n0 - p1[0] * n2 + DILATION * p0[1]) / root
-            w2 = (p1[0] * n1 - p1[1] * n0 + DILATION * p0[2]) / root
-            f00, f01, f10, f11 = -l11 * h00, -l11 * h01, -(l21 * h00 + l22 * h01), -(l21 * h01 + l22 * h11)
-            d00, d01, d02 = (
-                f00 * w0 + f01 * l22 * p1[0],
-                f00 * w1 + f01 * l22 * p1[1],
-                f00 * w2 + f01 * l22 * p1[2],
-            )
-            d10, d11, d12 = (
-                f10 * w0 + f11 * l22 * p1[0],
-                f10 * w1 + f11 * l22 * p1[1],
-                f10 * w2 + f11 * l22 * p1[2],
-            )
-
-            opacity = np.float64(opacities[i])
-            grad_opacities[i] = total[3] / opacity
-            ratio = det0 / det
-            if antialiased and ratio >= ANTIALIAS_FLOOR:
-                # opacity · sqrt(ratio): dL/dratio = Σg / (2 ratio)
-                by_det0 = total[3] / (2.0 * ratio) * (det - det0) / (det * det)
-                by_trace = -total[3] / 2.0 * DILATION / det
-                d00 += 2.0 * (by_det0 * (p1[1] * n2 - p1[2] * n1) + by_trace * p0[0])
-                d01 += 2.0 * (by_det0 * (p1[2] * n0 - p1[0] * n2) + by_trace * p0[1])
-                d02 += 2.0 * (by_det0 * (p1[0] * n1 - p1[1] * n0) + by_trace * p0[2])
-                d10 += 2.0 * (by_det0 * (n1 * p0[2] - n2 * p0[1]) + by_trace * p1[0])
-                d11 += 2.0 * (by_det0 * (n2 * p0[0] - n0 * p0[2]) + by_trace * p1[1])
-                d12 += 2.0 * (by_det0 * (n0 * p0[1] - n1 * p0[0]) + by_trace * p1[2])
-
-            # M = [A0; A1] R S with A0 = fx/z (W0 − tan_x W2), A1 = fy/z (W1 − tan_y W2)
-            q0, q1, q2, q3, inverse_length = rotation_entries(quats[i])
-            r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(q0, q1, q2, q3)
-            s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
-            jx, jy = fx / z, fy / z
-            a0, a1, a2 = (
-                jx * (viewmat[0, 0] - tan_x * viewmat[2, 0]),
-                jx * (viewmat[0, 1] - tan_x * viewmat[2, 1]),
-                jx * (viewmat[0, 2] - tan_x * viewmat[2, 2]),
-            )
-            b0, b1, b2 = (
-                jy * (viewmat[1, 0] - tan_y * viewmat[2, 0]),
-                jy * (viewmat[1, 1] - tan_y * viewmat[2, 1]),
-                jy * (viewmat[1, 2] - tan_y * viewmat[2, 2]),
-            )
-            grad_scales[i, 0] = d00 * (a0 * r00 + a1 * r10 + a2 * r20) + d10 * (
-                b0 * r00 + b1 * r10 + b2 * r20
-            )
-            grad_scales[i, 1] = d01 * (a0 * r01 + a1 * r11 + a2 * r21) + d11 * (
-                b0 * r01 + b1 * r11 + b2 * r21
-            )
-            grad_scales[i, 2] = d02 * (a0 * r02 + a1 * r12 + a2 * r22) + d12 * (
-                b0 * r02 + b1 * r12 + b2 * r22
-            )
-            d00, d01, d02, d10, d11, d12 = d00 * s0, d01 * s1, d02 * s2, d10 * s0, d11 * s1, d12 * s2
-            if inverse_length > 0.0:
-                v00, v01, v02 = a0 * d00 + b0 * d10, a0 * d01 + b0 * d11, a0 * d02 + b0 * d12
-                v10, v11, v12 = a1 * d00 + b1 * d10, a1 * d01 + b1 * d11, a1 * d02 + b1 * d12
-                v20, v21, v22 = a2 * d00 + b2 * d10, a2 * d01 + b2 * d11, a2 * d02 + b2 * d12
-                gw = 2.0 * (q1 * (v21 - v12) + q2 * (v02 - v20) + q3 * (v10 - v01))
-                gx = 2.0 * (q2 * (v01 + v10) + q3 * (v02 + v20) + q0 * (v21 - v12) - 2.0 * q1 * (v11 + v22))
-                gy = 2.0 * (q1 * (v01 + v10) + q3 * (v12 + v21) + q0 * (v02 - v20) - 2.0 * q2 * (v00 + v22))
-                gz = 2.0 * (q1 * (v02 + v20) + q2 * (v12 + v21) + q0 * (v10 - v01) - 2.0 * q3 * (v00 + v11))
-                along = gw * q0 + gx * q1 + gy * q2 + gz * q3
-                grad_quats[i, 0] = (gw - along * q0) * inverse_length
-                grad_quats[i, 1] = (gx - along * q1) * inverse_length
-                grad_quats[i, 2] = (gy - along * q2) * inverse_length
-                grad_quats[i, 3] = (gz - along * q3) * inverse_length
-            ga0, ga1, ga2 = (
-                d00 * r00 + d01 * r01 + d02 * r02,
-                d00 * r10 + d01 * r11 + d02 * r12,
-                d00 * r20 + d01 * r21 + d02 * r22,
-            )
-            gb0, gb1, gb2 = (
-                d10 * r00 + d11 * r01 + d12 * r02,
-                d10 * r10 + d11 * r11 + d12 * r12,
-                d10 * r20 + d11 * r21 + d12 * r22,
-            )
-            ga_w2 = ga0 * viewmat[2, 0] + ga1 * viewmat[2, 1] + ga2 * viewmat[2, 2]
-            gb_w2 = gb0 * viewmat[2, 0] + gb1 * viewmat[2, 1] + gb2 * viewmat[2, 2]
-            grad_jx = ga0 * viewmat[0, 0] + ga1 * viewmat[0, 1] + ga2 * viewmat[0, 2] - tan_x * ga_w2
-            grad_jy = gb0 * viewmat[1, 0] + gb1 * viewmat[1, 1] + gb2 * viewmat[1, 2] - tan_y * gb_w2
-            grad_tan_x, grad_tan_y = -jx * ga_w2, -jy * gb_w2
-
-            # px = fx x/z + cx, jx = fx/z, and tan_x = x/z unless it is clamped
-            camera[12] += grad_px * x / z + grad_jx / z
-            camera[13] += grad_py * y / z + grad_jy / z
-            camera[14] += grad_px
-            camera[15] += grad_py
-            half_x, half_y = FRUSTUM_MARGIN * 0.5 * width, FRUSTUM_MARGIN * 0.5 * height
-            slope_x, slope_y = fx * grad_px, fy * grad_py
-            if tan_x == x / z:
-                slope_x += grad_tan_x
-            else:  # clamped at (width − cx + half) / fx or −(cx + half) / fx
-                camera[12] -= grad_tan_x * tan_x / fx
-                camera[14] -= grad_tan_x / fx
-            if tan_y == y / z:
-                slope_y += grad_tan_y
-            else:
-                camera[13] -= grad_tan_y * tan_y / fy
-                camera[15] -= grad_tan_y / fy
-            gx, gy = slope_x / z, slope_y / z
-            gz = -(slope_x * x + slope_y * y) / (z * z) - (grad_jx * fx + grad_jy * fy) / (z * z)
-            gm0 = gx * viewmat[0, 0] + gy * viewmat[1, 0] + gz * viewmat[2, 0]
-            gm1 = gx * viewmat[0, 1] + gy * viewmat[1, 1] + gz * viewmat[2, 1]
-            gm2 = gx * viewmat[0, 2] + gy * viewmat[1, 2] + gz * viewmat[2, 2]
-            camera[0] += gx * m0 + jx * ga0
-            camera[1] += gx * m1 + jx * ga1
-            camera[2] += gx * m2 + jx * ga2
-            camera[3] += gx
-            camera[4] += gy * m0 + jy * gb0
-            camera[5] += gy * m1 + jy * gb1
-            camera[6] += gy * m2 + jy * gb2
-            camera[7] += gy
-            camera[8] += gz * m0 - jx * tan_x * ga0 - jy * tan_y * gb0
-            camera[9] += gz * m1 - jx * tan_x * ga1 - jy * tan_y * gb1
-            camera[10] += gz * m2 - jx * tan_x * ga2 - jy * tan_y * gb2
-            camera[11] += gz
-
-            if degree < 0:
-                grad_colors[i, 0, 0], grad_colors[i, 0, 1], grad_colors[i, 0, 2] = (
-                    total[0],
-                    total[1],
-                    total[2],
-                )
-            else:
-                t0, t1, t2 = shade_backward(colors[i], degree, m0, m1, m2, viewmat, total, grad_colors[i])
-                gm0 += t0
-                gm1 += t1
-                gm2 += t2
-                for row in range(3):  # the camera centre is −RᵀT
-                    along = t0 * viewmat[row, 0] + t1 * viewmat[row, 1] + t2 * viewmat[row, 2]
-                    camera[4 * row + 3] += along
-                    camera[4 * row] += t0 * viewmat[row, 3]
-                    camera[4 * row + 1] += t1 * viewmat[row, 3]
-                    camera[4 * row + 2] += t2 * viewmat[row, 3]
-            grad_means[i, 0], grad_means[i, 1], grad_means[i, 2] = gm0, gm1, gm2
+        _project_backward_range(
+            part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities, colors,
+            degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums,
+            grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera[part],
+        )  # fmt: skip

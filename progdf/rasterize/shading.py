@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
+from progdf.rasterize.geometry import Vec
 from progdf.rasterize.jit import kernel
 from progdf.sh import _C1, _C2, _C3, C0
 
@@ -15,14 +15,12 @@ Array = NDArray[Any]
 
 
 @kernel(inline=True)
-def view_direction(m0: float, m1: float, m2: float, viewmat: Array) -> tuple[float, float, float, float]:
-    """Unit vector from the camera centre −RᵀT to a point, world axes, and 1/distance (0 at the centre itself)."""
-    d0 = m0 + viewmat[0, 0] * viewmat[0, 3] + viewmat[1, 0] * viewmat[1, 3] + viewmat[2, 0] * viewmat[2, 3]
-    d1 = m1 + viewmat[0, 1] * viewmat[0, 3] + viewmat[1, 1] * viewmat[1, 3] + viewmat[2, 1] * viewmat[2, 3]
-    d2 = m2 + viewmat[0, 2] * viewmat[0, 3] + viewmat[1, 2] * viewmat[1, 3] + viewmat[2, 2] * viewmat[2, 3]
-    squared = d0 * d0 + d1 * d1 + d2 * d2
+def view_direction(point: Vec, eye: Vec) -> tuple[float, float, float, float]:
+    """Unit vector from the eye to a point, world axes, and 1/distance (zeros at the eye itself)."""
+    x, y, z = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
+    squared = x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(squared) if squared > 0.0 else 0.0
-    return d0 * inverse, d1 * inverse, d2 * inverse, inverse
+    return x * inverse, y * inverse, z * inverse, inverse
 
 
 @kernel()
@@ -83,47 +81,40 @@ def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array
         slopes[15, 0], slopes[15, 1] = 3 * _C3[6] * (xx - yy), -6 * _C3[6] * x * y
 
 
-@kernel()
-def shade(
-    sh: Array, degree: int, m0: float, m1: float, m2: float, viewmat: Array
-) -> tuple[float, float, float]:
-    """Colour Σ basis·sh + 0.5 seen from the camera, before the clamp at 0. sh: [K,3]"""
-    x, y, z, _ = view_direction(m0, m1, m2, viewmat)
-    basis = np.empty(16)
-    fill_basis(degree, x, y, z, basis)
-    red = green = blue = 0.5
-    for k in range((degree + 1) ** 2):
-        red += basis[k] * sh[k, 0]
-        green += basis[k] * sh[k, 1]
-        blue += basis[k] * sh[k, 2]
-    return red, green, blue
-
-
-@kernel()
+@kernel(contract=True)
 def shade_backward(
-    sh: Array, degree: int, m0: float, m1: float, m2: float, viewmat: Array, grad_rgb: Array, grad_sh: Array
-) -> tuple[float, float, float]:
-    """Gradients of `shade` clamped at 0: fills grad_sh [K,3], returns the gradient to (point − camera centre).
+    i: int, colors: Array, degree: int, point: Vec, eye: Vec, gradient: Vec, basis: Array, slopes: Array, out: Array
+) -> Vec:
+    """Gradients of Gaussian i's colour max(0, Σ basis·sh + 0.5).
 
     Args:
-        grad_rgb: gradient to the clamped colour. [3] float64
-        grad_sh: out, [K,3] float32
+        i: row of `colors` and `out`
+        colors: SH coefficients. [N,K,3] float32
+        degree: 0..3
+        point, eye: its centre and the camera's, world axes
+        gradient: to the clamped colour
+        basis, slopes: scratch. [16], [16,3] float64, `slopes` zero where no derivative is ever written
+        out: gradient to the coefficients. [N,K,3] float32
+
+    Returns:
+        The gradient to point − eye.
     """
-    x, y, z, inverse = view_direction(m0, m1, m2, viewmat)
-    basis = np.empty(16)
-    slopes = np.zeros((16, 3))
+    x, y, z, inverse = view_direction(point, eye)
     fill_basis(degree, x, y, z, basis)
     fill_basis_gradient(degree, x, y, z, slopes)
-    red, green, blue = shade(sh, degree, m0, m1, m2, viewmat)
-    g0 = grad_rgb[0] if red >= 0.0 else 0.0
-    g1 = grad_rgb[1] if green >= 0.0 else 0.0
-    g2 = grad_rgb[2] if blue >= 0.0 else 0.0
+    bands = (degree + 1) ** 2
+    red = green = blue = 0.5
+    for k in range(bands):
+        red += basis[k] * colors[i, k, 0]
+        green += basis[k] * colors[i, k, 1]
+        blue += basis[k] * colors[i, k, 2]
+    g0 = gradient[0] if red >= 0.0 else 0.0
+    g1 = gradient[1] if green >= 0.0 else 0.0
+    g2 = gradient[2] if blue >= 0.0 else 0.0
     dx = dy = dz = 0.0
-    for k in range((degree + 1) ** 2):
-        grad_sh[k, 0] = basis[k] * g0
-        grad_sh[k, 1] = basis[k] * g1
-        grad_sh[k, 2] = basis[k] * g2
-        along = g0 * sh[k, 0] + g1 * sh[k, 1] + g2 * sh[k, 2]
+    for k in range(bands):
+        out[i, k, 0], out[i, k, 1], out[i, k, 2] = basis[k] * g0, basis[k] * g1, basis[k] * g2
+        along = g0 * colors[i, k, 0] + g1 * colors[i, k, 1] + g2 * colors[i, k, 2]
         dx += slopes[k, 0] * along
         dy += slopes[k, 1] * along
         dz += slopes[k, 2] * along

@@ -76,12 +76,9 @@ def weigh(
 
 
 @kernel(parallel=True, cache=True)
-def gather(ids: Array, per_splat: Array, sums: Array, totals: Array) -> None:
+def gather(ids: Array, ranks: Array, per_splat: Array, sums: Array, totals: Array) -> None:
     """Add up each splat's intersections in their fixed order. totals: out, [N,4] float64, zero on entry"""
-    chunk = 256
-    count = ids.size
-    for part in prange((count + chunk - 1) // chunk):
-        for s in range(part * chunk, min(count, (part + 1) * chunk)):
-            for slot in range(per_splat[s], per_splat[s + 1]):
-                for k in range(SUMS):
-                    totals[ids[s], k] += sums[slot, k]
+    for n in prange(ids.size):
+        for slot in range(per_splat[ranks[n]], per_splat[ranks[n] + 1]):
+            for k in range(SUMS):
+                totals[ids[n], k] += sums[slot, k]
