@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from progdf.scenes.bear import SMALLEST, DemoScene, bear
+from progdf.scenes.assemble import DemoScene
+from progdf.scenes.bear import SMALLEST, bear
 from progdf.scenes.edits import AnalyticEdit, bear_edits, darkened, grown, recolored, striped, swung
 
 __all__ = [

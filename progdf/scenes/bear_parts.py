@@ -48,16 +48,17 @@ def _detail(
     radii: Triple,
     turn: Triple = (0.0, 0.0, 0.0),
     weight: float = 7.0,
+    clears: float = 0.16,
 ) -> Part:
     """A small part drawn finely, with no fur over it and no shadow of its own."""
-    return _ellipsoid(name, label, centre, radii, turn, weight, casts_shadow=False, clears=0.16)
+    return _ellipsoid(name, label, centre, radii, turn, weight, casts_shadow=False, clears=clears)
 
 
 def _eye(x: float) -> list[Part]:
     """An eye and the window it mirrors, up on the side that the lamp is on."""
     return [
         _detail("eye", "head", (x, 1.545, 0.432), (0.052, 0.060, 0.042)),
-        _detail("glint", "head", (x - 0.017, 1.567, 0.468), (0.015, 0.016, 0.006), weight=30.0),
+        _detail("glint", "head", (x - 0.017, 1.567, 0.468), (0.015, 0.016, 0.006), weight=30.0, clears=0.3),
     ]
 
 

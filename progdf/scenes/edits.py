@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf import colour
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.scenes.bear import DemoScene
+from progdf.scenes.assemble import DemoScene
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
 
 Change = Callable[[Gaussians, float], Gaussians]

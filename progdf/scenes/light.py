@@ -66,7 +66,7 @@ def linear_from_srgb(rgb: Tensor) -> Tensor:
     return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
 
 
-def sheen(normals: Tensor, velvet: Tensor, gloss: Tensor, color: Tensor) -> tuple[Tensor, Tensor]:
+def sheen(normals: Tensor, velvet: float, gloss: float, color: Tensor) -> tuple[Tensor, Tensor]:
     """View-dependent light that one SH band can hold.
 
     With d the direction from the eye: velvet adds velvet·(1 + n·d), brighter where the surface turns away, as
@@ -74,16 +74,16 @@ def sheen(normals: Tensor, velvet: Tensor, gloss: Tensor, color: Tensor) -> tupl
 
     Args:
         normals: unit. [N,3]
-        velvet, gloss: how much, in sRGB units. [N]
+        velvet, gloss: how much, in sRGB units
         color: colour of both. [N,3]
 
     Returns:
         what to add to the colour [N,3], and the coefficients of band 1 [N,3,3].
     """
     mirror = 2 * (normals @ KEY.direction)[:, None] * normals - KEY.direction
-    slope = velvet[:, None] * normals - gloss[:, None] * mirror
+    slope = velvet * normals - gloss * mirror
     band = torch.stack([-slope[:, 1], slope[:, 2], -slope[:, 0]], dim=1) / _SH_C1
-    return velvet[:, None] * color, band[:, :, None] * color[:, None, :]
+    return velvet * color, band[:, :, None] * color[:, None, :]
 
 
 def _wrapped(cosine: Tensor, softness: float) -> Tensor:
