@@ -80,7 +80,7 @@ def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets
             full=full,
             rest=(0.1 * full)[None].half(),
             step=torch.ones(1, full.shape[1]),
-            coefficients=coefficients,
+            coefficients=coefficients.clone(),
         )
         for attribute, full in offsets.items()
     }

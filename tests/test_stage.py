@@ -12,6 +12,7 @@ from imgui_bundle import imgui
 from PIL import Image
 from ui_rig import Rig, bear, first_view, rig
 
+from viewer.inputs import Keys, Press
 from viewer.state import LayerState
 from viewer.turntable import axes, eye
 
@@ -31,10 +32,10 @@ def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(
     assert hand.strengths == [1.0, 0.5]
     assert np.abs(hand.picture().astype(int) - before).max() > 20
     assert len(hand.stage.work.past.past) == 1
-    hand.key(imgui.Key.mod_ctrl, imgui.Key.z)
+    hand.key("Ctrl+Z")
     assert hand.strengths == [0.5, 0.5]
     assert np.array_equal(hand.picture(), before)
-    hand.key(imgui.Key.mod_ctrl, imgui.Key.mod_shift, imgui.Key.z)
+    hand.key("Ctrl+Shift+Z")
     assert hand.strengths == [1.0, 0.5]
 
 
@@ -72,6 +73,12 @@ def test_a_slow_frame_that_holds_a_whole_orbit_still_turns_the_camera(hand: Rig)
     assert hand.stage.work.view.camera.azimuth == pytest.approx(before.azimuth - 15.0)
 
 
+def test_a_slow_frame_that_holds_several_chords_does_all_in_their_order(hand: Rig) -> None:
+    hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.8))
+    hand.frame(keys=Keys((Press("Ctrl+Z"), Press("2"), Press("Right"))))
+    assert hand.strengths == pytest.approx([0.5, 0.51])
+
+
 def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
     hand.frame()  # the one that tooltips get
     drawn, frames = hand.stage.drawn, hand.stage.frames
@@ -91,7 +98,7 @@ def test_the_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
     moved = hand.stage.work.view.camera
     assert hand.stage.work.past.past == ()
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.8))
-    hand.key(imgui.Key.mod_ctrl, imgui.Key.z)
+    hand.key("Ctrl+Z")
     assert hand.stage.work.view.camera == moved
 
 
@@ -124,7 +131,7 @@ def test_the_other_buttons_do_what_the_table_says(
 ) -> None:
     before = hand.stage.work.view.camera
     if modifier is not None:
-        hand.hold(modifier)
+        hand.modifier(modifier)
     hand.drag(VIEW, (VIEW[0] + 30, VIEW[1] + 30), button)
     after = hand.stage.work.view.camera
     assert after != before
@@ -140,7 +147,7 @@ def test_the_other_buttons_do_what_the_table_says(
 
 
 def test_right_drag_looks_around_while_flying(hand: Rig) -> None:
-    hand.key(imgui.Key.v)
+    hand.key("V")
     before = hand.stage.work.view.camera
     hand.drag(VIEW, (VIEW[0] + 30, VIEW[1]), button=1)
     after = hand.stage.work.view.camera
@@ -176,49 +183,55 @@ def test_holding_backslash_shows_the_original_and_letting_go_brings_the_edit_bac
         original = untouched.picture()
     with rig() as hand:
         edited = hand.picture()
-        hand.hold(imgui.Key.backslash)
+        hand.frame(keys=Keys(held=frozenset("\\")))
         shown = hand.picture()
         assert np.array_equal(shown[60:], original[60:]), "below the word Original"
         assert not np.array_equal(shown[:60], original[:60])
-        hand.hold(imgui.Key.backslash, False)
+        hand.frame()
         assert np.array_equal(hand.picture(), edited)
         assert hand.stage.work.past.past == ()
 
 
 @pytest.mark.parametrize(
-    ("keys", "change"),
+    ("chord", "change"),
     [
-        ((imgui.Key.right_arrow,), 0.01),
-        ((imgui.Key.down_arrow,), -0.01),
-        ((imgui.Key.mod_shift, imgui.Key.left_arrow), -0.1),
-        ((imgui.Key.mod_ctrl, imgui.Key.up_arrow), 0.001),
+        ("Right", 0.01),
+        ("Down", -0.01),
+        ("Shift+Left", -0.1),
+        ("Ctrl+Up", 0.001),
     ],
 )
-def test_arrows_step_the_focused_strength(hand: Rig, keys: tuple[imgui.Key, ...], change: float) -> None:
-    hand.key(imgui.Key._2)
-    hand.key(*keys)
+def test_arrows_step_the_focused_strength(hand: Rig, chord: str, change: float) -> None:
+    hand.key("2")
+    hand.key(chord)
     assert hand.strengths == pytest.approx([0.5, 0.5 + change], abs=1e-9)
     assert len(hand.stage.work.past.past) == 1
 
 
 def test_a_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
-    hand.hold(imgui.Key.right_arrow)
-    assert hand.stage.patience() == pytest.approx(1 / 60) or hand.stage.patience() == 0.0
-    hand.frame(60)
-    hand.hold(imgui.Key.right_arrow, False)
-    hand.settle()
-    assert hand.strengths[0] > 0.55
+    for again in (False, True, True, True):
+        hand.frame(keys=Keys((Press("Right", again),), held=frozenset({"Right"})))
+        hand.frame(keys=Keys(held=frozenset({"Right"})))
+    assert hand.stage.work.past.past == ()
+    hand.frame()
+    assert hand.strengths[0] == pytest.approx(0.54)
     assert len(hand.stage.work.past.past) == 1
 
 
+def test_a_held_letter_does_not_switch_to_and_fro(hand: Rig) -> None:
+    for again in (False, True, True):
+        hand.frame(keys=Keys((Press("V", again),), held=frozenset({"V"})))
+    assert hand.stage.work.view.camera.mode == "fly"
+
+
 def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
-    hand.key(imgui.Key._2)
+    hand.key("2")
     assert hand.stage.work.focus == 1
-    hand.key(imgui.Key.mod_shift, imgui.Key._1)
+    hand.key("Shift+1")
     assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, True]
-    hand.key(imgui.Key._9)
+    hand.key("9")
     assert hand.stage.work.focus == 1, "there is no ninth layer"
-    hand.key(imgui.Key.h)
+    hand.key("H")
     assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, False]
 
 
@@ -226,57 +239,58 @@ def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
     layers = tuple(LayerState(i % 2, f"layer {i}", 0.5) for i in range(9))
     with rig(replace(first_view(bear()), layers=layers)) as hand:
         top = hand.image()[60:400, 350:]
-        hand.key(imgui.Key._9)
+        hand.key("9")
         hand.frame(5)
         assert not np.array_equal(hand.image()[60:400, 350:], top)
-        hand.key(imgui.Key.mod_shift, imgui.Key._9)
+        hand.key("Shift+9")
         assert not hand.stage.work.view.layers[8].enabled
 
 
 def test_a_text_field_owns_the_keys(hand: Rig) -> None:
-    hand.hold(imgui.Key.mod_ctrl)
+    hand.modifier(imgui.Key.mod_ctrl)
     hand.move(*hand.slider(0, 0.2))
     hand.press()
     hand.release()
-    hand.hold(imgui.Key.mod_ctrl, False)
+    hand.modifier(imgui.Key.mod_ctrl, False)
     assert hand.io.want_text_input
     before = hand.stage.work.view.camera
-    hand.key(imgui.Key.v)
-    hand.frame(5, fly="W")
+    hand.key("V")
+    hand.frame(5, keys=Keys(fly=frozenset("W")))
     assert hand.stage.work.view.camera == before
 
 
 def test_f_frames_the_focused_layer_and_with_none_goes_home(hand: Rig) -> None:
     home = hand.stage.work.view.camera
-    hand.key(imgui.Key._2)
-    hand.key(imgui.Key.f)
+    hand.key("2")
+    hand.key("F")
     framed = hand.stage.work.view.camera
     assert framed.distance < 0.5 * home.distance
     assert axes(framed) == axes(home)
-    hand.key(imgui.Key.escape)
-    hand.key(imgui.Key.f)
+    hand.key("Escape")
+    hand.key("F")
     assert hand.stage.work.view.camera == home
-    hand.key(imgui.Key.f)
+    hand.key("F")
     hand.drag(VIEW, (VIEW[0] + 30, VIEW[1]))
-    hand.key(imgui.Key.mod_shift, imgui.Key.f)
+    hand.key("Shift+F")
     assert hand.stage.work.view.camera == home
 
 
 def test_w_flies_ahead_and_s_comes_back(hand: Rig) -> None:
     home = hand.stage.work.view.camera
-    hand.frame(10, fly="W")
+    hand.frame(10, keys=Keys(fly=frozenset("W")))
+    patience = hand.stage.patience()
     ahead = hand.stage.work.view.camera
     assert np.dot(np.subtract(eye(ahead), eye(home)), axes(home).back) < 0
-    assert hand.stage.patience() is not None, "frames go on while a key is held"
-    hand.frame(10, fly="S")
+    assert patience == 0.0, "frames go on while a key is held"
+    hand.frame(10, keys=Keys(fly=frozenset("S")))
     assert eye(hand.stage.work.view.camera) == pytest.approx(eye(home))
 
 
 def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Path) -> None:
     with rig(pictures=tmp_path) as hand:
         shown = hand.picture()
-        hand.key(imgui.Key.f2)
-        hand.key(imgui.Key.mod_shift, imgui.Key.f2)
+        hand.key("F2")
+        hand.key("Shift+F2")
         first, second = sorted(tmp_path.iterdir())
         assert (first.name, second.name) == ("bear_001.png", "bear_002.png")
         assert np.array_equal(np.asarray(Image.open(first)), shown)
@@ -288,7 +302,7 @@ def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Pat
 
 def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_path: Path) -> None:
     with rig(pictures=tmp_path / "gone") as hand:
-        hand.key(imgui.Key.f2)
+        hand.key("F2")
         message = hand.stage.work.message
         assert message is not None
         assert message.error
@@ -305,7 +319,7 @@ def test_messages_leave_by_themselves(hand: Rig) -> None:
 
 
 def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
-    hand.key(imgui.Key.f10)
+    hand.key("F10")
     assert hand.stage.work.view.overlay
     assert hand.stage.drawn == 1, "showing figures draws no splats"
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
@@ -315,7 +329,7 @@ def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
 
 
 def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:
-    hand.key(imgui.Key.f12)
+    hand.key("F12")
     assert hand.stage.work.view.panel is False
     background = np.array(bear().demo.background) * 255
     assert np.abs(hand.image()[5, -5] - background).max() <= 1
@@ -351,6 +365,6 @@ def test_an_unknown_layer_count_needs_no_scene(hand: Rig) -> None:
     hand.stage.restart(replace(hand.stage.work.view, layers=()))
     hand.settle()
     assert hand.stage.work.focus is None
-    hand.key(imgui.Key.right_arrow)
-    hand.key(imgui.Key.h)
+    hand.key("Right")
+    hand.key("H")
     assert hand.strengths == []

@@ -12,6 +12,7 @@ from ui_rig import bear, first_view, rig
 
 from progdf.errors import ProgdfError
 from viewer.headless import headless_context, is_software
+from viewer.inputs import Keys
 from viewer.state import LayerState, ViewState
 
 Compare = Callable[[str, np.ndarray], None]
@@ -80,7 +81,7 @@ def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
 
 def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
-        hand.key(imgui.Key.f1)
+        hand.key("F1")
         hand.stage.tell(
             "shirt.gdf was made for another scene: it has 41 203 Gaussians, bear.ply has 1 500", True
         )
@@ -90,17 +91,16 @@ def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
 
 def test_a_scene_without_edits_and_the_original_held(screenshot: Compare) -> None:
     with rig(first_view(bear()), SMALLEST) as hand:
-        hand.hold(imgui.Key.backslash)
-        hand.settle()
+        hand.frame(3, Keys(held=frozenset("\\")))
         screenshot("ui_original", hand.image())
 
 
 def test_a_value_being_typed(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
-        hand.hold(imgui.Key.mod_ctrl)
+        hand.modifier(imgui.Key.mod_ctrl)
         hand.move(900.0, 136.0)
         hand.press()
         hand.release()
-        hand.hold(imgui.Key.mod_ctrl, False)
+        hand.modifier(imgui.Key.mod_ctrl, False)
         hand.frame(3)
         screenshot("ui_typing", hand.image())

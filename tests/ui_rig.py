@@ -17,6 +17,7 @@ from viewer.app import Document
 from viewer.engine import Engine
 from viewer.gl.screen import read_rgb
 from viewer.headless import headless_context
+from viewer.inputs import NO_KEYS, Keys, Press
 from viewer.stage import Stage
 from viewer.state import LayerState, ViewState
 from viewer.turntable import first_camera
@@ -48,9 +49,9 @@ class Rig:
         self.io.display_framebuffer_scale = imgui.ImVec2(density, density)
         self.settle()
 
-    def frame(self, count: int = 1, fly: str = "") -> None:
+    def frame(self, count: int = 1, keys: Keys = NO_KEYS) -> None:
         for _ in range(count):
-            self.stage.frame(self.screen, self.pixels, STEP_S, frozenset(fly))
+            self.stage.frame(self.screen, self.pixels, STEP_S, keys)
 
     def settle(self) -> None:
         """What the window's loop does while the stage has no patience."""
@@ -94,15 +95,16 @@ class Rig:
         self.event()
         self.settle()
 
-    def key(self, *keys: imgui.Key) -> None:
-        """Press all, then let go; modifiers first."""
-        for down, order in ((True, keys), (False, keys[::-1])):
-            for key in order:
-                self.io.add_key_event(key, down)
-                self.event()
+    def key(self, chord: str) -> None:
+        """Press a chord of `controls.KEYS` and let go."""
+        name = chord.rpartition("+")[2]
+        self.stage.wake()
+        self.frame(keys=Keys((Press(chord),), frozenset({name})))
+        self.frame()
         self.settle()
 
-    def hold(self, key: imgui.Key, down: bool = True) -> None:
+    def modifier(self, key: imgui.Key, down: bool = True) -> None:
+        """Hold a modifier for the mouse, or let it go."""
         self.io.add_key_event(key, down)
         self.event()
 

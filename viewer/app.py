@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import moderngl
 from imgui_bundle import imgui
 
 from progdf.checkpoint import Gdf, load_gdf
@@ -57,7 +56,7 @@ def run(document: Document, state: ViewState, pictures: Path = Path(), size: tup
     """
     window = Window(_window_title(document.title), size)
     try:
-        app = _App(window, document, state, pictures)
+        app = App(window, document, state, pictures)
         try:
             app.loop()
         finally:
@@ -67,12 +66,12 @@ def run(document: Document, state: ViewState, pictures: Path = Path(), size: tup
     return 0
 
 
-class _App:
+class App:
     """One window with its stage and engine."""
 
     def __init__(self, window: Window, document: Document, state: ViewState, pictures: Path) -> None:
         self.window, self.document = window, document
-        self.context = moderngl.create_context(require=330)
+        self.context = window.context()
         self.engine = Engine(self.context, document.scene, document.gdfs)
         self.stage = Stage(self.context, self.engine, document.facts(), state, window.ui_scale, pictures)
         self.dropped: list[Path] = []
@@ -93,10 +92,10 @@ class _App:
             if self.failure is not None:
                 raise self.failure
             for path in self._take_dropped():
-                self._open(path)
-            self._draw()
+                self.open(path)
+            self.draw()
 
-    def _draw(self) -> None:
+    def draw(self) -> None:
         """One frame of the latest state; nothing while the window is minimised."""
         if 0 in self.window.pixels:
             self.stage.rest()
@@ -107,7 +106,7 @@ class _App:
         self.stage.ui.set_scale(self.window.ui_scale)
         imgui.backends.glfw_new_frame()
         screen = self.context.screen
-        self.stage.frame(screen, self.window.pixels, seconds, self.window.fly_keys(), arrived)
+        self.stage.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
         self.window.present()
         requests = self.stage.take_requests()
         if "full_screen" in requests:
@@ -117,7 +116,7 @@ class _App:
 
     def _redraw(self) -> None:
         try:
-            self._draw()
+            self.draw()
         except BaseException as failure:  # glfw would only print it
             self.failure = failure
 
@@ -129,7 +128,7 @@ class _App:
         paths, self.dropped = self.dropped, []
         return paths
 
-    def _open(self, path: Path) -> None:
+    def open(self, path: Path) -> None:
         """A dropped file, by what it is: a scene replaces all, an edit comes on top of the stack."""
         try:
             if path.suffix.lower() == ".gdf":

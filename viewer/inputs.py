@@ -1,8 +1,8 @@
-"""Reads imgui's io: which bound keys were pressed, which drag is under way, where the mouse moved."""
+"""What the hand does, in the words of `controls`: which actions keys ask for, which drag has begun."""
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import dataclass
 
 from imgui_bundle import imgui
 
@@ -10,45 +10,56 @@ from . import controls
 from .state import ViewCamera
 
 _BUTTONS = (("left", 0), ("right", 1), ("middle", 2))
-_MODIFIERS = {"Ctrl": imgui.Key.mod_ctrl, "Shift": imgui.Key.mod_shift, "Alt": imgui.Key.mod_alt}
 
 
-@cache
-def key_of(chord: str) -> tuple[imgui.Key, int]:
-    """imgui's key and modifier mask of a chord such as "Ctrl+Shift+Z" or "F10".
+@dataclass(frozen=True)
+class Press:
+    """A key that went down, with the modifiers that were held just then; `again` while it is held."""
 
-    Raises:
-        AttributeError: there is no such key.
+    chord: str
+    again: bool = False
+
+
+@dataclass(frozen=True)
+class Keys:
+    """What the keyboard did since the last frame.
+
+    Not taken from imgui: it merges the events of a slow frame, and the Ctrl of a quick Ctrl+Z would be lost.
+
+    Args:
+        pressed: in their order
+        held: names of the keys that are down, as in the chords of `controls.KEYS`
+        fly: which of `controls.FLY_KEYS` are down, by their physical place
     """
-    *held, name = chord.split("+")
-    mask = 0
-    for modifier in held:
-        mask |= int(_MODIFIERS[modifier])
-    arrows = {"Left": "left_arrow", "Right": "right_arrow", "Up": "up_arrow", "Down": "down_arrow"}
-    attribute = f"_{name}" if name.isdigit() else arrows.get(name, name.lower())
-    return getattr(imgui.Key, attribute), mask
+
+    pressed: tuple[Press, ...] = ()
+    held: frozenset[str] = frozenset()
+    fly: frozenset[str] = frozenset()
 
 
-def actions_pressed() -> list[str]:
-    """Actions of `controls.KEYS` whose keys were pressed, or repeat; none while a text field is open."""
-    io = imgui.get_io()
-    if io.want_text_input:
+NO_KEYS = Keys()
+
+
+def actions_pressed(keys: Keys) -> list[str]:
+    """Actions of `controls.KEYS` that were asked for; none while a text field is open."""
+    if imgui.get_io().want_text_input:
         return []
-    mask = int(io.key_mods)
-    bound = ((key, *key_of(key.chord)) for key in controls.KEYS)
     return [
-        key.action for key, code, mods in bound if mods == mask and imgui.is_key_pressed(code, key.repeats)
+        key.action
+        for press in keys.pressed
+        for key in controls.KEYS
+        if key.chord == press.chord and (key.repeats or not press.again)
     ]
 
 
-def repeating() -> bool:
-    """Whether a key that repeats is held: the gesture is not over, and frames must go on."""
-    return any(imgui.is_key_down(key_of(key.chord)[0]) for key in controls.KEYS if key.repeats)
+def repeating(keys: Keys) -> bool:
+    """Whether a key that repeats is held: what it does is not over yet."""
+    return any(key.repeats and key.chord.rpartition("+")[2] in keys.held for key in controls.KEYS)
 
 
-def holds_original() -> bool:
+def holds_original(keys: Keys) -> bool:
     """Whether the key that shows the original is held."""
-    return not imgui.get_io().want_text_input and imgui.is_key_down(imgui.Key.backslash)
+    return controls.HELD_ORIGINAL in keys.held and not imgui.get_io().want_text_input
 
 
 def modifier() -> str:
@@ -69,9 +80,15 @@ def any_button_down() -> bool:
     return any(imgui.is_mouse_down(button) for _, button in _BUTTONS)
 
 
-def fly(camera: ViewCamera, keys: frozenset[str], seconds: float, radius: float) -> ViewCamera:
-    """Flight by the keys that are down (names of `controls.FLY_KEYS`)."""
+def flying(keys: Keys) -> bool:
+    """Whether flight keys are held, and not as parts of a chord or of a text."""
     io = imgui.get_io()
-    right, up, ahead = (sum(controls.FLY_KEYS[key][i] for key in keys) for i in range(3))
+    return bool(keys.fly) and not (io.want_text_input or io.key_ctrl or io.key_super)
+
+
+def fly(camera: ViewCamera, keys: Keys, seconds: float, radius: float) -> ViewCamera:
+    """Flight by the keys that are down."""
+    io = imgui.get_io()
+    right, up, ahead = (sum(controls.FLY_KEYS[key][i] for key in keys.fly) for i in range(3))
     pace = 10.0 if io.key_shift else 0.1 if io.key_alt else 1.0
     return controls.fly(camera, right, up, ahead, seconds, radius, pace)

@@ -20,6 +20,7 @@ from progdf.errors import ProgdfError
 from . import controls, inputs, overlay, panel, workspace
 from .engine import Engine, FrameTimings
 from .gl.screen import read_rgb
+from .inputs import NO_KEYS, Keys
 from .pick import surface_point
 from .pictures import save_picture
 from .state import ViewCamera, ViewState
@@ -63,7 +64,7 @@ class Stage:
         self.timings = FrameTimings()  # of the picture on screen
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
         self._drag: str | None = None
-        self._flying = False
+        self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
         self._unsettled, self._linger = SETTLE_FRAMES, True
 
@@ -101,7 +102,7 @@ class Stage:
         self.ui.make_current()
         if self._unsettled > 0:
             return 0.0
-        if self._flying or inputs.repeating():
+        if inputs.flying(self._keys):
             return 1.0 / 60.0
         waits = [LINGER_S] if self._linger else []
         if imgui.get_io().want_text_input:
@@ -121,7 +122,7 @@ class Stage:
         screen: moderngl.Framebuffer,
         size: tuple[int, int],
         seconds: float,
-        fly_keys: frozenset[str] = frozenset(),
+        keys: Keys = NO_KEYS,
         arrived: float | None = None,
     ) -> None:
         """Handle the input that imgui's io holds, and draw.
@@ -130,7 +131,7 @@ class Stage:
             screen: where to draw
             size: its width and height in pixels: io.display_size times io.display_framebuffer_scale
             seconds: since the last frame
-            fly_keys: which of controls.FLY_KEYS are down, by their physical place
+            keys: what the keyboard did
             arrived: time.perf_counter() when the input came; now if None
         """
         arrived = time.perf_counter() if arrived is None else arrived
@@ -142,8 +143,9 @@ class Stage:
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
-        self._handle_input(fly_keys, seconds)
-        if not imgui.is_any_item_active() and self._drag is None and not inputs.repeating():
+        self._keys = keys
+        self._handle_input(seconds)
+        if not imgui.is_any_item_active() and self._drag is None and not inputs.repeating(keys):
             self.work = workspace.settled(self.work)
         if self.work != before:
             self.wake()
@@ -169,14 +171,12 @@ class Stage:
         area, density = self._area(), imgui.get_io().display_framebuffer_scale
         return max(round(area.width * density.x), 1), max(round(area.height * density.y), 1)
 
-    def _handle_input(self, fly_keys: frozenset[str], seconds: float) -> None:
-        io = imgui.get_io()
+    def _handle_input(self, seconds: float) -> None:
         focus = self.work.focus
-        for action in inputs.actions_pressed():
+        for action in inputs.actions_pressed(self._keys):
             self._perform(action)
-        self._flying = bool(fly_keys) and not (io.want_text_input or io.key_ctrl or io.key_super)
-        if self._flying:
-            flown = inputs.fly(self.work.view.camera, fly_keys, seconds, self.facts.bounds.radius)
+        if inputs.flying(self._keys):
+            flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
             self._panel(reveal=self.work.focus != focus)
@@ -222,7 +222,7 @@ class Stage:
         return camera if point is None else controls.pivot_on(camera, point, self.facts.bounds.radius)
 
     def _shown(self) -> ViewState:
-        return workspace.original(self.work.view) if inputs.holds_original() else self.work.view
+        return workspace.original(self.work.view) if inputs.holds_original(self._keys) else self.work.view
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
         """The splats; the engine works only where what is shown is another picture than its last one."""
@@ -237,7 +237,7 @@ class Stage:
 
     def _draw_overlays(self) -> None:
         area, work = self._area(), self.work
-        if inputs.holds_original():
+        if inputs.holds_original(self._keys):
             overlay.banner("Original", area, self.ui)
         if work.view.overlay:
             overlay.timings(self.figures(), self.ui)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,21 @@ from imgui_bundle import imgui  # before glfw: it makes glfw load the library th
 
 # isort: split
 import glfw
+import moderngl
 
 from progdf.errors import ProgdfError
 
 from . import controls
+from .inputs import Keys, Press
 
 LEAST = (640, 400)
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
+_NAMES = {
+    **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
+    **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
+    **{getattr(glfw, f"KEY_{name.upper()}"): name for name in ("Left", "Right", "Up", "Down", "Escape")},
+    glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
+}
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),
     (glfw.CONTEXT_VERSION_MINOR, 3),
@@ -54,7 +63,14 @@ class Window:
         glfw.set_window_size_limits(self.handle, *LEAST, glfw.DONT_CARE, glfw.DONT_CARE)
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)
+        self._pressed: list[Press] = []
+        self._down: dict[int, str] = {}  # names of the keys that are down
         self._windowed: tuple[int, int, int, int] | None = None
+
+    def context(self) -> moderngl.Context:
+        """Its GL context, for drawing; through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do."""
+        moderngl.init_context(_GlfwLoader())
+        return moderngl.get_context()
 
     def close(self) -> None:
         glfw.destroy_window(self.handle)
@@ -74,6 +90,10 @@ class Window:
         def on_event(*_: object) -> None:
             wake()
 
+        def on_key(_: object, key: int, scancode: int, action: int, mods: int) -> None:
+            self._note_key(key, scancode, action, mods)
+            wake()
+
         def on_drop(_: object, names: Sequence[str]) -> None:
             dropped([Path(name) for name in names])
 
@@ -85,7 +105,6 @@ class Window:
             glfw.set_cursor_enter_callback,
             glfw.set_mouse_button_callback,
             glfw.set_scroll_callback,
-            glfw.set_key_callback,
             glfw.set_char_callback,
             glfw.set_window_focus_callback,
             glfw.set_window_iconify_callback,
@@ -94,6 +113,7 @@ class Window:
             listen(self.handle, on_event)
         callback: Any = on_drop  # glfw's own annotation has the arguments of the C function
         glfw.set_drop_callback(self.handle, callback)
+        glfw.set_key_callback(self.handle, on_key)
         glfw.set_window_refresh_callback(self.handle, on_refresh)
         # imgui's own callbacks call the ones that were there before
         imgui.backends.glfw_init_for_opengl(ctypes.cast(self.handle, ctypes.c_void_p).value or 0, True)
@@ -127,9 +147,20 @@ class Window:
         pixels, coordinates = self.pixels[0], int(glfw.get_window_size(self.handle)[0])
         return max(content * coordinates / pixels, 0.5) if pixels else 1.0
 
-    def fly_keys(self) -> frozenset[str]:
-        """Which flight keys are down, by their physical place."""
-        return frozenset(n for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS)
+    def take_keys(self) -> Keys:
+        """What the keyboard did since the last call."""
+        fly = frozenset(n for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS)
+        keys = Keys(tuple(self._pressed), frozenset(self._down.values()), fly)
+        self._pressed.clear()
+        return keys
+
+    def _note_key(self, key: int, scancode: int, action: int, mods: int) -> None:
+        if action == glfw.RELEASE:
+            self._down.pop(key, None)
+            return
+        name = key_name(key, scancode)
+        self._down[key] = name
+        self._pressed.append(Press(chord(name, mods), action == glfw.REPEAT))
 
     def present(self) -> None:
         glfw.swap_buffers(self.handle)
@@ -150,6 +181,32 @@ class Window:
             glfw.set_window_monitor(
                 self.handle, monitor, 0, 0, mode.size.width, mode.size.height, mode.refresh_rate
             )
+
+
+def key_name(key: int, scancode: int) -> str:
+    """The name of a glfw key in `controls`: letters as the layout has them, others by their place."""
+    place = _NAMES.get(key, "")
+    if len(place) == 1 and place.isalpha():
+        label = glfw.get_key_name(key, scancode) or ""
+        return label.upper() if label.isascii() and label.isalpha() else place
+    return place
+
+
+def chord(name: str, mods: int) -> str:
+    """A key with its modifiers, as in `controls.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
+    ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
+    held = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
+    return "".join(prefix for prefix, bit in held if mods & bit) + name
+
+
+class _GlfwLoader:
+    """What moderngl asks for the addresses of OpenGL's functions."""
+
+    def load_opengl_function(self, name: str) -> int:
+        return ctypes.cast(glfw.get_proc_address(name), ctypes.c_void_p).value or 0
+
+    def release(self) -> None:
+        """Nothing is held."""
 
 
 def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:

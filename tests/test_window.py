@@ -1,0 +1,265 @@
+"""The real window: `progdf view` under Xvfb, driven by xdotool; and files dropped on it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from ui_rig import bear, first_view
+
+from progdf.checkpoint import save_gdf
+from progdf.ply import save_ply
+from viewer import app as application
+from viewer import controls, panel
+
+PATIENCE_S = 60.0
+WIDTH, HEIGHT = application.SIZE
+
+
+@dataclass
+class Desktop:
+    """`progdf view` on a display of its own."""
+
+    process: subprocess.Popen[str]
+    environment: dict[str, str]
+    folder: Path
+    window: str = ""
+
+    def xdotool(self, *arguments: object) -> str:
+        command = ["xdotool", *(str(argument) for argument in arguments)]
+        run = subprocess.run(
+            command, env=self.environment, capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        return run.stdout.strip()
+
+    def until(self, what: str, happened: Callable[[], object]) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not happened():
+            assert self.process.poll() is None, f"the window closed: {self.process.communicate()}"
+            assert time.monotonic() < end, f"waited in vain for {what}"
+            time.sleep(0.05)
+
+    def open(self) -> None:
+        def found() -> str:
+            self.window = self.xdotool("search", "--onlyvisible", "--name", "ProGDF Studio").split("\n")[0]
+            return self.window
+
+        self.until("the window", found)
+        self.xdotool("windowfocus", self.window)
+
+    def point(self, x: float, y: float) -> None:
+        self.xdotool("mousemove", "--window", self.window, round(x), round(y))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: int = 1) -> None:
+        self.point(*start)
+        self.xdotool("mousedown", button)
+        for share in (0.3, 0.6, 1.0):
+            self.point(*(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+        self.xdotool("mouseup", button)
+
+    def shot(self, keys: str = "shift+F2") -> np.ndarray:
+        """The window as it saves itself, after everything that was sent before."""
+        path = self.folder / f"bear_{len(list(self.folder.glob('bear_*.png'))) + 1:03d}.png"
+        self.xdotool("key", keys)
+        self.until(path.name, path.exists)
+        return np.asarray(Image.open(path)).astype(int)
+
+    def ticks(self) -> int:
+        """Processor time that the window has used, in hundredths of a second."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return int(fields[11]) + int(fields[12])
+
+
+@pytest.fixture
+def desktop(tmp_path: Path) -> Iterator[Desktop]:
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("Xvfb and xdotool are not installed")
+    paths = bear().save(tmp_path)
+    receive, send = os.pipe()
+    server = subprocess.Popen(
+        [
+            "Xvfb",
+            "-displayfd",
+            str(send),
+            "-screen",
+            "0",
+            f"{WIDTH + 100}x{HEIGHT + 100}x24",
+            "-nolisten",
+            "tcp",
+        ],
+        pass_fds=[send],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(send)
+    with os.fdopen(receive) as display:
+        environment = os.environ | {"DISPLAY": f":{display.readline().strip()}", "NUMBA_NUM_THREADS": "2"}
+    environment.pop("WAYLAND_DISPLAY", None)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "progdf", "view", *map(str, paths), "--set", "scarf=0.5"],
+        env=environment,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    made = Desktop(process, environment, tmp_path)
+    try:
+        made.open()
+        yield made
+    finally:
+        for started in (process, server):
+            started.terminate()
+            started.communicate(timeout=PATIENCE_S)
+
+
+def slider(layer: int, strength: float) -> tuple[float, float]:
+    inset = 12 + 10 + 7
+    x = WIDTH - panel.WIDTH_PX + inset + strength * (panel.WIDTH_PX - 2 * inset)
+    return x, 136.0 + 97.0 * layer
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> int:
+    """Pixels of the picture that differ visibly."""
+    wide = WIDTH - round(panel.WIDTH_PX)
+    return int((np.abs(before - after)[: HEIGHT - 60, :wide].max(axis=-1) > 12).sum())
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_nothing(
+    desktop: Desktop,
+) -> None:
+    first = desktop.shot()
+    assert first.shape == (HEIGHT, WIDTH, 3)
+    desktop.drag(slider(0, 0.5), slider(0, 1.0))
+    second = desktop.shot()
+    assert changed(first, second) > 200
+    desktop.xdotool("key", "ctrl+z")
+    assert changed(first, desktop.shot()) == 0
+    time.sleep(1.0)
+    before = desktop.ticks()
+    time.sleep(1.0)
+    assert desktop.ticks() - before <= 2, "frames are drawn although nothing changes"
+    desktop.xdotool("key", "ctrl+q")
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+    assert desktop.process.communicate() == ("", "")
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> None:
+    first = desktop.shot()
+    desktop.drag((400, 400), (480, 380))
+    orbited = desktop.shot()
+    assert changed(first, orbited) > 1000
+    desktop.xdotool("keydown", "w")
+    time.sleep(0.5)
+    desktop.xdotool("keyup", "w")
+    flown = desktop.shot()
+    assert changed(orbited, flown) > 1000
+    desktop.xdotool("windowsize", "--sync", desktop.window, 900, 650)
+    picture = desktop.shot("F2")
+    assert picture.shape == (650, 900 - panel.WIDTH_PX, 3)
+    desktop.xdotool("key", "ctrl+q")
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+
+
+def test_without_a_display_view_says_so_in_one_line(tmp_path: Path) -> None:
+    paths = bear().save(tmp_path)
+    hidden = {"DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE"}
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    run = subprocess.run(
+        [sys.executable, "-m", "progdf", "view", str(paths[0])],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    if sys.platform != "linux":
+        pytest.skip("only Linux can be without a display")
+    assert run.returncode == 2
+    assert run.stderr.count("\n") == 1
+    assert run.stderr.startswith("progdf: no window")
+    assert "progdf render" in run.stderr
+
+
+def test_chords_are_named_as_in_the_table_of_bindings() -> None:
+    from viewer.window import _NAMES, chord, glfw
+
+    assert chord("Z", glfw.MOD_CONTROL | glfw.MOD_SHIFT) == "Ctrl+Shift+Z"
+    assert chord("F2", 0) == "F2"
+    bound = {key.chord.rpartition("+")[2] for key in controls.KEYS} | {controls.HELD_ORIGINAL}
+    assert bound <= set(_NAMES.values()), "every bound key is known to the window"
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[application.App]:
+    """The application on a window of glfw's null platform: everything but a screen."""
+    from viewer.window import Window, glfw
+
+    glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
+    if not glfw.init():
+        pytest.skip("glfw has no null platform here")
+    glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
+    stack = bear()
+    try:
+        window = Window("test", (800, 600))
+    finally:
+        glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
+    document = application.Document("bear.ply", stack.scene, stack.gdfs[:1])
+    app = application.App(window, document, first_view(stack, 0.5), tmp_path)
+    app.draw()
+    yield app
+    app.close()
+    window.close()
+
+
+@pytest.mark.gl
+def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, tmp_path: Path) -> None:
+    gdf = bear().gdfs[1]
+    save_gdf(tmp_path / "ears.gdf", gdf)
+    opened.open(tmp_path / "ears.gdf")
+    opened.draw()
+    layers = opened.stage.work.view.layers
+    assert [(layer.name, layer.strength) for layer in layers] == [("scarf", 0.5), ("ears", 1.0)]
+    assert [row.count for row in opened.stage.facts.rows] == [len(g.region) for g in bear().gdfs]
+    assert len(opened.stage.work.past.past) == 1
+
+
+@pytest.mark.gl
+def test_a_dropped_scene_takes_the_place_of_the_old_one(opened: application.App, tmp_path: Path) -> None:
+    save_ply(tmp_path / "half.ply", bear().scene[:700])
+    opened.open(tmp_path / "half.ply")
+    opened.draw()
+    assert opened.stage.facts.count == 700
+    assert opened.stage.work.view.layers == ()
+    assert opened.stage.facts.title == "half.ply"
+
+
+@pytest.mark.gl
+def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
+    opened: application.App, tmp_path: Path
+) -> None:
+    before = opened.stage.work.view
+    other = replace(bear().gdfs[1], scene=replace(bear().gdfs[1].scene, means_sha256="0" * 64))
+    save_gdf(tmp_path / "other.gdf", other)
+    (tmp_path / "torn.ply").write_bytes(b"ply\nformat")
+    (tmp_path / "notes.txt").write_text("hello")
+    for name in ("other.gdf", "torn.ply", "notes.txt", "absent.gdf"):
+        opened.open(tmp_path / name)
+        opened.draw()
+        message = opened.stage.work.message
+        assert message is not None
+        assert message.error
+        assert name in message.text
+        assert "\n" not in message.text
+        assert opened.stage.work.view == before
