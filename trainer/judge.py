@@ -1,13 +1,13 @@
-"""What is measured of an edit, always on views that training has not seen, and always on the region's own pixels.
+"""What is measured of an edit, on views that training has not seen and on the region's own pixels.
 
-A whole picture of which the region is 3 % would flatter every figure; so errors are taken over the pixels that show
-the region or that the edit changes (method.md 7).
+A whole picture of which the region is 3 % would flatter every figure; so errors are taken over the pixels that
+show the region or that the edit changes (method.md 7).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,13 +17,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region
 from trainer.crops import CropScene, crop_scene, render_all
 from trainer.losses import Perceptual
-from trainer.trajectory import Trajectory
 from trainer.views import View, crop
-
-OffsetsAt = Callable[[float], Tensor]
-"""Slider value -> offsets of the members. float -> [M,C]"""
-
-SLIDER_SAMPLES = 25
 
 
 @dataclass(frozen=True)
@@ -59,24 +53,13 @@ class Judge:
     def perceptual(self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual) -> float:
         """Mean perceptual distance of the boxes."""
         with torch.no_grad():
-            values = [float(measure(a, b, None)) for a, b in zip(found, expected, strict=True)]
+            values = [float(measure(a, b)) for a, b in zip(found, expected, strict=True)]
         return sum(values) / max(1, len(values))
 
-    def psnr_curve(self, offsets_at: OffsetsAt, expected: Sequence[Sequence[Tensor]]) -> list[float]:
-        """PSNR at `slider_samples()` to the pictures expected there."""
-        return [
-            self.psnr(self.pictures(offsets_at(s)), pictures)
-            for s, pictures in zip(slider_samples(), expected, strict=True)
-        ]
-
-    def recorded(self, trajectory: Trajectory) -> list[list[Tensor]]:
-        """The trajectory's own pictures at `slider_samples()`."""
-        return [self.pictures(trajectory.at(s)) for s in slider_samples()]
-
-
-def slider_samples() -> list[float]:
-    """Slider values at which errors are taken: even, both ends left out where the error is 0 by construction."""
-    return [(i + 1) / (SLIDER_SAMPLES + 1) for i in range(SLIDER_SAMPLES)]
+    def counted(self, offsets: Tensor) -> Tensor:
+        """The pixels that count, of all views, with these offsets. [M,C] -> [P,3]"""
+        pictures = self.pictures(offsets)
+        return torch.cat([picture[pixels] for picture, pixels in zip(pictures, self.pixels, strict=True)])
 
 
 def make_judge(
@@ -107,22 +90,3 @@ def make_judge(
     boxes = {s: [crop(p, v.box) for p, v in zip(ps, views, strict=True)] for s, ps in edited.items()}
     original = pack(scene[region.members], with_shN=channels > 14)
     return Judge(original, crops, pixels, boxes, [view.camera.name for view in views])
-
-
-def slider_curve(judge: Judge, offsets_at: OffsetsAt, steps: int = 20) -> tuple[list[float], list[float]]:
-    """Visible change along the slider.
-
-    Returns:
-        mean |picture(s) − picture(0)| at 0, 1/steps … 1, and the chord from each of those to the next
-    """
-    pictures = [judge.pictures(offsets_at(i / steps)) for i in range(steps + 1)]
-    start = pictures[0]
-    return (
-        [_distance(picture, start) for picture in pictures],
-        [_distance(b, a) for a, b in zip(pictures, pictures[1:], strict=False)],
-    )
-
-
-def _distance(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:
-    total = sum(float((x - y).abs().sum()) for x, y in zip(a, b, strict=True))
-    return total / sum(x.numel() for x in a)

@@ -13,6 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from progdf.errors import ProgdfError
+from progdf.lpips import Features, Lpips
+
 
 class _ClampTowards(torch.autograd.Function):
     @staticmethod
@@ -45,17 +48,44 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
 
 
 class Perceptual(Protocol):
-    """A perceptual distance whose target side is computed once per key."""
+    """A perceptual distance of images of range 0..1 that are at least 31 pixels each way."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """As report.json names it."""
+        ...
 
-    def __call__(self, image: Tensor, target: Tensor, key: Hashable) -> Tensor:
-        """[h,w,3], [h,w,3] in 0..1 -> []; `key` names the target, None caches nothing."""
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
+        """[h,w,3], [h,w,3] -> []; what is computed of the target is kept under `key`, None keeps nothing."""
         ...
 
     def forget(self) -> None:
-        """Drop what is cached for targets."""
+        """Drop what is kept of targets."""
         ...
+
+
+class LpipsLoss:
+    """LPIPS with AlexNet (Zhang et al. 2018); the targets' features are computed once per key."""
+
+    name = "lpips-alex"
+
+    def __init__(self, network: Lpips) -> None:
+        self._network = network
+        self._kept: dict[Hashable, Features] = {}
+
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
+        """See `Perceptual`."""
+        seen = self._kept.get(key) if key is not None else None
+        if seen is None:
+            with torch.no_grad():
+                seen = self._network.features(target)
+            if key is not None:
+                self._kept[key] = seen
+        return self._network.distance(self._network.features(image), seen)
+
+    def forget(self) -> None:
+        """See `Perceptual`."""
+        self._kept.clear()
 
 
 class GradientL1:
@@ -63,19 +93,26 @@ class GradientL1:
 
     name = "gradient-l1"
 
-    def __call__(self, image: Tensor, target: Tensor, key: Hashable) -> Tensor:
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
+        """See `Perceptual`."""
         a, b = image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
         total = image.new_zeros(())
         for _ in range(2):
             for axis in (2, 3):
                 total = total + (a.diff(dim=axis) - b.diff(dim=axis)).abs().mean()
-            if min(a.shape[2:]) < 4:
-                break
             a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
         return total
 
     def forget(self) -> None:
-        """Nothing is cached."""
+        """Nothing is kept."""
+
+
+def perceptual_loss() -> tuple[Perceptual, str]:
+    """LPIPS, or its stand-in and one line that says why and how to get the real one; "" where all is well."""
+    try:
+        return LpipsLoss(Lpips.load()), ""
+    except ProgdfError as error:
+        return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 
 
 def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:

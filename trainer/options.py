@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
 from progdf.errors import ProgdfError
-from trainer.editors.base import EditKind
+from progdf.field.choose import Kind
 from trainer.trajectory import Slider
-
-FieldChoice = Literal["auto", "separable", "keyframes"]
-Threads = int
 
 QUICK_STEPS = 240
 QUICK_VIEWS = 12
@@ -43,17 +40,17 @@ class TrainOptions:
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with."""
     image_size: int = 256
     """Longer side of the views in pixels."""
-    steps: int = 600
+    steps: int = 800
     """Optimiser steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
     kind: Literal["auto", "colour", "style", "geometry"] = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor says (folder: style)."""
-    stages: int = 4
+    stages: int = 8
     """Strengths that a procedural editor is asked for; 1 is the paper's optimisation towards the end alone."""
     progressive: Literal["warmup", "off"] = "off"
     """The paper's progressive constraint (eq. 5) as a warm-up of the learning rate."""
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
-    field: FieldChoice = "auto"
+    field: Kind = "auto"
     """Kind of field; auto keeps the smallest that meets --target-psnr."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
@@ -71,7 +68,7 @@ class FitOptions:
 
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
-    field: FieldChoice = "auto"
+    field: Kind = "auto"
     """Kind of field; auto keeps the smallest that meets --target-psnr."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
@@ -109,5 +106,7 @@ def settled(options: TrainOptions) -> TrainOptions:
             f"--steps is {options.steps}; at least {4 * options.stages} would be right for {options.stages} stages"
         )
     if not math.isfinite(options.target_psnr):
-        raise ProgdfError(f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right")
+        raise ProgdfError(
+            f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"
+        )
     return replace(options, name=name)

@@ -156,7 +156,9 @@ def optimise(
     before: Sequence[Tensor] = render_all(crops, original)
     for index, stage in enumerate(stages):
         perceptual.forget()
-        way = sum(float((a - b).abs().mean()) for a, b in zip(stage.targets, before, strict=True)) / len(crops)
+        way = sum(float((a - b).abs().mean()) for a, b in zip(stage.targets, before, strict=True)) / len(
+            crops
+        )
         spacing = way * len(stages) / settings.snapshots
         losses: list[float] = []
         for local in range(stage.steps):

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 Advance = Callable[[int, str], None]
 """Steps done so far, and a short word about them (the loss)."""
@@ -21,16 +27,26 @@ class RunLog:
     """Writes what happens to log.txt and, unless quiet, to the screen (stderr); measures each stage's seconds.
 
     Args:
-        path: log.txt, started anew
+        path: log.txt
         quiet: the file only
+        append: keep what is in the file
     """
 
-    def __init__(self, path: Path, quiet: bool = False) -> None:
+    def __init__(self, path: Path, quiet: bool = False, append: bool = False) -> None:
         self.seconds: dict[str, float] = {}
         self._start = time.perf_counter()
-        self._file = path.open("w", encoding="utf-8", buffering=1)
+        self._file = path.open("a" if append else "w", encoding="utf-8", buffering=1)
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
         self._bar = self._console.is_terminal and not quiet
+
+    def head(self, text: str) -> None:
+        """A line for the file alone, without a time."""
+        self._file.write(text + "\n")
+
+    def rounded_seconds(self) -> dict[str, float]:
+        """Seconds by stage, and the total since the log was opened."""
+        total = time.perf_counter() - self._start
+        return {name: round(seconds, 2) for name, seconds in {**self.seconds, "total": total}.items()}
 
     def say(self, text: str) -> None:
         """One line."""
@@ -84,8 +100,3 @@ class RunLog:
 
 def _escaped(text: str) -> str:
     return text.replace("[", "\\[")
-
-
-def command_line() -> str:
-    """The command as it was typed."""
-    return " ".join(sys.argv[1:]) if sys.argv else ""

@@ -15,8 +15,7 @@ EditKind = Literal["colour", "style", "geometry"]
 class ImageEditor(Protocol):
     """Edits pictures of one region.
 
-    `stages` are the strengths that it can picture, ascending, the last 1: four for an editor with a dial of
-    its own, only (1,) for one that knows nothing but the finished edit.
+    An editor with a dial of its own pictures any strength, one that knows nothing but the finished edit only 1.
     """
 
     @property
@@ -26,7 +25,7 @@ class ImageEditor(Protocol):
 
     @property
     def stages(self) -> tuple[float, ...]:
-        """Strengths to ask for, ascending, the last 1."""
+        """The strengths that it can picture, ascending, the last 1; empty: any."""
         ...
 
     def edit(self, view: View, strength: float) -> Tensor:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from PIL import UnidentifiedImageError
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -47,14 +46,7 @@ class FolderEditor:
         if strength not in self.folders:
             raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
         path = _picture(self.folders[strength], view.camera.name)
-        width, height = view.camera.width, view.camera.height
-        try:
-            picture = read_picture(path, size=(width, height))
-        except (UnidentifiedImageError, OSError) as error:
-            raise ProgdfError(
-                f"{path} cannot be read as a picture ({type(error).__name__}); save it as PNG"
-            ) from error
-        return picture
+        return read_picture(path, size=(view.camera.width, view.camera.height))
 
 
 def folder(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> FolderEditor:

@@ -22,7 +22,6 @@ from progdf.sh import shade
 from trainer.editors.base import EditKind
 from trainer.views import View
 
-STAGES = (0.25, 0.5, 0.75, 1.0)
 _STRIPES = 7  # across the longest side of the region
 
 
@@ -32,7 +31,7 @@ class ColourEditor:
 
     change: Callable[[Tensor, float], Tensor]
     kind: EditKind = "colour"
-    stages: tuple[float, ...] = STAGES
+    stages: tuple[float, ...] = ()
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
@@ -57,7 +56,7 @@ class StripesEditor:
     target: Tensor
     reference: Tensor
     kind: EditKind = "colour"
-    stages: tuple[float, ...] = STAGES
+    stages: tuple[float, ...] = ()
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""

@@ -1,0 +1,138 @@
+"""The run folder: what lies where, whose folder it is, and pictures of views out and in.
+
+RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
+RUN/views/original|mask|final/VIEW.png          the view before, where the region is, after
+RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it, finished and at its other strengths
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.files import written_whole
+from progdf.pictures import write_image
+from trainer.pictures import read_picture
+
+_SIGNATURE = "progdf train"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths of one run."""
+
+    root: Path
+
+    @property
+    def trajectory(self) -> Path:
+        """The recorded trajectory."""
+        return self.root / "trajectory.safetensors"
+
+    @property
+    def cameras(self) -> Path:
+        """All views' cameras, `progdf.load_cameras` reads them."""
+        return self.root / "cameras.json"
+
+    @property
+    def report(self) -> Path:
+        """Figures, JSON."""
+        return self.root / "report.json"
+
+    @property
+    def picture(self) -> Path:
+        """Figures, to look at."""
+        return self.root / "report.png"
+
+    @property
+    def log(self) -> Path:
+        """What happened."""
+        return self.root / "log.txt"
+
+    def gdf(self, name: str) -> Path:
+        """The edit."""
+        return self.root / f"{name}.gdf"
+
+    def view(self, kind: str, name: str, strength: float = 1.0) -> Path:
+        """A view's picture; `kind` is original, edited, mask or final."""
+        folder = self.root / "views" / kind
+        return (folder if strength == 1.0 else folder / f"{strength:g}") / f"{name}.png"
+
+
+def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
+    """Make the run's folder, or take over that of an earlier run of the same edit.
+
+    Args:
+        root: the folder
+        edit: what identifies the edit (scene, region, editor)
+
+    Raises:
+        ProgdfError: it is a file, holds something that is no run, or the run of another edit. Nothing is touched.
+    """
+    if root.exists() and not root.is_dir():
+        raise ProgdfError(f"{root} is a file; give --out a folder")
+    folder = RunFolder(root)
+    if root.is_dir() and any(root.iterdir()):
+        first = (
+            folder.log.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0]
+            if folder.log.is_file()
+            else ""
+        )
+        if not first.startswith(_SIGNATURE):
+            raise ProgdfError(f"{root} is not empty and no run of progdf train; give --out another folder")
+        earlier = _json_or_nothing(first.removeprefix(_SIGNATURE))
+        for what, value in edit.items():
+            if earlier.get(what) != value:
+                raise ProgdfError(
+                    f"{root} holds a run with another {what} ({earlier.get(what)}); give --out another folder, "
+                    "or delete this one"
+                )
+    root.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def signature(edit: Mapping[str, str]) -> str:
+    """First line of log.txt, by which a folder is known to be a run, and of which edit."""
+    return f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}"
+
+
+def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
+    """One PNG per view. Pictures by view name, [H,W,3] or [H,W]."""
+    for name, image in pictures.items():
+        write_image(folder.view(kind, name, strength), image)
+
+
+def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: float = 1.0) -> list[Tensor]:
+    """The pictures of the named views. [H,W,3] each
+
+    Raises:
+        ProgdfError: one is missing or broken.
+    """
+    return [read_picture(folder.view(kind, name, strength)) for name in names]
+
+
+def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
+    """Delete pictures of views that an earlier run of the same edit had and this one has not."""
+    kept = set(names)
+    for path in (folder.root / "views").glob("*/**/*.png"):
+        if path.stem not in kept:
+            path.unlink()
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON, whole or not at all."""
+    with written_whole(path) as beside:
+        beside.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _json_or_nothing(text: str) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,63 @@
+"""`progdf train` and `progdf fit`: the command line, made from the options' dataclasses."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Sequence
+from typing import TypeVar
+
+import tyro
+
+from progdf.errors import ProgdfError
+from trainer.options import FitOptions, TrainOptions
+
+_Options = TypeVar("_Options")
+
+
+def train(argv: Sequence[str]) -> int:
+    """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
+    options = parsed(TrainOptions, argv, "progdf train")
+    from trainer.run import train as run  # only now: --help and a mistyped option need no torch
+
+    run(options)
+    return 0
+
+
+def fit(argv: Sequence[str]) -> int:
+    """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
+    options = parsed(FitOptions, argv, "progdf fit")
+    from trainer.run import refit
+
+    refit(options)
+    return 0
+
+
+def parsed(kind: type[_Options], argv: Sequence[str], command: str) -> _Options:
+    """Options from the command line; `--help` prints and exits.
+
+    Raises:
+        ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(kind, args=list(argv), prog=command)
+    except SystemExit as leaving:
+        if not leaving.code:
+            raise
+        raise ProgdfError(f"{_first_words(said.getvalue())}; see {command} --help") from None
+
+
+def _first_words(box: str) -> str:
+    """What tyro's framed message says, without the frame and the advice below the rule."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    lines = [line.strip("│ \t").strip() for line in text.splitlines()]
+    kept = []
+    for line in lines:
+        if line.startswith("────"):
+            break
+        if line and not line.startswith(("╭", "╰")):
+            kept.append(line)
+    return " ".join(kept) or "the options cannot be read"

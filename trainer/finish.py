@@ -1,0 +1,153 @@
+"""The end of every run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.checkpoint import Gdf, fingerprint, save_gdf
+from progdf.compose import Layer, compose
+from progdf.field.choose import Kind
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
+from progdf.pictures import write_image
+from trainer.artefacts import RunFolder, read_views, write_json
+from trainer.fit import fit_field, visibility
+from trainer.judge import Judge, make_judge
+from trainer.losses import Perceptual
+from trainer.preparation import Stand
+from trainer.progress import RunLog
+from trainer.report import figures, measure, report_picture
+from trainer.trajectory import Trajectory
+from trainer.views import View
+
+_RANK_VIEWS = 4
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run leaves.
+
+    Args:
+        folder: the run's folder
+        gdf: path of the .gdf file
+        report: what report.json holds
+        trajectory: the recorded trajectory
+    """
+
+    folder: RunFolder
+    gdf: Path
+    report: Mapping[str, Any]
+    trajectory: Trajectory
+
+
+def finished(
+    folder: RunFolder,
+    stand: Stand,
+    trajectory: Trajectory,
+    about: Mapping[str, Any],
+    perceptual: Perceptual,
+    log: RunLog,
+    choice: Kind,
+) -> RunResult:
+    """Fit, measure, and write NAME.gdf, report.json and report.png."""
+    options = about["options"]
+    scene, region = stand.scene, stand.region
+    with log.stage("fit"):
+        channels = trajectory.end.shape[1]
+        judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
+        few = stand.train[:: max(1, len(stand.train) // _RANK_VIEWS)][:_RANK_VIEWS]
+        seen = kept_judge(folder, stand, few, trajectory.strengths, channels)
+        weights = visibility(scene, region.members, stand.train)
+        fitted = fit_field(trajectory, seen, judge, weights, choice, options["target_psnr"])
+    field = fitted.chosen.field
+    log.say(
+        f"{fitted.chosen.label}, the smallest of {fitted.tried} fields that serves: "
+        f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
+    )
+    if not fitted.met:
+        log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
+    with log.stage("report"):
+        measured = measure(judge, fitted, perceptual)
+        gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
+        endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
+        losses = [(int(step), float(loss)) for step, loss in about["losses"]]
+        title = f"{options['name']}: {options['editor']}"
+        picture = report_picture(judge, measured, losses, title)
+    report = {
+        **figures(measured, endpoint, outside),
+        "trajectory": {
+            "recordings": len(trajectory),
+            "s": [round(float(s), 4) for s in trajectory.s],
+            "stages": list(trajectory.strengths),
+            "attribute_worth_db": about["attribute_worth_db"],
+        },
+        "time": {**_earlier_times(folder), **log.rounded_seconds()},
+        "memory_mb": _peak_memory_mb(),
+        "options": options,
+    }
+    save_gdf(folder.gdf(options["name"]), replace(gdf, report=report))
+    write_json(folder.report, report)
+    write_image(folder.picture, picture)
+    edit = report["edit"]
+    log.say(
+        f"held-out views: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}; between: "
+        + "; ".join(
+            f"s={s} {e['psnr']} (2 keyframes {e['keyframes2']})" for s, e in report["between"].items()
+        )
+    )
+    log.say(f"wrote {folder.gdf(options['name'])}")
+    return RunResult(folder, folder.gdf(options["name"]), report, trajectory)
+
+
+def kept_judge(
+    folder: RunFolder, stand: Stand, views: Sequence[View], strengths: Sequence[float], channels: int
+) -> Judge:
+    """Some views beside their edited pictures, as the run keeps them."""
+    names = [view.camera.name for view in views]
+    edited = {s: read_views(folder, "edited", names, s) for s in strengths}
+    return make_judge(stand.scene, stand.region, views, edited, stand.background, channels)
+
+
+def end_rows(stand: Stand, trajectory: Trajectory) -> Tensor:
+    """Raw member rows of the finished edit: original + end, in float32. [M,C]"""
+    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    return rows + trajectory.end
+
+
+def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
+    """Largest difference of any raw number: at s = 1 from the recorded end, and outside the region at any s."""
+    outside = torch.ones(len(scene), dtype=torch.bool)
+    outside[gdf.region.members] = False
+    finished = compose(scene, [Layer(gdf, 1.0)])
+    packed = pack(finished[gdf.region.members], with_shN=end.shape[1] > BASE_CHANNELS)
+    endpoint = float((packed - end).abs().max())
+    change = 0.0
+    for s in (0.3, 1.0):
+        edited = compose(scene, [Layer(gdf, s)])
+        for name in ATTRIBUTES:
+            before, after = getattr(scene, name)[outside], getattr(edited, name)[outside]
+            if before.numel() and not torch.equal(before, after):
+                change = max(change, float((after - before).abs().max()))
+    return endpoint, change
+
+
+def _earlier_times(folder: RunFolder) -> dict[str, float]:
+    """Seconds of the stages that this command did not run again."""
+    try:
+        times = json.loads(folder.report.read_text(encoding="utf-8"))["time"]
+        return {str(stage): float(seconds) for stage, seconds in times.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _peak_memory_mb() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (1 << 20 if sys.platform == "darwin" else 1 << 10))

@@ -1,0 +1,125 @@
+"""From a recorded trajectory to the field that is shipped, with its errors beside those of the honest baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.field import BakedField, fit_keyframes
+from progdf.field.choose import Candidate, FieldJudge, Kind, choose_field
+from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
+from progdf.rasterize import alpha_weights
+from trainer.judge import Judge
+from trainer.trajectory import Trajectory
+from trainer.views import View
+
+BASELINES = (2, 4)
+_PAYS = 0.1  # dB that an attribute must be worth to be stored
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The chosen field and what it was chosen against.
+
+    Args:
+        chosen: the field with its errors against the trajectory
+        met: whether it reaches the target
+        tried: how many fields were looked at
+        baselines: keyframe fields by name
+    """
+
+    chosen: Candidate
+    met: bool
+    tried: int
+    baselines: Mapping[str, Candidate]
+
+
+def fit_field(
+    trajectory: Trajectory, seen: Judge, judge: Judge, weights: Tensor, kind: Kind, target_psnr: float
+) -> Fitted:
+    """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target.
+
+    Args:
+        trajectory: what was recorded
+        seen: training views, on which ranks are chosen
+        judge: held-out views, which have the last word
+        weights: how visible each member is. [M]
+        kind: "auto" tries separable and keyframe fields, the others only their kind
+        target_psnr: dB; where none reaches it, the best is kept and `met` is false
+    """
+    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    ticks = tuple(float(s) for s in trajectory.s)
+    errors = FieldJudge(trajectory.s, offsets, judge.counted)
+    choice = choose_field(
+        trajectory.s, offsets, seen.counted, weights, kind, target_psnr, judge=errors, recorded=ticks
+    )
+    baselines = {
+        f"keyframes{count}": errors.candidate(
+            fit_keyframes(trajectory.s, offsets, count, ticks), f"{count} keyframes"
+        )
+        for count in BASELINES
+    }
+    return Fitted(choice.best, choice.met, len(choice.tried), baselines)
+
+
+def field_figures(candidate: Candidate) -> dict[str, Any]:
+    """A field's size and errors as report.json has them."""
+    field = candidate.field
+    return {
+        "kind": field.kind,
+        "bytes_per_gaussian": round(field.bytes_per_member, 1),
+        "parameters": stored_numbers(field),
+        "psnr_mean": round(candidate.mean, 2),
+        "psnr_worst": round(candidate.worst, 2),
+    }
+
+
+def visibility(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Tensor:
+    """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]"""
+    total = torch.zeros(len(members))
+    for view in views:
+        total += alpha_weights(scene, view.camera, torch.ones_like(view.mask))[members, 2].float()
+    return total / total.mean().clamp_min(1e-12) + 1e-3
+
+
+def without_idle_attributes(trajectory: Trajectory, judge: Judge) -> tuple[Trajectory, dict[str, float]]:
+    """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views.
+
+    Returns:
+        The trajectory (without the higher SH bands' columns if these go), and what leaving out each attribute
+        that moves would cost, dB.
+    """
+    offsets, end = trajectory.offsets, trajectory.end
+    costs: dict[str, float] = {}
+    slices = attribute_slices(end.shape[1])
+    for name in ("shN", "quats", "log_scales", "means", "logit_opacities"):
+        if name not in slices or not bool(end[:, slices[name]].any()):
+            continue
+        tried = end.clone()
+        tried[:, slices[name]] = 0.0
+        target = judge.edited[1.0]
+        cost = judge.psnr(judge.pictures(end), target) - judge.psnr(judge.pictures(tried), target)
+        costs[name] = round(cost, 3)
+        if cost < _PAYS:
+            offsets = offsets.clone()
+            offsets[:, :, slices[name]] = 0.0
+            end = tried
+    if "shN" in slices and not bool(end[:, slices["shN"]].any()):
+        offsets, end = offsets[:, :, :BASE_CHANNELS].clone(), end[:, :BASE_CHANNELS].clone()
+    if end is trajectory.end:
+        return trajectory, costs
+    return Trajectory(
+        trajectory.s, offsets, end, trajectory.steps, trajectory.stage_ends, trajectory.strengths
+    ), costs
+
+
+def stored_numbers(field: BakedField) -> int:
+    """How many numbers the field holds for all members together, coefficients included."""
+    return sum(
+        bases.full.numel() + bases.rest.numel() + bases.step.numel() + bases.coefficients.numel()
+        for bases in field.attributes.values()
+    )

@@ -1,0 +1,85 @@
+"""What training works on: the views that look at the region, and what the editor makes of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.camera_files import load_cameras
+from progdf.gaussians import Gaussians
+from progdf.region import Region
+from trainer.artefacts import RunFolder, write_views
+from trainer.crops import CropScene, crop_scene
+from trainer.editors import ImageEditor
+from trainer.options import TrainOptions
+from trainer.views import View, choose_views, fit_size, named, region_rig, split_views
+
+BACKGROUND = (1.0, 1.0, 1.0)
+_PROBES = 3
+
+Pictures = Mapping[float, Sequence[Tensor]]
+"""Strength → whole edited pictures, one per view. [H,W,3] each"""
+
+
+@dataclass(frozen=True)
+class Stand:
+    """The scene, the region, and the views on it."""
+
+    scene: Gaussians
+    region: Region
+    train: Sequence[View]
+    held_out: Sequence[View]
+    background: Tensor
+
+
+def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand:
+    """The views: the given cameras, or a rig that looks at the region."""
+    background = torch.tensor(BACKGROUND)
+    if options.cameras is not None:
+        cameras = [fit_size(camera, options.image_size) for camera in load_cameras(options.cameras)]
+    else:
+        # half as many again, as some will find the region hidden
+        cameras = region_rig(scene, region, options.views + options.views // 2, options.image_size)
+    views = choose_views(scene, region, named(cameras), options.views, background)
+    train, held_out = split_views(views, max(1, len(views) // 5))
+    return Stand(scene, region, train, held_out, background)
+
+
+def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:
+    """What the editor is asked for: its own strengths, or `stages` even ones where any will do."""
+    return editor.stages or tuple((i + 1) / stages for i in range(stages))
+
+
+def edited_views(
+    editor: ImageEditor, views: Sequence[View], strengths: Sequence[float], folder: RunFolder
+) -> dict[float, list[Tensor]]:
+    """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on."""
+    edited: dict[float, list[Tensor]] = {}
+    for strength in strengths:
+        pictures = [_eight_bits(editor.edit(view, strength)) for view in views]
+        named_pictures = {view.camera.name: p for view, p in zip(views, pictures, strict=True)}
+        write_views(folder, "edited", named_pictures, strength)
+        edited[strength] = pictures
+    return edited
+
+
+def probes(stand: Stand) -> list[CropScene]:
+    """A few training views at half size, in which movement is measured."""
+    chosen = stand.train[:: max(1, len(stand.train) // _PROBES)][:_PROBES]
+    return [
+        crop_scene(
+            stand.scene,
+            stand.region.members,
+            view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
+            (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
+            stand.background,
+        )
+        for view in chosen
+    ]
+
+
+def _eight_bits(image: Tensor) -> Tensor:
+    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
