@@ -78,7 +78,7 @@ def finished(
         measured = measure(judge, fitted, perceptual)
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
         endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
-        losses = [(int(step), float(loss)) for step, loss in about["losses"]]
+        losses = [(int(step), float(loss), float(left)) for step, loss, left in about["losses"]]
         title = f"{options['name']}: {options['editor']}"
         picture = report_picture(judge, measured, losses, title)
     report = {

@@ -90,7 +90,8 @@ class Snapshot:
         stage: index of the stage
         ends_stage: whether it is the last of its stage
         offsets: raw-space offsets of the members. [M,C] float32
-        loss: mean loss since the last recording
+        loss: mean loss towards the stage's target since the last recording
+        left: mean L1 distance from the finished edit since the last recording
     """
 
     step: int
@@ -98,10 +99,11 @@ class Snapshot:
     ends_stage: bool
     offsets: Tensor
     loss: float
+    left: float
 
 
 OnStep = Callable[[int, float], None]
-"""Called after every step with the number of steps done and a running mean of the loss."""
+"""Called after every step: steps done, running mean of the L1 distance from the finished edit."""
 
 
 def learning_rates(kind: EditKind, channels: int, extent: float) -> Tensor:
@@ -160,7 +162,7 @@ def optimise(
             crops
         )
         spacing = way * len(stages) / settings.snapshots
-        losses: list[float] = []
+        losses: list[tuple[float, float]] = []
         for local in range(stage.steps):
             if not queue:
                 queue = torch.randperm(len(crops), generator=order).tolist()
@@ -183,8 +185,9 @@ def optimise(
             decay = min(0.9, (step + 1) / (step + 10))
             average.lerp_(moved.detach(), 1.0 - decay)
             step += 1
-            running = value if math.isnan(running) else 0.95 * running + 0.05 * value
-            losses.append(value)
+            left = float(l1(image.detach(), stages[-1].targets[view]))
+            running = left if math.isnan(running) else 0.95 * running + 0.05 * left
+            losses.append((value, left))
             if on_step is not None:
                 on_step(step, running)
             last = local == stage.steps - 1
@@ -194,7 +197,8 @@ def optimise(
             pictures = render_all(probes, original + offsets)
             if last or _mean_distance(pictures, last_pictures) >= spacing:
                 last_pictures = pictures
-                yield Snapshot(step, index, last, offsets, sum(losses) / len(losses))
+                loss_mean, left_mean = torch.tensor(losses).mean(dim=0).tolist()
+                yield Snapshot(step, index, last, offsets, loss_mean, left_mean)
                 losses = []
         before = stage.targets
 

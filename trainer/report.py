@@ -26,6 +26,9 @@ _PAPER, _INK, _PALE, _GRID = (250, 249, 246), (38, 36, 34), (118, 113, 107), (22
 _LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160))
 _THUMBNAIL = 240
 
+Lines = Mapping[str, tuple[Sequence[float], Sequence[float]]]
+"""Name → xs and ys of a line."""
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -89,17 +92,17 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
 
 
 def report_picture(
-    judge: Judge, measured: Measured, losses: Sequence[tuple[int, float]], title: str
+    judge: Judge, measured: Measured, losses: Sequence[tuple[int, float, float]], title: str
 ) -> Tensor:
     """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; errors over the slider.
 
     Args:
         judge: held-out views; the one that shows most of the region is pictured
         measured: see `Measured`
-        losses: (step, loss) of the recordings; none where the edit was not trained now
+        losses: (step, loss towards the stage, L1 to the finished edit) of the recordings
         title: one line
     """
-    fitted = measured.fitted
+    fitted, slider = measured.fitted, measured.slider
     chosen, linear = fitted.chosen, fitted.baselines["keyframes2"]
     best = max(range(len(judge.pixels)), key=lambda i: int(judge.pixels[i].sum()))
     blank = torch.full((*judge.crops[best].size, 3), 0.94)
@@ -119,40 +122,31 @@ def report_picture(
         )
     )
     s = sample_strengths()
-    plots = [
-        _plot(
-            "field against the recorded trajectory, dB",
-            {
-                f"{chosen.field.kind} {chosen.field.bytes_per_member:.0f} B": (s, chosen.curve),
-                **{
-                    f"{name} {errors.field.bytes_per_member:.0f} B": (s, errors.curve)
-                    for name, errors in fitted.baselines.items()
-                },
-            },
-        ),
-        _plot(
-            "visible change along the slider",
-            {
-                "from the original": (_even(len(measured.slider.distances)), measured.slider.distances),
-                "per 1/20 step": ([(i + 0.5) / 20 for i in range(20)], measured.slider.steps),
-            },
-        ),
-    ]
+    fields = {chosen.field.kind: chosen, **fitted.baselines}
+    plots: dict[str, Lines] = {
+        "field against the recorded trajectory, dB": {
+            f"{name}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
+            for name, found in fields.items()
+        },
+        "visible change along the slider": {
+            "from the original": (_even(len(slider.distances)), slider.distances),
+            "per 1/20 step": (
+                [(i + 0.5) / len(slider.steps) for i in range(len(slider.steps))],
+                slider.steps,
+            ),
+        },
+    }
     if measured.between:
         at = list(measured.between)
-        plots.append(
-            _plot(
-                "against the editor's own picture, dB",
-                {
-                    "slider": (at, [ours for ours, _ in measured.between.values()]),
-                    "2 keyframes": (at, [plain for _, plain in measured.between.values()]),
-                },
-            )
-        )
-    if losses:
-        plots.append(
-            _plot("training loss", {"loss": ([float(t) for t, _ in losses], [x for _, x in losses])})
-        )
+        plots["against the editor's own picture, dB"] = {
+            "slider": (at, [ours for ours, _ in measured.between.values()]),
+            "2 keyframes": (at, [plain for _, plain in measured.between.values()]),
+        }
+    steps = [float(step) for step, _, _ in losses]
+    plots["training, over steps"] = {
+        "L1 to the finished edit": (steps, [left for _, _, left in losses]),
+        "loss to the stage": (steps, [loss for _, loss, _ in losses]),
+    }
     return _stacked(sheet, plots)
 
 
@@ -173,12 +167,7 @@ def _thumbnail(image: Tensor) -> Tensor:
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
 
 
-def _plot(
-    title: str,
-    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    width: int = 420,
-    height: int = 260,
-) -> Image.Image:
+def _plot(title: str, lines: Lines, width: int, height: int = 260) -> Image.Image:
     """Lines over a common axis, drawn at twice the size and scaled down for smooth edges."""
     zoom = 2
     page = Image.new("RGB", (width * zoom, height * zoom), _PAPER)
@@ -224,15 +213,14 @@ def _ticks(low: float, high: float) -> list[float]:
     return [round(i * step, 10) for i in range(first, last + 1)]
 
 
-def _stacked(sheet: Image.Image, plots: Sequence[Image.Image]) -> Tensor:
+def _stacked(sheet: Image.Image, plots: Mapping[str, Lines]) -> Tensor:
     """The sheet with the plots in rows below it."""
-    columns = max(1, min(len(plots), sheet.width // plots[0].width)) if plots else 1
-    rows = -(-len(plots) // columns)
-    width = max(sheet.width, columns * (plots[0].width if plots else 0))
-    page = Image.new("RGB", (width, sheet.height + rows * (plots[0].height if plots else 0) + 8), _PAPER)
+    columns = 3 if len(plots) % 2 else 2
+    width = sheet.width // columns
+    drawn = [_plot(title, lines, width) for title, lines in plots.items()]
+    rows = -(-len(drawn) // columns)
+    page = Image.new("RGB", (sheet.width, sheet.height + rows * drawn[0].height + 8), _PAPER)
     page.paste(sheet, (0, 0))
-    for i, plot in enumerate(plots):
-        spare = (width - columns * plot.width) // (columns + 1)
-        x = spare + (i % columns) * (plot.width + spare)
-        page.paste(plot, (x, sheet.height + (i // columns) * plot.height))
+    for i, plot in enumerate(drawn):
+        page.paste(plot, ((i % columns) * width, sheet.height + (i // columns) * plot.height))
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)

@@ -196,8 +196,8 @@ def _optimised(
     kind: EditKind,
     perceptual: Perceptual,
     log: RunLog,
-) -> tuple[Trajectory, list[tuple[int, float]]]:
-    """PGS over the training views: the trajectory, even in time, and (step, loss) of its recordings."""
+) -> tuple[Trajectory, list[tuple[int, float, float]]]:
+    """PGS over the training views: the trajectory, even in time, and (step, loss to the stage, L1 to the finished edit) of its recordings."""
     scene, members = stand.scene, stand.region.members
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     crops = [crop_scene(scene, members, v.camera, v.box, stand.background) for v in stand.train]
@@ -213,7 +213,7 @@ def _optimised(
         seed=options.seed,
     )
     snapshots: list[tuple[int, int, bool, Tensor]] = []
-    losses: list[tuple[int, float]] = []
+    losses: list[tuple[int, float, float]] = []
     with log.steps("optimise", sum(stage.steps for stage in stages)) as advance:
         try:
             for found in optimise(
@@ -223,16 +223,16 @@ def _optimised(
                 stages,
                 perceptual,
                 settings,
-                lambda step, loss: advance(step, f"loss {loss:.4f}"),
+                lambda step, left: advance(step, f"loss to the edit {left:.4f}"),
             ):
                 snapshots.append((found.step, found.stage, found.ends_stage, found.offsets.half()))
-                losses.append((found.step, round(found.loss, 5)))
+                losses.append((found.step, round(found.loss, 5), round(found.left, 5)))
                 end = found.offsets
         except FloatingPointError as error:
             raise ProgdfError(
                 f"training broke down: {error}; check the edited views, or try --kind style"
             ) from error
-    log.say(f"loss {losses[0][1]:.4f} at step {losses[0][0]}, {losses[-1][1]:.4f} at step {losses[-1][0]}")
+    log.say(f"L1 to the finished edit: {losses[0][2]:.4f} at first, {losses[-1][2]:.4f} at the end")
     return record(snapshots, end, list(edited)), losses
 
 
