@@ -191,6 +191,19 @@ def test_escape_leaves_the_typed_value_out(hand: Hand) -> None:
     assert hand.strengths[0] == 0.5
 
 
+def test_looking_at_a_value_without_changing_it_does_not_round_it() -> None:
+    view = ViewState(layers=(LayerState(0, "scarf", 0.123456),))
+    hand = hand_on(view)
+    hand.click(SIZE[0] - 40, EYES[0])
+    hand.frame()
+    assert imgui.get_io().want_text_input
+    hand.click(LEFT + 150, 500)
+    hand.frame()
+    assert not imgui.get_io().want_text_input
+    assert hand.work.view == view
+    hand.ui.close()
+
+
 def test_a_click_on_the_number_types_a_value(hand: Hand) -> None:
     hand.click(SIZE[0] - 40, EYES[1])
     hand.frame()

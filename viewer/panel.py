@@ -144,6 +144,8 @@ def _layer(
     """One card: eye, swatch, name and value; the slider; count and instruction."""
     scale, p = ui.scale, PALETTE
     imgui.push_id(index)
+    canvas = imgui.get_window_draw_list()
+    clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
     imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*(p.card_focused if focused else p.card)))
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * scale, 8 * scale))
     child = imgui.ChildFlags_
@@ -168,15 +170,22 @@ def _layer(
     note = f"{grouped(row.count)} splats" + (f"  ·  {row.instruction}" if row.instruction else "")
     _small(note, p.dim)
     pressed = imgui.is_window_hovered() and imgui.is_mouse_clicked(imgui.MouseButton_.left.value)
-    corner, size = imgui.get_window_pos(), imgui.get_window_size()
-    imgui.end_child()
     if focused:
-        edge = imgui.ImVec2(corner.x + 3 * scale, corner.y + size.y)
-        imgui.get_window_draw_list().add_rect_filled(corner, edge, u32(p.accent), 3 * scale)
+        _focus_bar(clip, scale)
+    imgui.end_child()
     imgui.pop_style_var()
     imgui.pop_style_color()
     imgui.pop_id()
     return layer, touched or pressed
+
+
+def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], scale: float) -> None:
+    """A stripe along the left edge of the card that is being drawn, in the panel's clip."""
+    canvas, corner = imgui.get_window_draw_list(), imgui.get_window_pos()
+    edge = imgui.ImVec2(corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
+    canvas.push_clip_rect(*clip, False)
+    canvas.add_rect_filled(corner, edge, u32(PALETTE.accent), 3 * scale)
+    canvas.pop_clip_rect()
 
 
 def _layer_head(layer: LayerState, row: LayerRow, ui: UiContext) -> LayerState:
