@@ -10,9 +10,11 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from viewer import controls, turntable
-from viewer.state import Vec3, ViewCamera
+from viewer import controls, turntable, workspace
+from viewer.layer_rows import LayerRow
+from viewer.state import LayerState, Vec3, ViewCamera, ViewState
 from viewer.turntable import Bounds, axes, cross, dot, eye, to_camera
+from viewer.workspace import SceneFacts
 
 AXES: tuple[Vec3, ...] = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0))
 RADII = st.sampled_from([1e-3, 0.1, 1.0, 30.0, 1e4])
@@ -211,6 +213,17 @@ def test_no_key_is_bound_twice_and_none_is_also_a_flight_key() -> None:
     chords = [key.chord for key in controls.KEYS]
     assert len(chords) == len(set(chords))
     assert not set(chords) & set(controls.FLY_KEYS)
+
+
+def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
+    row = LayerRow(3, (0.5, 0.5, 0.5), (), "", Bounds())
+    facts = SceneFacts("bear.ply", 3, Bounds(), (row,))
+    for layers in ((), (LayerState(0, "scarf", 0.5),)):
+        work = workspace.opened(ViewState(layers=layers))
+        for key in controls.KEYS:
+            after = workspace.perform(work, key.action, facts)
+            assert usable(after.view.camera)
+            assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)
 
 
 def test_toggling_fly_does_not_move_the_picture() -> None:
