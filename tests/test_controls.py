@@ -1,4 +1,4 @@
-"""The camera never breaks, whatever the hand does; a move can be taken back; the table of bindings is whole."""
+"""The camera never breaks, whatever the hand does; moves can be taken back; the bindings are whole."""
 
 from __future__ import annotations
 
