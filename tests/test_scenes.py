@@ -13,7 +13,8 @@ from progdf.colour import typical_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.rasterize import render
-from progdf.scenes import surface
+from progdf.scenes import bear_paint, surface
+from progdf.scenes.assemble import assemble
 from progdf.scenes.bear_parts import bear_parts
 from progdf.sh import sh0_to_rgb
 
@@ -46,6 +47,34 @@ def test_making_a_bear_leaves_torch_as_it_was() -> None:
     scenes.bear(scenes.SMALLEST)
     assert torch.equal(before, torch.get_rng_state())
     assert torch.get_num_threads() == threads
+
+
+def test_a_room_has_its_size_and_all_its_things_and_is_seeded() -> None:
+    scene = scenes.room(2503)
+    assert len(scene.gaussians) == 2503
+    assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
+    assert _same(scene.gaussians, scenes.room(2503).gaussians)
+    with pytest.raises(ProgdfError, match="too few for a room; at least"):
+        scenes.room(scenes.SMALLEST_ROOM - 1)
+
+
+def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
+    scene = scenes.room(6000)
+    for camera in scene.cameras:
+        x, y, z = camera.position.tolist()
+        assert max(abs(x), abs(z)) < 1.9
+        assert 0.9 < y < 2.0
+    camera = scene.cameras[5].resized(96, 72)
+    red, green = (render(scene.gaussians, camera, background=c) for c in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    # closed on all sides: next to nothing of the background is left
+    assert float((red - green).abs().mean()) < 0.02
+
+
+def test_a_part_that_lies_inside_another_is_reported_not_searched_for() -> None:
+    outer = surface.Part("outer", "x", surface.ball(), torch.zeros(3), torch.eye(3))
+    inner = surface.Part("inner", "x", surface.ball(), torch.zeros(3), 0.1 * torch.eye(3))
+    with pytest.raises(ValueError, match="lies inside other parts; move it"):
+        assemble([outer, inner], ("x",), bear_paint.paint, 500, 0)
 
 
 def test_too_few_gaussians_for_a_bear_are_refused() -> None:
@@ -111,7 +140,10 @@ def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
     assert 25 < float(dark[0]) < 60  # eyes and nose: the darkest of the picture, in its upper half
 
 
-@pytest.mark.parametrize("shape", [surface.ball(), surface.ball(5.0), surface.ring(0.3)])
+@pytest.mark.parametrize(
+    "shape",
+    [surface.ball(), surface.ball(5.0), surface.ring(0.3), surface.lathe((0.5, 1.0, 0.3), (1.0, 0.2, -1.0))],
+)
 def test_samples_lie_on_the_surface_and_their_normals_point_out(shape: surface.Shape) -> None:
     matrix = torch.tensor([[0.5, 0.1, 0.0], [0.0, 0.8, 0.0], [0.1, 0.0, 0.3]])
     part = surface.Part("x", "x", shape, torch.tensor([1.0, 2.0, 3.0]), matrix)

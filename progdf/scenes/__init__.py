@@ -5,9 +5,11 @@ from __future__ import annotations
 from progdf.scenes.assemble import DemoScene
 from progdf.scenes.bear import SMALLEST, bear
 from progdf.scenes.edits import AnalyticEdit, bear_edits, darkened, grown, recolored, striped, swung
+from progdf.scenes.room import SMALLEST_ROOM, room
 
 __all__ = [
     "SMALLEST",
+    "SMALLEST_ROOM",
     "AnalyticEdit",
     "DemoScene",
     "bear",
@@ -15,6 +17,7 @@ __all__ = [
     "darkened",
     "grown",
     "recolored",
+    "room",
     "striped",
     "swung",
 ]

@@ -13,13 +13,14 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
-from progdf.scenes.light import develop, irradiance, linear_from_srgb, sheen
+from progdf.scenes.light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, sheen
 from progdf.scenes.noise import lattice
 from progdf.scenes.paint import Paint, Painter
 from progdf.scenes.surface import Part, Samples, sample
 from progdf.sh import rgb_to_sh0
 
 _PROBES = 600
+_MOST_DRAWN = 10_000  # per Gaussian kept; a part of which less shows is misplaced
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,12 @@ class DemoScene:
 
 
 def assemble(
-    parts: Sequence[Part], label_names: tuple[str, ...], paint: Painter, size: int, seed: int
+    parts: Sequence[Part],
+    label_names: tuple[str, ...],
+    paint: Painter,
+    size: int,
+    seed: int,
+    daylight: Daylight = OUTDOORS,
 ) -> tuple[Gaussians, Tensor]:
     """Exactly `size` Gaussians on the visible surfaces of `parts`, and their labels [N] uint8; seeded."""
     random = torch.Generator().manual_seed(seed)
@@ -63,7 +69,7 @@ def assemble(
         counts, shown = _budget(parts, size)
         for part, count, share in zip(parts, counts, shown, strict=True):
             at = _visible(parts, part, count, share, random)
-            pieces.append(_clothe(parts, part, at, paint(part, at, table), random))
+            pieces.append(_clothe(parts, part, at, paint(part, at, table), daylight, random))
             labels.append(torch.full((count,), label_names.index(part.label), dtype=torch.uint8))
     return _joined(pieces), torch.cat(labels)
 
@@ -115,13 +121,15 @@ def _visible(parts: Sequence[Part], part: Part, count: int, share: float, random
         kept = _is_shown(parts, part, at).nonzero()[:, 0]
         if len(kept) >= count:
             break
+        if drawn > _MOST_DRAWN * count:
+            raise ValueError(f"{part.name} at {part.centre.tolist()} lies inside other parts; move it")
         drawn = max(drawn + 1, math.ceil(1.01 * drawn * count / max(len(kept), 1)))
     chosen = torch.randperm(len(kept), generator=random)[:count].sort().values
     return at[kept[chosen]]
 
 
 def _clothe(
-    parts: Sequence[Part], part: Part, at: Samples, coat: Paint, random: torch.Generator
+    parts: Sequence[Part], part: Part, at: Samples, coat: Paint, daylight: Daylight, random: torch.Generator
 ) -> Gaussians:
     """Light and shape the painted Gaussians of one part."""
     n = len(at)
@@ -130,7 +138,9 @@ def _clothe(
     leaning = leaning / leaning.norm(dim=1, keepdim=True)
     stands = (torch.rand(n, generator=random) < coat.pelt.standing).float()
     albedo = linear_from_srgb((coat.color * (1 + 0.05 * grain + 0.10 * stands)[:, None]).clamp(0, 1))
-    color = coat.color if coat.glows else develop(albedo * irradiance(at.points, leaning, parts, part))
+    color = (
+        coat.color if coat.glows else develop(albedo * irradiance(at.points, leaning, parts, part, daylight))
+    )
     glow, band = sheen(at.normals, coat.velvet, coat.gloss, 0.35 + 0.65 * color)
     means, quats, log_scales = _lay(at, coat, stands, random)
     opacity = 0.97 - 0.10 * torch.rand(n, generator=random) - 0.25 * stands

@@ -26,7 +26,7 @@ def turned(degrees: Triple) -> Tensor:
     return matrix
 
 
-def _ellipsoid(
+def ellipsoid(
     name: str,
     label: str,
     centre: Triple,
@@ -37,6 +37,7 @@ def _ellipsoid(
     casts_shadow: bool = True,
     clears: float = 0.0,
 ) -> Part:
+    """An ellipsoid of these radii, turned by degrees about x, then y, then z; see `Part` for the rest."""
     matrix = turned(turn) @ torch.diag(torch.tensor(radii))
     return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow, clears)
 
@@ -51,7 +52,7 @@ def _detail(
     clears: float = 0.16,
 ) -> Part:
     """A small part drawn finely, with no fur over it and no shadow of its own."""
-    return _ellipsoid(name, label, centre, radii, turn, weight, casts_shadow=False, clears=clears)
+    return ellipsoid(name, label, centre, radii, turn, weight, casts_shadow=False, clears=clears)
 
 
 def _eye(x: float) -> list[Part]:
@@ -92,8 +93,8 @@ def _pair(
     x, y, z = centre
     mirrored = (turn[0], -turn[1], -turn[2])
     return [
-        _ellipsoid(name, label, (x, y, z), radii, turn, weight),
-        _ellipsoid(name, label, (-x, y, z), radii, mirrored, weight),
+        ellipsoid(name, label, (x, y, z), radii, turn, weight),
+        ellipsoid(name, label, (-x, y, z), radii, mirrored, weight),
     ]
 
 
@@ -101,10 +102,10 @@ def bear_parts() -> list[Part]:
     """Every part of the scene, the bear first, the lawn last."""
     feet = _pair("foot", "legs", (0.355, 0.235, 0.80), (0.195, 0.235, 0.115), (-12, 16, 0), weight=1.3)
     return [
-        _ellipsoid("body", "body", (0.0, 0.57, 0.0), (0.50, 0.60, 0.45)),
-        _ellipsoid("tail", "body", (0.0, 0.17, -0.44), (0.13, 0.13, 0.13)),
-        _ellipsoid("head", "head", (0.0, 1.47, 0.05), (0.47, 0.415, 0.42), weight=1.5),
-        _ellipsoid("muzzle", "head", (0.0, 1.365, 0.40), (0.215, 0.165, 0.19), weight=2.2),
+        ellipsoid("body", "body", (0.0, 0.57, 0.0), (0.50, 0.60, 0.45)),
+        ellipsoid("tail", "body", (0.0, 0.17, -0.44), (0.13, 0.13, 0.13)),
+        ellipsoid("head", "head", (0.0, 1.47, 0.05), (0.47, 0.415, 0.42), weight=1.5),
+        ellipsoid("muzzle", "head", (0.0, 1.365, 0.40), (0.215, 0.165, 0.19), weight=2.2),
         _detail("nose", "head", (0.0, 1.44, 0.575), (0.085, 0.060, 0.055)),
         _detail("mouth", "head", (0.0, 1.345, 0.588), (0.011, 0.052, 0.018)),
         _detail("mouth", "head", (0.05, 1.292, 0.568), (0.056, 0.011, 0.020), (0, 20, 26)),
@@ -125,14 +126,10 @@ def bear_parts() -> list[Part]:
             weight=3.5,
             casts_shadow=False,
         ),
-        _ellipsoid("knot", "scarf", (0.13, 1.035, 0.405), (0.085, 0.075, 0.06), (0, 0, -15), 3.5, 2.6, False),
-        _ellipsoid(
-            "end", "scarf", (0.205, 0.825, 0.437), (0.088, 0.235, 0.027), (10, 8, 14), 3.5, 5.0, False
-        ),
-        _ellipsoid(
-            "end", "scarf", (0.075, 0.845, 0.462), (0.088, 0.200, 0.027), (10, 2, -8), 3.5, 5.0, False
-        ),
-        _ellipsoid("plinth", "plinth", (0.0, -0.15, 0.20), (1.20, 0.16, 1.20), exponent=7.0, weight=0.55),
+        ellipsoid("knot", "scarf", (0.13, 1.035, 0.405), (0.085, 0.075, 0.06), (0, 0, -15), 3.5, 2.6, False),
+        ellipsoid("end", "scarf", (0.205, 0.825, 0.437), (0.088, 0.235, 0.027), (10, 8, 14), 3.5, 5.0, False),
+        ellipsoid("end", "scarf", (0.075, 0.845, 0.462), (0.088, 0.200, 0.027), (10, 2, -8), 3.5, 5.0, False),
+        ellipsoid("plinth", "plinth", (0.0, -0.15, 0.20), (1.20, 0.16, 1.20), exponent=7.0, weight=0.55),
         Part(
             "grass",
             "grass",

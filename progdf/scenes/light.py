@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +12,22 @@ from torch import Tensor
 from progdf.scenes.surface import Part
 
 _SH_C1 = math.sqrt(3 / (4 * math.pi))
+
+
+@dataclass(frozen=True)
+class Daylight:
+    """How much light there is.
+
+    Args:
+        sun: [N,3] points -> [N], the share of the key light that comes in, 0..1; None is all of it
+        fill: strength of the light from all around
+    """
+
+    sun: Callable[[Tensor], Tensor] | None = None
+    fill: float = 1.0
+
+
+OUTDOORS = Daylight()
 
 
 @dataclass(frozen=True)
@@ -33,11 +49,13 @@ SKY = torch.tensor([0.60, 0.72, 0.95])
 GROUND = torch.tensor([0.20, 0.24, 0.12])
 
 
-def irradiance(points: Tensor, normals: Tensor, parts: Sequence[Part], own: Part) -> Tensor:
-    """Linear light that falls on each point. [N,3], [N,3] -> [N,3]"""
+def irradiance(
+    points: Tensor, normals: Tensor, parts: Sequence[Part], own: Part, daylight: Daylight = OUTDOORS
+) -> Tensor:
+    """Linear light that falls on each point of the part `own`. [N,3], [N,3] -> [N,3]"""
     others = [part for part in parts if part is not own]
     open_sky = torch.ones(len(points))
-    lit = torch.ones(len(points))
+    lit = torch.ones(len(points)) if daylight.sun is None else daylight.sun(points)
     for part in others:
         local = part.to_local(points)
         open_sky = open_sky * (1 - _occlusion(points, normals, local, part))
@@ -45,7 +63,7 @@ def irradiance(points: Tensor, normals: Tensor, parts: Sequence[Part], own: Part
             lit = lit * _unshadowed(local, part)
     facing = _wrapped(normals @ KEY.direction, 0.18)
     up = 0.5 + 0.5 * normals[:, 1:2]
-    ambient = SKY * up + GROUND * (1 - up)
+    ambient = daylight.fill * (SKY * up + GROUND * (1 - up))
     return (
         KEY.color * (facing * lit * (0.4 + 0.6 * open_sky))[:, None]
         + RIM.color * _wrapped(normals @ RIM.direction, 0.3)[:, None] * open_sky[:, None]

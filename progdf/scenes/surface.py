@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,13 +19,14 @@ class Shape:
     """A surface of revolution about the local y axis.
 
     Args:
-        profile: radius and height along the curve that turns, the outside on the left hand. [P,2]
+        profile: radius and height along the curve that turns, the outside on the left hand; None is the flat
+            square x, z in −1..1 that faces up. [P,2]
         level: [N,3] local points -> [N]: below 1 inside, 1 on the surface, above 1 outside
         nearest: [N,3] local points -> [N,3] a point of the surface close to each
         girth: how thick the body is, as a share of its radius
     """
 
-    profile: Tensor
+    profile: Tensor | None
     level: Callable[[Tensor], Tensor]
     nearest: Callable[[Tensor], Tensor]
     girth: float = 1.0
@@ -81,6 +82,49 @@ def dome(drop: float) -> Shape:
     return Shape(curve, level, nearest)
 
 
+def lathe(radii: Sequence[float], heights: Sequence[float]) -> Shape:
+    """A turned body: radii at descending heights, straight between them, closed at both ends."""
+    outline = torch.tensor([[0.0, heights[0]], *zip(radii, heights, strict=True), [0.0, heights[-1]]])
+    lengths = (outline[1:] - outline[:-1]).norm(dim=1)
+    at = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    places = torch.linspace(0, float(at[-1]), _STEPS)
+    index = (torch.searchsorted(at, places) - 1).clamp(0, len(lengths) - 1)
+    curve = torch.lerp(outline[index], outline[index + 1], ((places - at[index]) / lengths[index])[:, None])
+    rising, radius = torch.tensor(heights).flip(0), torch.tensor(radii).flip(0)
+
+    middle, half = (heights[0] + heights[-1]) / 2, (heights[0] - heights[-1]) / 2
+
+    def width(local: Tensor) -> Tensor:
+        above = torch.searchsorted(rising, local[:, 1].contiguous()).clamp(1, len(rising) - 1)
+        share = ((local[:, 1] - rising[above - 1]) / (rising[above] - rising[above - 1])).clamp(0, 1)
+        return torch.lerp(radius[above - 1], radius[above], share)
+
+    def level(local: Tensor) -> Tensor:
+        across = torch.hypot(local[:, 0], local[:, 2]) / width(local)
+        return torch.maximum(across, (local[:, 1] - middle).abs() / half)
+
+    def nearest(local: Tensor) -> Tensor:
+        out = width(local) / torch.hypot(local[:, 0], local[:, 2]).clamp_min(1e-6)
+        return torch.stack(
+            [local[:, 0] * out, local[:, 1].clamp(heights[-1], heights[0]), local[:, 2] * out], 1
+        )
+
+    return Shape(curve, level, nearest)
+
+
+def panel() -> Shape:
+    """A flat square, x and z in −1..1, that faces up; what lies behind it is inside."""
+
+    def level(local: Tensor) -> Tensor:
+        beside = (local[:, 0].abs() >= 1) | (local[:, 2].abs() >= 1)
+        return torch.where(beside & (local[:, 1] < 0), 2.0, 1 + local[:, 1])
+
+    def nearest(local: Tensor) -> Tensor:
+        return torch.stack([local[:, 0].clamp(-1, 1), torch.zeros(len(local)), local[:, 2].clamp(-1, 1)], 1)
+
+    return Shape(None, level, nearest)
+
+
 @dataclass(frozen=True)
 class Part:
     """A shape placed in the world.
@@ -124,11 +168,14 @@ class Part:
 
     def touches(self, other: Part) -> bool:
         """Whether the spheres around the two parts meet."""
-        reach = [
-            float(part.matrix.norm(dim=0).max() * part.shape.profile.norm(dim=1).max())
-            for part in (self, other)
-        ]
-        return float((self.centre - other.centre).norm()) < sum(reach)
+        return float((self.centre - other.centre).norm()) < self.reach + other.reach
+
+    @property
+    def reach(self) -> float:
+        """Radius of a sphere about the centre that holds the part, world units."""
+        profile = self.shape.profile
+        farthest = math.sqrt(2) if profile is None else float(profile.norm(dim=1).max())
+        return farthest * float(self.matrix.norm(dim=0).max())
 
 
 @dataclass(frozen=True)
@@ -157,6 +204,8 @@ class Samples:
 def sample(part: Part, count: int) -> Samples:
     """`count` points on the part, a Fibonacci spiral spaced evenly by (weighted) world area."""
     profile = part.shape.profile
+    if profile is None:
+        return _sample_panel(part, count)
     step = profile[1:] - profile[:-1]
     middle = 0.5 * (profile[1:] + profile[:-1])
     turns = torch.arange(_TURNS) * (2 * math.pi / _TURNS)
@@ -186,6 +235,22 @@ def sample(part: Part, count: int) -> Samples:
         local,
         normals / normals.norm(dim=1, keepdim=True),
         cell.sqrt(),
+    )
+
+
+def _sample_panel(part: Part, count: int) -> Samples:
+    """`sample` of a flat square: a lattice of two irrational steps (Roberts 2018, the R2 sequence)."""
+    index = torch.arange(1, count + 1, dtype=torch.float64)[:, None]
+    shares = (0.5 + index * torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)) % 1.0
+    spot = (2 * shares - 1).float()
+    local = torch.stack([spot[:, 0], torch.zeros(count), spot[:, 1]], dim=1)
+    normal = torch.linalg.cross(part.matrix[:, 2], part.matrix[:, 0])
+    area = float(4 * normal.norm())
+    return Samples(
+        local @ part.matrix.T + part.centre,
+        local,
+        (normal / normal.norm()).expand(count, 3),
+        torch.full((count,), math.sqrt(area / count)),
     )
 
 
