@@ -1,0 +1,228 @@
+"""The whole job: `progdf train` and `progdf fit` on a small bear."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import trainer.run
+from progdf.checkpoint import load_gdf
+from progdf.compose import Layer, compose
+from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES, pack
+from progdf.ply import load_ply
+from tests.trained import quick_options, write_bear
+from trainer import cli
+from trainer.options import FitOptions, settled
+from trainer.run import RunResult, refit, train
+from trainer.trajectory import load_trajectory
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small bear."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def done(folder: Path) -> RunResult:
+    """A finished run of a few seconds, shared by the tests that only look."""
+    return train(quick_options(folder), quiet=True)
+
+
+def test_training_lowers_the_loss_and_reaches_held_out_views(done: RunResult) -> None:
+    about = json.loads(json.dumps(done.report))
+    _, _, recorded = load_trajectory(done.folder.trajectory)
+    losses = [left for _, _, left in recorded["losses"]]
+    assert losses[-1] < 0.3 * losses[0]
+    assert about["edit"]["psnr_to_views"] > 28.0
+
+
+def test_the_slider_is_nearer_to_the_editor_than_two_keyframes(done: RunResult) -> None:
+    for strength in ("0.25", "0.5", "0.75"):
+        between = done.report["between"][strength]
+        assert between["psnr"] > between["keyframes2"] + 4.0, strength
+
+
+def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_exactly_the_recorded_end(
+    folder: Path, done: RunResult
+) -> None:
+    scene = load_ply(folder / "scene.ply")
+    gdf = load_gdf(done.gdf, scene)
+    at_zero = compose(scene, [Layer(gdf, 0.0)])
+    assert all(torch.equal(getattr(at_zero, name), getattr(scene, name)) for name in ATTRIBUTES)
+    trajectory, extra, _ = load_trajectory(done.folder.trajectory)
+    members = extra["members"]
+    with_sh = trajectory.end.shape[1] > 14
+    recorded = pack(scene[members], with_shN=with_sh) + trajectory.end
+    at_one = compose(scene, [Layer(gdf, 1.0)])
+    assert torch.equal(pack(at_one[members], with_shN=with_sh), recorded)
+    assert done.report["field"]["endpoint_error"] == 0.0
+
+
+def test_rows_outside_the_region_are_byte_identical_at_any_strength(folder: Path, done: RunResult) -> None:
+    scene = load_ply(folder / "scene.ply")
+    gdf = load_gdf(done.gdf, scene)
+    outside = torch.ones(len(scene), dtype=torch.bool)
+    outside[gdf.region.members] = False
+    for strength in (0.1, 0.5, 1.0):
+        edited = compose(scene, [Layer(gdf, strength)])
+        for name in ATTRIBUTES:
+            assert torch.equal(getattr(edited, name)[outside], getattr(scene, name)[outside])
+    assert done.report["field"]["outside_change"] == 0.0
+
+
+def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
+    report = json.loads(done.folder.report.read_text(encoding="utf-8"))
+    expected = {
+        "field": {"kind", "bytes_per_gaussian", "parameters", "psnr_mean", "psnr_worst", "endpoint_error"},
+        "baselines": {"keyframes2", "keyframes4"},
+        "slider": {"monotone", "uniformity", "largest_jump", "t50", "t90"},
+        "between": {"0.25", "0.5", "0.75"},
+        "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
+        "time": {"views", "edit", "optimise", "fit", "total"},
+        "options": {"scene", "editor", "seed"},
+    }
+    for part, keys in expected.items():
+        assert keys <= set(report[part]), part
+    assert report["memory_mb"] > 0
+    assert report["field"]["psnr_worst"] >= 40.0
+    assert set(report["baselines"]["keyframes2"]) >= {"psnr_mean", "psnr_worst", "bytes_per_gaussian"}
+
+
+def test_every_view_is_kept_before_and_after(done: RunResult) -> None:
+    views = done.folder.root / "views"
+    names = {path.name for path in (views / "original").glob("*.png")}
+    assert len(names) == 10
+    for kind in ("edited", "edited/0.25", "edited/0.5", "edited/0.75", "mask", "final"):
+        assert {path.name for path in (views / kind).glob("*.png")} == names, kind
+    with Image.open(done.folder.picture) as picture:
+        assert picture.width > 600
+
+
+def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
+    folder: Path, done: RunResult
+) -> None:
+    options = quick_options(
+        folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="colour"
+    )
+    result = train(options, quiet=True)
+    assert result.report["edit"]["psnr_to_views"] > 28.0
+    assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}
+
+
+def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
+    options = quick_options(folder, "twice", steps=24, stages=2)
+    digests = []
+    for _ in range(2):
+        result = train(options, quiet=True)
+        trajectory, _, _ = load_trajectory(result.folder.trajectory)
+        digests.append(hashlib.sha256(trajectory.offsets.numpy().tobytes()).hexdigest())
+    assert digests[0] == digests[1]
+
+
+def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
+    result = train(quick_options(folder, "refit", steps=24, stages=2), quiet=True)
+    before = result.folder.trajectory.read_bytes()
+    again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
+    assert again.report["field"]["kind"] == "keyframes"
+    assert load_gdf(again.gdf).field.kind == "keyframes"
+    assert result.folder.trajectory.read_bytes() == before
+    assert again.report["edit"] == result.report["edit"]
+    assert again.report["time"]["optimise"] == result.report["time"]["optimise"]
+
+
+def test_an_interrupted_run_leaves_the_earlier_edit_whole(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = quick_options(folder, "interrupted", steps=24, stages=2)
+    first = train(options, quiet=True)
+    kept = first.gdf.read_bytes()
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer.run, "optimise", interrupt)
+    with pytest.raises(KeyboardInterrupt, match="run the command again"):
+        train(options, quiet=True)
+    assert first.gdf.read_bytes() == kept
+    assert not [path for path in first.folder.root.rglob("*") if path.name.startswith(".")]
+
+
+def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
+    folder: Path, done: RunResult, tmp_path: Path
+) -> None:
+    (tmp_path / "thesis.txt").write_text("important")
+    with pytest.raises(ProgdfError, match="not empty"):
+        train(replace(quick_options(folder), out=tmp_path), quiet=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+    kept = done.gdf.read_bytes()
+    with pytest.raises(ProgdfError, match="another editor"):
+        train(quick_options(folder, editor="darken:0.5"), quiet=True)
+    assert done.gdf.read_bytes() == kept
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "nowhere.ply --out r --region all --editor night",
+        "{scene} --out r --region labels:{labels}:99 --editor night",
+        "{scene} --out r --region all --editor paint:#fff",
+        "{scene} --out r --region all --editor recolor:blue",
+        "{scene} --out r --region all --editor night --views 2",
+        "{scene} --out r --region all --editor night --steps 3",
+        "{scene} --out r --region all --editor night --steps many",
+        "{scene} --out r --region all --editor night --image-size 0",
+        "{scene} --out r --region all --editor night --name a/b",
+        "{scene} --out r --region all --editor night --cameras nowhere.json",
+        "{scene} --out {scene} --region all --editor night",
+        "{scene} --out r --region all --editor night --colour blue",
+        "{scene} --out r --region all",
+        "--out r",
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_no_edit(folder: Path, tmp_path: Path, arguments: str) -> None:
+    words = arguments.format(scene=folder / "scene.ply", labels=folder / "labels.npy").split()
+    words = [str(tmp_path / "r") if word == "r" else word for word in words]
+    with pytest.raises(ProgdfError, match="; ") as told:
+        cli.train(words)
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.rglob("*.gdf"))
+
+
+def test_fitting_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="progdf train"):
+        cli.fit([str(tmp_path)])
+
+
+def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
+    words = (
+        f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
+    )
+    options = settled(cli.parsed(trainer.options.TrainOptions, words, "progdf train"))
+    assert (options.seed, options.slider, options.steps, options.views, options.name) == (
+        7,
+        "even",
+        240,
+        12,
+        "r",
+    )
+
+
+def test_one_member_in_one_view_is_enough(folder: Path) -> None:
+    labels = np.zeros(1500, dtype=np.uint8)
+    scene = load_ply(folder / "scene.ply")
+    labels[int(scene.means[:, 1].argmax())] = 1
+    np.save(folder / "one.npy", labels)
+    options = quick_options(folder, "one", steps=8, stages=1, views=5)
+    result = train(replace(options, region=f"labels:{folder / 'one.npy'}:1"), quiet=True)
+    assert load_gdf(result.gdf).field.members == 1
