@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from imgui_bundle import imgui
-from ui_rig import bear, first_view, rig
+from ui_rig import Rig, bear, first_view, rig
 
 from progdf.errors import ProgdfError
+from viewer import panel
+from viewer.engine import FrameTimings
 from viewer.headless import headless_context, is_software
 from viewer.inputs import Keys
 from viewer.state import LayerState, ViewState
@@ -51,6 +53,10 @@ def crowded() -> ViewState:
     return replace(first_view(bear()), layers=layers)
 
 
+def the_panel(hand: Rig) -> np.ndarray:
+    return hand.image()[:, -round(panel.WIDTH_PX) :]
+
+
 def test_the_window_at_its_smallest(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         screenshot("ui_main", hand.image())
@@ -73,10 +79,10 @@ def test_a_scaled_desktop_shows_the_same_as_a_dense_screen() -> None:
 
 def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
     with rig(crowded(), SMALLEST) as hand:
-        screenshot("ui_crowded", hand.image())
+        screenshot("ui_crowded", the_panel(hand))
         hand.wheel(900.0, 300.0, -100.0)
         hand.frame(20)
-        screenshot("ui_crowded_scrolled", hand.image())
+        screenshot("ui_crowded_scrolled", the_panel(hand))
 
 
 def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
@@ -103,4 +109,13 @@ def test_a_value_being_typed(screenshot: Compare) -> None:
         hand.release()
         hand.modifier(imgui.Key.mod_ctrl, False)
         hand.frame(3)
-        screenshot("ui_typing", hand.image())
+        screenshot("ui_typing", the_panel(hand))
+
+
+def test_the_timings_of_a_picture(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.key("F10")
+        hand.stage.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500)
+        hand.stage.latencies_ms.extend([20.0, 21.0, 34.0])
+        hand.frame()
+        screenshot("ui_timings", hand.image()[:180, :240])
