@@ -40,11 +40,10 @@ def done(folder: Path) -> RunResult:
 
 
 def test_training_lowers_the_loss_and_reaches_held_out_views(done: RunResult) -> None:
-    about = json.loads(json.dumps(done.report))
     _, _, recorded = load_trajectory(done.folder.trajectory)
     losses = [left for _, _, left in recorded["losses"]]
-    assert losses[-1] < 0.3 * losses[0]
-    assert about["edit"]["psnr_to_views"] > 28.0
+    assert losses[-1] < 0.2 * sum(losses[:3]) / 3
+    assert done.report["edit"]["psnr_to_views"] > 32.0  # 35.8 when written; 16 before the edit
 
 
 def test_the_slider_is_nearer_to_the_editor_than_two_keyframes(done: RunResult) -> None:
@@ -116,7 +115,7 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
         folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="colour"
     )
     result = train(options, quiet=True)
-    assert result.report["edit"]["psnr_to_views"] > 28.0
+    assert result.report["edit"]["psnr_to_views"] > 32.0
     assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}
 
 
@@ -131,7 +130,7 @@ def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
 
 
 def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
-    result = train(quick_options(folder, "refit", steps=24, stages=2), quiet=True)
+    result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
     before = result.folder.trajectory.read_bytes()
     again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
     assert again.report["field"]["kind"] == "keyframes"
@@ -209,13 +208,8 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
     options = settled(cli.parsed(trainer.options.TrainOptions, words, "progdf train"))
-    assert (options.seed, options.slider, options.steps, options.views, options.name) == (
-        7,
-        "even",
-        240,
-        12,
-        "r",
-    )
+    assert (options.seed, options.slider, options.name) == (7, "even", "r")
+    assert (options.steps, options.views, options.stages) == (240, 12, 4)
 
 
 def test_one_member_in_one_view_is_enough(folder: Path) -> None:
