@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 from imgui_bundle import imgui
 
-from viewer import panel, turntable, workspace
+from viewer import panel, turntable, widgets, workspace
 from viewer.layer_rows import LayerRow
 from viewer.state import LayerState, ViewState
 from viewer.strength_slider import parse_strength
@@ -295,8 +295,8 @@ def test_long_names_are_shortened_to_their_room() -> None:
     hand = hand_on(STACK)
     imgui.new_frame()
     room = imgui.calc_text_size("a long name").x
-    assert panel.elided("a long name", room) == "a long name"
-    short = panel.elided("a long name that goes on and on", room)
+    assert widgets.elided("a long name", room) == "a long name"
+    short = widgets.elided("a long name that goes on and on", room)
     assert short.endswith("…")
     assert imgui.calc_text_size(short).x <= room
     imgui.render()

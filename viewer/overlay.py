@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from imgui_bundle import imgui
 
 from . import controls
+from .engine import FrameTimings
 from .ui_context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32
+from .widgets import grouped
 from .workspace import Message
 
 MOUSE_HELP = (
@@ -32,7 +35,32 @@ class Area:
     height: float
 
 
-def timings(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
+def figures(
+    timings: FrameTimings, latencies_ms: Sequence[float], count: int, draws_with: str
+) -> list[tuple[str, str]]:
+    """Names and figures of a picture.
+
+    Args:
+        timings: where its time went
+        latencies_ms: from a slider's event to finished pixels, the last ones
+        count: Gaussians in the scene
+        draws_with: "gl" or "cpu"
+    """
+    lines = [
+        ("frame", f"{timings.total_ms:.1f} ms"),
+        ("  compose", f"{timings.compose_ms:.1f} ms"),
+        ("  upload", f"{timings.upload_ms:.1f} ms"),
+        ("  sort", f"{timings.sort_ms:.1f} ms"),
+        ("  draw", f"{timings.draw_ms:.1f} ms"),
+    ]
+    if latencies_ms:
+        median, late = np.percentile(latencies_ms, (50, 95))
+        lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
+    lines.append(("splats", f"{grouped(timings.drawn)} of {grouped(count)}"))
+    return [*lines, ("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with])]
+
+
+def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
     """A small table at the upper left: names, and figures aligned at the right."""
     size, pad, gap = SMALL_PX * ui.scale, 8.0 * ui.scale, 14.0 * ui.scale
     names = max((_wide(name, size, ui) for name, _ in lines), default=0.0)

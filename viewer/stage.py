@@ -21,6 +21,7 @@ from . import controls, inputs, overlay, panel, workspace
 from .engine import Engine, FrameTimings
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
+from .pace import Pace
 from .pick import surface_point
 from .pictures import save_picture
 from .state import ViewCamera, ViewState
@@ -28,9 +29,7 @@ from .turntable import to_camera
 from .ui_context import PALETTE, UiContext
 from .workspace import Message, SceneFacts
 
-SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
-LINGER_S = 0.65  # one more frame after this, for tooltips
-BLINK_S = 0.3  # while a text field is open
+FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
 MESSAGE_S, ERROR_S = 6.0, 15.0
 
 
@@ -66,21 +65,14 @@ class Stage:
         self._drag: str | None = None
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
-        self._unsettled, self._linger = SETTLE_FRAMES, True
+        self._pace = Pace()
+        self.wake, self.rest = self._pace.wake, self._pace.rest
 
     def close(self) -> None:
         """Free what the stage made; the engine and the context are the caller's."""
         self.ui.make_current()
         imgui.backends.opengl3_shutdown()
         self.ui.close()
-
-    def wake(self) -> None:
-        """Something happened: draw until everything has settled."""
-        self._unsettled, self._linger = SETTLE_FRAMES, True
-
-    def rest(self) -> None:
-        """Nothing can be drawn: wait for the next event."""
-        self._unsettled, self._linger = 0, False
 
     def serve(self, engine: Engine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
@@ -100,16 +92,12 @@ class Stage:
     def patience(self) -> float | None:
         """Seconds the window may wait for an event before the next `frame`; None: for ever."""
         self.ui.make_current()
-        if self._unsettled > 0:
-            return 0.0
-        if inputs.flying(self._keys):
-            return 1.0 / 60.0
-        waits = [LINGER_S] if self._linger else []
+        waits = [FLIGHT_S] if inputs.flying(self._keys) else []
         if imgui.get_io().want_text_input:
             waits.append(BLINK_S)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
-        return min(waits, default=None)
+        return self._pace.patience(waits)
 
     def tell(self, text: str, error: bool = False) -> None:
         """Show one line at the bottom of the picture for a while."""
@@ -138,8 +126,7 @@ class Stage:
         self.ui.make_current()
         imgui.get_io().delta_time = max(seconds, 1e-5)
         self._clock += max(seconds, 0.0)
-        self._linger = self._linger and self._unsettled > 0
-        self._unsettled = max(self._unsettled - 1, 0)
+        self._pace.step()
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
@@ -240,7 +227,7 @@ class Stage:
         if inputs.holds_original(self._keys):
             overlay.banner("Original", area, self.ui)
         if work.view.overlay:
-            overlay.timings(self.figures(), self.ui)
+            overlay.table(self.figures(), self.ui)
         if work.help:
             overlay.bindings(area, self.ui)
         if work.message is not None:
@@ -251,19 +238,7 @@ class Stage:
 
     def figures(self) -> list[tuple[str, str]]:
         """What the overlay shows of the picture on screen."""
-        t = self.timings
-        lines = [
-            ("frame", f"{t.total_ms:.1f} ms"),
-            ("  compose", f"{t.compose_ms:.1f} ms"),
-            ("  upload", f"{t.upload_ms:.1f} ms"),
-            ("  sort", f"{t.sort_ms:.1f} ms"),
-            ("  draw", f"{t.draw_ms:.1f} ms"),
-        ]
-        if self.latencies_ms:
-            median, late = np.percentile(self.latencies_ms, (50, 95))
-            lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
-        lines.append(("splats", f"{panel.grouped(t.drawn)} of {panel.grouped(self.facts.count)}"))
-        return [*lines, ("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[self.engine.draws_with])]
+        return overlay.figures(self.timings, self.latencies_ms, self.facts.count, self.engine.draws_with)
 
     def take_requests(self) -> tuple[str, ...]:
         """What the window shall do now; asked for once each."""

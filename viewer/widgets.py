@@ -1,0 +1,92 @@
+"""The panel's small parts: headings, labels, tips, icon buttons, rows of choices, text that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from imgui_bundle import imgui
+
+from .ui_context import PALETTE, SMALL_PX, Rgba, UiContext
+
+
+def section(name: str, ui: UiContext) -> None:
+    """The heading of a part of the panel."""
+    imgui.push_font(ui.fonts.bold, SMALL_PX)
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.dim))
+    imgui.align_text_to_frame_padding()
+    imgui.text(name.upper())
+    imgui.pop_style_color()
+    imgui.pop_font()
+
+
+def right_edge() -> float:
+    """Where the line ends, in the coordinates of `same_line`; ask at the line's start."""
+    return float(imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x)
+
+
+def label(text: str, column: float) -> None:
+    """A name at the left; what follows begins at `column`."""
+    imgui.align_text_to_frame_padding()
+    imgui.text_disabled(text)
+    imgui.same_line(column)
+
+
+def small(text: str, colour: Rgba) -> None:
+    """Small text, shortened to the line."""
+    imgui.push_font(None, SMALL_PX)
+    imgui.text_colored(imgui.ImVec4(*colour), elided(text, imgui.get_content_region_avail().x))
+    imgui.pop_font()
+
+
+def tip(text: str) -> None:
+    """What the last item does, told when the mouse rests on it."""
+    flags = imgui.HoveredFlags_
+    if imgui.is_item_hovered(flags.for_tooltip.value | flags.allow_when_disabled.value):
+        imgui.set_tooltip(text)
+
+
+def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
+    """A square button without a frame; True when it was pressed."""
+    side = imgui.get_frame_height()
+    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if dim else PALETTE.text)))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
+    pressed = imgui.button(f"{icon}##{name}", imgui.ImVec2(side, 0.0))
+    imgui.pop_style_var()
+    imgui.pop_style_color(2)
+    return bool(pressed)
+
+
+def choice(name: str, options: Sequence[str], current: int | None, ui: UiContext) -> int | None:
+    """A row of joined buttons; the index that was pressed, or None."""
+    gap = 2.0 * ui.scale
+    each = (imgui.get_content_region_avail().x - gap * (len(options) - 1)) / len(options)
+    pressed = None
+    imgui.begin_group()
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
+    for i, option in enumerate(options):
+        if i:
+            imgui.same_line(0.0, gap)
+        colour = PALETTE.accent_dark if i == current else PALETTE.field
+        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*colour))
+        if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
+            pressed = i
+        imgui.pop_style_color()
+    imgui.pop_style_var()
+    imgui.end_group()
+    return pressed
+
+
+def grouped(count: int) -> str:
+    """12345 as "12 345", with a thin space."""
+    return f"{count:,}".replace(",", "\u2009")
+
+
+def elided(text: str, room: float) -> str:
+    """The text, shortened with "…" to fit `room` window pixels in the present font."""
+    if imgui.calc_text_size(text).x <= room:
+        return text
+    kept = text
+    while kept and imgui.calc_text_size(kept + "…").x > room:
+        kept = kept[:-1]
+    return kept.rstrip() + "…"
