@@ -7,7 +7,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,12 +20,11 @@ from torch import Tensor
 from progdf.camera_files import save_cameras
 from progdf.checkpoint import Gdf, load_gdf
 from progdf.compose import Layer, compose
-from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.pictures import contact_sheet, write_image
 from progdf.ply import load_ply, save_ply
 from progdf.rasterize import render
-from progdf.scenes import SMALLEST, DemoScene, bear
+from progdf.scenes import DemoScene, bear, room
 from trainer.options import TrainOptions
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -41,29 +40,68 @@ class DemoEdit:
     editor: str
 
 
+@dataclass(frozen=True)
+class Show:
+    """What the demo does with one scene.
+
+    Args:
+        make: size and seed -> the scene
+        size: Gaussians if nobody says how many
+        view: which of the scene's cameras takes the pictures
+        inside: whether the edits are trained from the scene's own cameras, as one cannot see in from outside
+        edits: two edits that share no Gaussian, and one that shares Gaussians with both
+    """
+
+    make: Callable[[int, int], DemoScene]
+    size: int
+    view: int
+    inside: bool
+    edits: tuple[DemoEdit, DemoEdit, DemoEdit]
+
+
 _COAT = ("body", "head", "ears", "arms", "legs")
-EDITS = {
-    "bear": (
-        DemoEdit("scarf", ("scarf",), "stripes:#12a150"),
-        DemoEdit("gold", _COAT, "recolor:#d89a12"),
-        DemoEdit("night", (*_COAT, "scarf"), "night:0.85"),
-    )
+SHOWS = {
+    "bear": Show(
+        bear,
+        size=24_000,
+        view=2,
+        inside=False,
+        edits=(
+            DemoEdit("scarf", ("scarf",), "recolor:#3d4fc4"),
+            DemoEdit("gold", _COAT, "recolor:#d9a012"),
+            DemoEdit("frost", (*_COAT, "scarf"), "recolor:#62b3ea"),
+        ),
+    ),
+    "room": Show(
+        room,
+        size=40_000,
+        view=0,
+        inside=True,
+        edits=(
+            DemoEdit("rug", ("rug",), "recolor:#2c7a4b"),
+            DemoEdit("walls", ("walls",), "recolor:#e0a458"),
+            DemoEdit(
+                "night",
+                ("walls", "rug", "floor", "ceiling", "table", "stool", "ball", "picture"),
+                "night:0.8",
+            ),
+        ),
+    ),
 }
-"""Per scene: two edits that share no Gaussian, and one that shares Gaussians with both."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
     """Make a scene, train three region edits of it, write pictures, open the window if there is a display."""
 
-    scene: Literal["bear"] = "bear"
-    """Which scene."""
-    size: int = 24_000
-    """Number of Gaussians."""
+    scene: Literal["bear", "room"] = "bear"
+    """A bear in the grass to look at from all around, or a room to stand in."""
+    size: int | None = None
+    """Number of Gaussians; by default 24000 for the bear, 40000 for the room."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Folder for the scene, the edits and the pictures; made if need be."""
     quick: bool = False
-    """A draft in a third of the time: fewer views and steps."""
+    """A draft in a third of the time: fewer views, smaller, fewer steps."""
     seed: int = 0
     """Of the scene and of the training."""
     threads: int = 0
@@ -75,23 +113,24 @@ class DemoOptions:
 def main(argv: Sequence[str]) -> int:
     """Run the demo. Raises ProgdfError for options that cannot be met."""
     options = tyro.cli(DemoOptions, args=list(argv), prog="progdf demo")
-    if options.size < SMALLEST:
-        raise ProgdfError(f"--size is {options.size}; at least {SMALLEST} Gaussians would be right")
     begun = time.perf_counter()
-    scene = bear(options.size, options.seed)
-    edits = EDITS[options.scene]
+    show = SHOWS[options.scene]
+    scene = show.make(show.size if options.size is None else options.size, options.seed)
     write_scene(options.out, scene)
-    print(f"{options.scene}: {options.size:,} Gaussians in {options.out / 'scene.ply'}".replace(",", " "))
+    print(f"{options.scene}: {len(scene.gaussians)} Gaussians in {options.out / 'scene.ply'}")
     gdfs = {}
-    for edit in edits:
+    for edit in show.edits:
         print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
-        gdfs[edit.name] = load_gdf(_train(options, scene, edit))
+        gdfs[edit.name] = load_gdf(_train(options, show, scene, edit))
     print()
-    for picture in write_pictures(options.out, scene, gdfs):
+    for picture in write_pictures(options.out, scene, gdfs, show.view):
         print(f"look at {picture}")
-    command = ["view", str(options.out / "scene.ply"), *(str(_gdf(options.out, edit)) for edit in edits)]
+    command = ["view", str(options.out / "scene.ply"), *(str(_gdf(options.out, edit)) for edit in show.edits)]
     command += ["--background", _hex(scene.background)]
-    print(f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:\n  progdf {shlex.join(command)}")
+    print(
+        f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:\n  progdf {shlex.join(command)}",
+        flush=True,
+    )
     if options.window and _has_display():
         # another process, as the trainer and the viewer share nothing but files
         return subprocess.run([sys.executable, "-m", "progdf", *command], check=False).returncode
@@ -107,35 +146,45 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
     save_cameras(folder / "cameras.json", scene.cameras)
 
 
-def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf]) -> list[Path]:
-    """Write what the sliders do: each alone, two against each other, and before and after in large."""
-    gaussians = load_ply(folder / "scene.ply")
-    view = scene.cameras[2]
+def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
+    """Write what three sliders do: each alone, two against each other, and in large.
 
-    def shot(size: int, strengths: Mapping[str, float]) -> Tensor:
+    Args:
+        folder: where scene.ply lies and the pictures go
+        scene: its cameras and background
+        gdfs: the edits by name; the first two share no Gaussian
+        view: which camera
+
+    Returns:
+        sliders.png, two-sliders.png, hero.png
+    """
+    gaussians = load_ply(folder / "scene.ply")
+    camera = scene.cameras[view]
+
+    def shot(height: int, strengths: Mapping[str, float]) -> Tensor:
         layers = [Layer(gdfs[name], strength) for name, strength in strengths.items()]
+        sized = camera.resized(round(height * camera.width / camera.height), height)
         with torch.no_grad():
-            return render(compose(gaussians, layers), view.resized(size, size), background=scene.background)
+            return render(compose(gaussians, layers), sized, background=scene.background)
 
     names = list(gdfs)
-    labels = [f"{strength:.0%}" for strength in STRENGTHS]
+    first, second, third = names
     sliders = contact_sheet(
         [[shot(300, {name: strength}) for strength in STRENGTHS] for name in names],
-        [f"{name}" for name in names],
-        labels,
+        names,
+        [f"{strength:.0%}" for strength in STRENGTHS],
         "One slider per edit",
         "  ·  ".join(f"{name}: {gdf.instruction}" for name, gdf in gdfs.items()),
     )
-    first, second, *_ = names
-    thirds = [f"{strength:.0%}" for strength in _GRID]
+    steps = [f"{strength:.0%}" for strength in _GRID]
     grid = contact_sheet(
         [[shot(260, {first: a, second: b}) for b in _GRID] for a in _GRID],
-        [f"{first} {third}" for third in thirds],
-        [f"{second} {third}" for third in thirds],
+        [f"{first} {step}" for step in steps],
+        [f"{second} {step}" for step in steps],
         "Two sliders, every mixture",
     )
-    mixtures: list[dict[str, float]] = [{}, dict.fromkeys(names[:2], 1.0), dict.fromkeys(names, 0.7)]
-    hero = torch.cat([shot(512, strengths) for strengths in mixtures], dim=1)
+    mixtures: list[dict[str, float]] = [{}, {first: 1.0}, {first: 1.0, second: 1.0}, {third: 1.0}]
+    hero = torch.cat([shot(480, strengths) for strengths in mixtures], dim=1)
     written = []
     for name, image in (("sliders", sliders), ("two-sliders", grid), ("hero", hero)):
         written.append(folder / f"{name}.png")
@@ -143,9 +192,9 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf]) -> l
     return written
 
 
-def _train(options: DemoOptions, scene: DemoScene, edit: DemoEdit) -> Path:
+def _train(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> Path:
     """Train one edit and return its .gdf file."""
-    from trainer.run import train  # only now: the pictures above need none of it
+    from trainer.run import train  # only now: `--help` and the pictures need none of it
 
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
@@ -155,7 +204,10 @@ def _train(options: DemoOptions, scene: DemoScene, edit: DemoEdit) -> Path:
             out=folder / edit.name,
             region=f"labels:{folder / 'labels.npy'}:{ids}",
             editor=edit.editor,
-            quick=options.quick,
+            cameras=folder / "cameras.json" if show.inside else None,
+            views=10 if options.quick else 24,
+            image_size=192 if options.quick else 256,
+            steps=160 if options.quick else 480,
             seed=options.seed,
             threads=options.threads,
         )

@@ -56,11 +56,11 @@ class AnalyticEdit:
 
 
 def recolored(target: Tensor) -> AnalyticEdit:
-    """`colour.recolor` of every Gaussian, seen from the members' typical colour; `target` [3] sRGB."""
+    """`colour.recolor` of every Gaussian, seen from the members' own colour; `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         rgb = sh0_to_rgb(part.sh0)
-        return _with_color(part, colour.recolor(rgb, target, strength, colour.typical_color(rgb)), strength)
+        return _with_color(part, colour.recolor(rgb, target, strength, _own_color(part)), strength)
 
     return AnalyticEdit("recolor", change)
 
@@ -71,7 +71,7 @@ def striped(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
     def change(part: Gaussians, strength: float) -> Gaussians:
         rgb = sh0_to_rgb(part.sh0)
         pattern = colour.stripe_pattern(part.means, axis, period)
-        edited = colour.stripes(rgb, pattern, target, strength, colour.typical_color(rgb))
+        edited = colour.stripes(rgb, pattern, target, strength, _own_color(part))
         return _with_color(part, edited, strength * pattern[:, None, None])
 
     return AnalyticEdit("stripes", change)
@@ -142,6 +142,12 @@ def _ear_roots(means: Tensor) -> Tensor:
         ear = means[means[:, 0] * side > 0]
         roots.append(ear.mean(0) - torch.tensor([0.09 * side, 0.11, 0.0]))
     return torch.stack(roots)
+
+
+def _own_color(part: Gaussians) -> Tensor:
+    """The typical colour, each Gaussian counted as much as it can cover. [3]"""
+    _, middle, long = part.scales.sort(dim=1).values.unbind(1)
+    return colour.typical_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
 
 
 def _nearest(means: Tensor, pivots: Tensor) -> Tensor:
