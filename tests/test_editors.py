@@ -10,14 +10,13 @@ import pytest
 import torch
 from PIL import Image
 
-from progdf import colour
 from progdf.errors import ProgdfError
 from progdf.pictures import write_image
 from progdf.rasterize import render
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from tests.trained import WHITE, small
 from trainer.editors import EDITORS, check_editor, make_editor
-from trainer.editors.procedural import StripesEditor
+from trainer.editors.procedural import StripesEditor, recolored
 from trainer.views import choose_views, make_view, named, split_views
 
 PROCEDURAL = ("recolor:#3060d0", "tint:#d4af37", "stripes:#20a040", "darken:0.7", "night")
@@ -50,6 +49,17 @@ def test_the_edit_grows_continuously_with_the_strength(spec: str) -> None:
     assert max(steps) < 0.25
 
 
+def test_the_greys_of_a_thing_do_not_turn_through_the_rainbow_when_its_colour_does() -> None:
+    orange, target = torch.tensor([0.85, 0.45, 0.10]), torch.tensor([0.19, 0.38, 0.82])
+    warm_grey, cool_grey = torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]])
+    for s in (0.2, 0.4, 0.6, 0.8):
+        warm, cool = recolored(torch.stack([warm_grey, cool_grey]), target, s, orange)
+        assert float((warm - cool).abs().max()) < 0.06, "they were neighbours and stay so"
+        assert float(warm[2]) > float(warm[1]), "towards blue, not by way of green"
+    green = recolored(orange, target, 0.5, orange)
+    assert float(green[1]) > max(float(green[0]), float(green[2])), "the colour itself turns by way of green"
+
+
 def test_what_shares_a_pixel_with_the_region_is_not_edited() -> None:
     case = small()
     view = replace(
@@ -79,8 +89,8 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     editor = make_editor("stripes:#20a040", matt, case.region, views)
     assert isinstance(editor, StripesEditor)
     rows = case.region.members
-    painted = colour.stripes(
-        sh0_to_rgb(matt.sh0[rows]).clamp_min(0), editor.pattern, editor.target, 1.0, editor.reference
+    painted = recolored(
+        sh0_to_rgb(matt.sh0[rows]).clamp_min(0), editor.target, editor.pattern, editor.reference
     )
     scene = replace(matt, sh0=matt.sh0.index_copy(0, rows, rgb_to_sh0(painted)))
     for view in views:

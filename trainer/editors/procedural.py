@@ -22,6 +22,7 @@ from progdf.sh import shade
 from trainer.editors.base import EditKind
 from trainer.views import View
 
+_GREY, _COLOURED = 0.5, 1.3  # of the typical chroma: up to here a grey, from here a colour
 _STRIPES = 7  # across the longest side of the region
 
 
@@ -65,7 +66,7 @@ class StripesEditor:
         scene, members, camera = self.scene, self.members, view.camera
         directions = torch.nn.functional.normalize(scene.means[members] - camera.position, dim=1)
         before = shade(min(scene.sh_degree, 3), directions, scene.sh[members])
-        painted = colour.stripes(before, self.pattern, self.target, strength, self.reference)
+        painted = recolored(before, self.target, strength * self.pattern, self.reference)
         colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
         with torch.no_grad():
             premultiplied, _, _ = rasterize(
@@ -86,7 +87,7 @@ class StripesEditor:
 def recolor(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
     """`recolor:#rrggbb`: another colour, the shading kept; hue, saturation and lightness move together."""
     target, reference = colour.parse_color(what), reference_color(views)
-    return ColourEditor(lambda rgb, strength: colour.recolor(rgb, target, strength, reference))
+    return ColourEditor(lambda rgb, strength: recolored(rgb, target, strength, reference))
 
 
 def tint(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
@@ -124,6 +125,29 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
     axis[longest] = 1.0
     period = max(float(high[longest] - low[longest]) / _STRIPES, 1e-6)
     return axis, period, 0.5 - float(low[longest]) / period
+
+
+def recolored(rgb: Tensor, target: Tensor, strength: float | Tensor, reference: Tensor) -> Tensor:
+    """`colour.recolor` with calm greys on the way.
+
+    The hue of what is coloured turns; but a grey's hue is noise, and turned it shines in every colour of the rainbow
+    half way. So what has less chroma than the region's typical colour goes straight to its finished colour.
+
+    Args:
+        rgb: sRGB colours. [...,3]
+        target: what `reference` becomes. [3]
+        strength: 0..1, one number or [...]
+        reference: the region's typical colour. [3]
+    """
+    s = torch.as_tensor(strength, dtype=rgb.dtype).expand(rgb.shape[:-1])
+    turned = colour.recolor(rgb, target, s, reference)
+    lab = colour.srgb_to_oklab(rgb.clamp(0, 1))
+    finished = colour.srgb_to_oklab(colour.recolor(rgb, target, 1.0, reference))
+    straight = colour.oklab_to_srgb(torch.lerp(lab, finished, s[..., None])).clamp(0, 1)
+    typical = float(colour.srgb_to_oklab(reference)[1:].norm())
+    share = (lab[..., 1:].norm(dim=-1) / max(typical, 1e-3) - _GREY) / (_COLOURED - _GREY)
+    share = torch.where((s == 0) | (s == 1), 1.0, share.clamp(0, 1))
+    return torch.lerp(straight, turned, (share * share * (3 - 2 * share))[..., None])
 
 
 def reference_color(views: Sequence[View]) -> Tensor:
