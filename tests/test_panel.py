@@ -10,7 +10,7 @@ from imgui_bundle import imgui
 
 from viewer import panel, turntable, widgets, workspace
 from viewer.layer_rows import LayerRow
-from viewer.state import LayerState, ViewState
+from viewer.state import LayerState, ViewCamera, ViewState
 from viewer.strength_slider import parse_strength
 from viewer.turntable import Bounds
 from viewer.ui_context import UiContext
@@ -19,7 +19,11 @@ from viewer.workspace import SceneFacts, Workspace
 SIZE = (1024, 640)
 ROW = LayerRow(3120, (0.2, 0.6, 0.3), (0.0, 0.25, 0.5, 0.75, 1.0), "stripes:#30a050", Bounds())
 FACTS = SceneFacts("bear.ply", 24_000, Bounds(), (ROW, ROW))
-STACK = ViewState(layers=(LayerState(0, "scarf", 0.5), LayerState(1, "body", 0.0)))
+STACK = ViewState(
+    camera=ViewCamera(fov_y=40.1),
+    layers=(LayerState(0, "scarf", 0.5), LayerState(1, "body", 0.0)),
+    background=(0.1, 0.2, 0.3),
+)
 
 
 @dataclass

@@ -116,13 +116,13 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
         camera = turntable.with_up(camera, ups[chosen][1])
     label("Lens", column)
     imgui.set_next_item_width(-1.0)
-    camera = replace(
-        camera, fov_y=imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)[1]
-    )
+    changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
+    camera = replace(camera, fov_y=fov_y) if changed else camera  # unchanged, imgui still rounds to float32
     tip("Vertical field of view")
     label("Background", column)
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
-    red, green, blue = imgui.color_edit3("##background", list(state.background), picker)[1]
+    changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
+    background = (red, green, blue) if changed else state.background
     label("Show", column)
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
@@ -132,7 +132,7 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
         actions.append("home")
     tip("Back to the first view (Shift+F)")
-    return replace(state, camera=camera, background=(red, green, blue))
+    return replace(state, camera=camera, background=background)
 
 
 _ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
