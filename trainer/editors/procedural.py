@@ -36,7 +36,10 @@ class ColourEditor:
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
-        return view.blended(self.change(view.inside, strength))
+        shown = view.mask > 0
+        inside = view.inside.clone()
+        inside[shown] = self.change(view.inside[shown], strength)
+        return view.blended(inside)
 
 
 @dataclass(frozen=True)
