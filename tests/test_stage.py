@@ -330,6 +330,15 @@ def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
     assert hand.stage.timings.total_ms > 0.0
 
 
+def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> None:
+    drawn = hand.stage.drawn
+    hand.stage.greet(hand.screen)
+    image = hand.image()
+    assert hand.stage.drawn == drawn
+    assert len(np.unique(image[:60].reshape(-1, 3), axis=0)) > 10, "a word"
+    assert len(np.unique(image[60:].reshape(-1, 3), axis=0)) == 1, "on the background alone"
+
+
 def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:
     hand.key("F12")
     assert hand.stage.work.view.panel is False

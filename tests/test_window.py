@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -171,6 +172,16 @@ def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> 
     assert picture.shape == (650, 900 - panel.WIDTH_PX, 3)
     desktop.xdotool("key", "ctrl+q")
     assert desktop.process.wait(timeout=PATIENCE_S) == 0
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_ctrl_c_in_the_terminal_closes_an_idle_window(desktop: Desktop) -> None:
+    desktop.shot()
+    time.sleep(1.0)
+    desktop.process.send_signal(signal.SIGINT)
+    assert desktop.process.wait(timeout=PATIENCE_S) == 130
+    assert desktop.process.communicate() == ("", "progdf: interrupted\n")
 
 
 def test_without_a_display_view_says_so_in_one_line(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from .layer_rows import layer_rows
 from .stage import Stage
 from .state import LayerState, ViewState
 from .turntable import bounds_of, first_camera
-from .window import Window
+from .window import Window, interruptible
 from .workspace import SceneFacts
 
 SIZE = (1280, 800)
@@ -58,7 +58,8 @@ def run(document: Document, state: ViewState, pictures: Path = Path(), size: tup
     try:
         app = App(window, document, state, pictures)
         try:
-            app.loop()
+            with interruptible():
+                app.loop()
         finally:
             app.close()
     finally:
@@ -87,6 +88,9 @@ class App:
 
     def loop(self) -> None:
         """Draw while something changes, sleep while nothing does."""
+        imgui.backends.glfw_new_frame()
+        self.stage.greet(self.context.screen)
+        self.window.present()
         while not self.window.closing:
             self.window.wait(self.stage.patience())
             if self.failure is not None:

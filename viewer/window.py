@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import signal
+import socket
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +185,31 @@ class Window:
             glfw.set_window_monitor(
                 self.handle, monitor, 0, 0, mode.size.width, mode.size.height, mode.refresh_rate
             )
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl+C in the terminal end a wait for events, which Python would only hear of with the next event."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard, told = socket.socketpair()
+    told.setblocking(False)
+    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+
+    def listen() -> None:
+        while heard.recv(1):
+            glfw.post_empty_event()
+
+    listener = threading.Thread(target=listen, daemon=True)
+    listener.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        told.close()
+        listener.join()
+        heard.close()
 
 
 def key_name(key: int, scancode: int) -> str:
