@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -248,5 +249,6 @@ def _retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Tra
 
 
 def _shared(steps: int, stages: int) -> list[int]:
-    """Steps per stage, adding up to `steps`."""
-    return [steps * (i + 1) // stages - steps * i // stages for i in range(stages)]
+    """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
+    marks = [steps * i // (stages + 1) for i in range(stages)]
+    return [b - a for a, b in pairwise([*marks, steps])]
