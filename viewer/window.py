@@ -189,7 +189,7 @@ class Window:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl+C in the terminal end a wait for events, which Python would only hear of with the next event."""
+    """Let Ctrl+C in the terminal end a wait for events; Python alone would hear of it with the next event."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
