@@ -32,6 +32,7 @@ _GREY_CHROMA = 0.03  # below this chroma a hue is mostly noise
 _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
 _OPPOSITE = math.radians(140.0)  # hues further apart than this have no "shorter way" worth the name
 _GREEN = math.radians(142.5)
+_GAMUT_SLACK = 1e-3  # less than a third of an 8-bit step
 
 
 def parse_color(text: str) -> Tensor:
@@ -217,21 +218,16 @@ def _relight(lightness: Tensor, reference: Tensor, goal: Tensor) -> Tensor:
 
 def _fit_gamut(lightness: Tensor, chroma: Tensor, hue: Tensor) -> Tensor:
     """sRGB of OKLCh colours; chroma that sRGB cannot show is reduced, lightness and hue stay. [...,3]"""
-    direction = torch.stack([torch.cos(hue), torch.sin(hue)], dim=-1)
-
-    def at(share: Tensor) -> Tensor:
-        return oklab_to_srgb(
-            torch.cat([lightness[..., None], (chroma * share)[..., None] * direction], dim=-1)
-        )
-
-    whole = at(torch.ones_like(chroma))
-    outside = ((whole < -1e-3) | (whole > 1 + 1e-3)).any(-1)
-    if not bool(outside.any()):
-        return whole.clamp(0, 1)
-    low, high = torch.zeros_like(chroma), torch.ones_like(chroma)
-    for _ in range(10):  # to a thousandth of the chroma
-        middle = 0.5 * (low + high)
-        rgb = at(middle)
-        fits = ((rgb >= -1e-3) & (rgb <= 1 + 1e-3)).all(-1)
-        low, high = torch.where(fits, middle, low), torch.where(fits, high, middle)
-    return torch.where(outside[..., None], at(low), whole).clamp(0, 1)
+    lab = torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1)
+    rgb = oklab_to_srgb(lab)
+    outside = (rgb - 0.5).abs().amax(dim=-1) > 0.5 + _GAMUT_SLACK
+    if bool(outside.any()):
+        beyond = lab[outside]
+        low, high = torch.zeros_like(beyond[:, :1]), torch.ones_like(beyond[:, :1])
+        for _ in range(10):  # to a thousandth of the chroma
+            middle = 0.5 * (low + high)
+            tried = oklab_to_srgb(torch.cat([beyond[:, :1], middle * beyond[:, 1:]], dim=1))
+            fits = (tried - 0.5).abs().amax(dim=1, keepdim=True) <= 0.5 + _GAMUT_SLACK
+            low, high = torch.where(fits, middle, low), torch.where(fits, high, middle)
+        rgb[outside] = oklab_to_srgb(torch.cat([beyond[:, :1], low * beyond[:, 1:]], dim=1))
+    return rgb.clamp(0, 1)

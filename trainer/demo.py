@@ -78,7 +78,7 @@ SHOWS = {
         view=0,
         inside=True,
         edits=(
-            DemoEdit("rug", ("rug",), "recolor:#2c7a4b"),
+            DemoEdit("rug", ("rug",), "recolor:#3a55b4"),
             DemoEdit("walls", ("walls",), "recolor:#e0a458"),
             DemoEdit(
                 "night",
@@ -205,7 +205,7 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -
             region=f"labels:{folder / 'labels.npy'}:{ids}",
             editor=edit.editor,
             cameras=folder / "cameras.json" if show.inside else None,
-            views=10 if options.quick else 24,
+            views=(18 if show.inside else 10) if options.quick else 24,
             image_size=192 if options.quick else 256,
             steps=160 if options.quick else 480,
             seed=options.seed,
