@@ -9,7 +9,10 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scenes import random_gaussians
 
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.scenes import bear
 from viewer import controls, turntable, workspace
 from viewer.layer_rows import LayerRow
 from viewer.state import LayerState, Vec3, ViewCamera, ViewState
@@ -224,6 +227,31 @@ def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
             after = workspace.perform(work, key.action, facts)
             assert usable(after.view.camera)
             assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)
+
+
+def test_the_first_view_shows_the_whole_bear_upright_with_cameras_and_without() -> None:
+    demo = bear(1500)
+    for cameras in (demo.cameras, ()):
+        camera = turntable.first_camera(demo.gaussians, cameras, aspect=1.0)
+        assert camera.up == (0.0, 1.0, 0.0), "the axis itself, not what photographs scatter around it"
+        built = to_camera(camera, 400, 400)
+        figure = demo.gaussians.means[demo.members("body", "head", "ears", "arms", "legs")]
+        seen = figure @ built.viewmat[:3, :3].T + built.viewmat[:3, 3]
+        pixels = seen[:, :2] / seen[:, 2:] * built.K[0, 0] + 200.0
+        assert bool((seen[:, 2] > 0).all())
+        assert bool(((pixels > 0) & (pixels < 400)).all())
+
+
+def test_a_slanted_up_axis_is_kept() -> None:
+    scene = random_gaussians(50)
+    tilt = torch.tensor([math.sin(0.2), -math.cos(0.2), 0.0])
+    level = look_at(torch.tensor([0.0, 0.0, -4.0]), torch.zeros(3), tilt)
+    camera = Camera(level, intrinsics(0.9, 40, 24), 40, 24)
+    assert turntable.first_camera(scene, [camera]).up == pytest.approx(tilt.tolist(), abs=1e-5)
+
+
+def test_nothing_at_all_can_still_be_looked_at() -> None:
+    assert usable(turntable.first_camera(random_gaussians(0)))
 
 
 def test_toggling_fly_does_not_move_the_picture() -> None:
