@@ -356,6 +356,23 @@ def test_the_picture_has_the_framebuffers_pixels_on_a_dense_screen(
         assert np.abs(hand.image()[:, :680] - np.clip(image, 0, 1) * 255).max() <= 0.51
 
 
+@pytest.mark.parametrize("draw", ["gl", "cpu"])
+def test_interface_and_splats_leave_each_others_gl_state_alone(draw: str) -> None:
+    with rig(draw=draw) as hand:
+        panel_before = hand.image()[:480, 340:]
+        hand.key("F1")
+        hand.drag(VIEW, (VIEW[0] + 60, VIEW[1] + 20))
+        hand.drag(hand.slider(0, 0.5), hand.slider(0, 1.0))
+        hand.key("Ctrl+Z")
+        hand.key("F1")
+        hand.move(*VIEW)
+        hand.settle()
+        used, view = hand.image(), hand.stage.work.view
+    with rig(view, draw=draw) as fresh:
+        assert np.array_equal(used[:, :340], fresh.picture())
+    assert np.array_equal(used[:480, 340:], panel_before), "all but the undo buttons"
+
+
 def test_a_new_size_of_the_window_is_drawn_at_once(hand: Rig) -> None:
     hand.pixels = hand.points = (500, 300)
     hand.io.display_size = imgui.ImVec2(500, 300)

@@ -135,18 +135,20 @@ def rig(
     scale: float = 1.0,
     stack: Stack | None = None,
     pictures: Path = Path(),
+    draw: str = "cpu",
 ) -> Iterator[Rig]:
-    """A stage on the bear, drawn by the CPU rasteriser.
+    """A stage on the bear.
 
     Args:
         view: the first state; the bear with both edits half way if None
         points: size of the window in its own coordinates
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
+        draw: what draws the splats, as for the engine
     """
     stack = stack or bear()
     context = headless_context()
-    engine = Engine(context, stack.scene, stack.gdfs, draw="cpu")
+    engine = Engine(context, stack.scene, stack.gdfs, draw=draw)
     facts = Document("bear.ply", stack.scene, stack.gdfs).facts()
     stage = Stage(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
     try:
