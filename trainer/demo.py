@@ -41,6 +41,15 @@ class DemoEdit:
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much training an edit gets, see `TrainOptions`."""
+
+    views: int
+    image_size: int
+    steps: int
+
+
+@dataclass(frozen=True)
 class Show:
     """What the demo does with one scene.
 
@@ -49,6 +58,8 @@ class Show:
         size: Gaussians if nobody says how many
         view: which of the scene's cameras takes the pictures
         inside: whether the edits are trained from the scene's own cameras, as one cannot see in from outside
+        draft: the effort of --quick
+        full: the effort otherwise
         edits: two edits that share no Gaussian, and one that shares Gaussians with both
     """
 
@@ -56,6 +67,8 @@ class Show:
     size: int
     view: int
     inside: bool
+    draft: Effort
+    full: Effort
     edits: tuple[DemoEdit, DemoEdit, DemoEdit]
 
 
@@ -66,6 +79,8 @@ SHOWS = {
         size=24_000,
         view=2,
         inside=False,
+        draft=Effort(views=10, image_size=160, steps=160),
+        full=Effort(views=24, image_size=256, steps=480),
         edits=(
             DemoEdit("scarf", ("scarf",), "recolor:#3d4fc4"),
             DemoEdit("gold", _COAT, "recolor:#d9a012"),
@@ -77,6 +92,9 @@ SHOWS = {
         size=40_000,
         view=0,
         inside=True,
+        # from inside each view shows a part only: more of them, and more steps to come round to each
+        draft=Effort(views=16, image_size=192, steps=320),
+        full=Effort(views=30, image_size=256, steps=800),
         edits=(
             DemoEdit("rug", ("rug",), "recolor:#3a55b4"),
             DemoEdit("walls", ("walls",), "recolor:#e0a458"),
@@ -198,6 +216,7 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -
 
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
+    effort = show.draft if options.quick else show.full
     train(
         TrainOptions(
             scene=folder / "scene.ply",
@@ -205,9 +224,9 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -
             region=f"labels:{folder / 'labels.npy'}:{ids}",
             editor=edit.editor,
             cameras=folder / "cameras.json" if show.inside else None,
-            views=(18 if show.inside else 10) if options.quick else 24,
-            image_size=192 if options.quick else 256,
-            steps=160 if options.quick else 480,
+            views=effort.views,
+            image_size=effort.image_size,
+            steps=effort.steps,
             seed=options.seed,
             threads=options.threads,
         )
