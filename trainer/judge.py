@@ -80,6 +80,8 @@ def make_judge(
         background: rgb. [3]
         channels: width of a packed row
     """
+    if edited:
+        views = [v.widened([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]
     crops = [crop_scene(scene, region.members, view.camera, view.box, background) for view in views]
     pixels = []
     for i, view in enumerate(views):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -54,16 +54,35 @@ def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:
 
 
 def edited_views(
-    editor: ImageEditor, views: Sequence[View], strengths: Sequence[float], folder: RunFolder
+    editor: ImageEditor, views: Sequence[View], strengths: Sequence[float], folder: RunFolder, confined: bool
 ) -> dict[float, list[Tensor]]:
-    """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on."""
+    """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
+
+    Args:
+        editor: see `ImageEditor`
+        views: all views
+        strengths: what the editor is asked for
+        folder: where the pictures go
+        confined: put back what the editor changed outside the region; members would be pulled over it otherwise
+    """
     edited: dict[float, list[Tensor]] = {}
     for strength in strengths:
-        pictures = [_eight_bits(editor.edit(view, strength)) for view in views]
+        made = [editor.edit(view, strength) for view in views]
+        if confined:
+            made = [view.confined(picture) for view, picture in zip(views, made, strict=True)]
+        pictures = [_eight_bits(picture) for picture in made]
         named_pictures = {view.camera.name: p for view, p in zip(views, pictures, strict=True)}
         write_views(folder, "edited", named_pictures, strength)
         edited[strength] = pictures
     return edited
+
+
+def widened(stand: Stand, edited: Pictures) -> Stand:
+    """The training views with boxes that hold all that the edit changes."""
+    views = [
+        view.widened([pictures[i] for pictures in edited.values()]) for i, view in enumerate(stand.train)
+    ]
+    return replace(stand, train=views)
 
 
 def probes(stand: Stand) -> list[CropScene]:

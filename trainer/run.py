@@ -23,6 +23,7 @@ from trainer.artefacts import RunFolder, claim, remove_stale_views, signature, w
 from trainer.crops import crop_scene, render_all
 from trainer.editors import check_editor, make_editor
 from trainer.editors.base import EditKind
+from trainer.editors.folder import FolderEditor
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
 from trainer.losses import Perceptual, perceptual_loss
@@ -36,6 +37,7 @@ from trainer.preparation import (
     make_stand,
     probes,
     strengths_to_ask,
+    widened,
 )
 from trainer.progress import RunLog
 from trainer.trajectory import Trajectory, load_trajectory, record, retime, save_trajectory, straightened
@@ -96,11 +98,13 @@ def _trained(
     with log.stage("edit"):
         editor = make_editor(options.editor, scene, region, views)
         strengths = strengths_to_ask(editor, options.stages)
-        edited = edited_views(editor, views, strengths, folder)
-    kind: EditKind = editor.kind if options.kind == "auto" else options.kind
+        kind: EditKind = editor.kind if options.kind == "auto" else options.kind
+        confined = isinstance(editor, FolderEditor) and kind != "geometry"
+        edited = edited_views(editor, views, strengths, folder, confined)
+        train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
+        stand = widened(stand, train_edits)
     log.say(f"{options.editor}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
 
-    train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
     with log.stage("optimise"):
         trajectory, losses = _optimised(options, stand, train_edits, kind, perceptual, log)
     with log.stage("retime"):

@@ -22,9 +22,8 @@ MOST_VIEWS = 96
 
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
-_LEAST_COVER = (
-    0.25  # a view that shows less than this share of what the median view shows of the region is dropped
-)
+_CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
+_LEAST_COVER = 0.25  # of what the median view shows of the region; a view that shows less is dropped
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,15 @@ class View:
         """
         change = torch.where(self.mask[..., None] > 1e-4, edited_inside - self.inside, 0.0)
         return (self.image + self.mask[..., None] * change).clamp(0.0, 1.0)
+
+    def confined(self, edited: Tensor) -> Tensor:
+        """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]"""
+        return torch.lerp(self.image, edited, self.mask[..., None])
+
+    def widened(self, edited: Sequence[Tensor]) -> View:
+        """The view with its box grown to all that these pictures of it change visibly."""
+        changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
+        return replace(self, box=region_box(torch.maximum(self.mask, (changed > _CHANGED).float())))
 
 
 def crop(image: Tensor, box: Crop) -> Tensor:
