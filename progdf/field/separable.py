@@ -9,7 +9,7 @@ solved again for the bases as stored.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,27 +22,27 @@ LEVELS = 127
 
 
 @dataclass(frozen=True)
-class Spectrum:
-    """One attribute's trajectory, taken apart.
+class Course:
+    """One attribute's trajectory beside its full offset.
 
     Args:
         offsets: recorded offsets. [T,M,c] float32
         weights: how much an error of each number shows, ≥ 0. [M,c] float32
-        mix: bases 1, 2, … as sums of what basis 0 leaves at the snapshots, strongest first. [T,R] float32
-        lead: a_0 at the snapshots when it stands alone. [T] float32
-        energy: weighted squared error at each snapshot with the first 0, 1, … R of them. [R+1,T] float64
+        lead: a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
+        gram: weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
     """
 
     offsets: Tensor
     weights: Tensor
-    mix: Tensor
     lead: Tensor
-    energy: Tensor
+    gram: Tensor
 
     @property
-    def largest_rank(self) -> int:
-        """The rank beyond which nothing is left to explain."""
-        return int(self.mix.shape[1])
+    def residual(self) -> Tensor:
+        """What a_0 times the full offset leaves; 0 at both ends. [T,M,c]"""
+        left = torch.addcmul(self.offsets, self.lead[:, None, None], self.offsets[-1], value=-1)
+        left[[0, -1]] = 0.0
+        return left
 
 
 def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
@@ -77,65 +77,61 @@ def channel_weights(weights: Tensor | None, members: int, channels: int) -> Tens
     return spread
 
 
-def moving_attributes(offsets: Tensor, stillness: Mapping[str, float] | None = None) -> dict[str, slice]:
-    """The attributes that move at all, and their columns.
-
-    Args:
-        offsets: recorded offsets. [T,M,C]
-        stillness: largest |offset| of an attribute that still counts as standing still; 0 where not named
-    """
-    limits = stillness or {}
+def moving_attributes(offsets: Tensor) -> dict[str, slice]:
+    """The attributes that move at all in [T,M,C] offsets, and their columns."""
     return {
         name: columns
         for name, columns in attribute_slices(offsets.shape[2]).items()
-        if offsets[:, :, columns].numel()
-        and float(offsets[:, :, columns].abs().max()) > limits.get(name, 0.0)
+        if bool(offsets[:, :, columns].any())
     }
 
 
-def spectrum(offsets: Tensor, weights: Tensor, emphasis: Tensor | None = None) -> Spectrum:
-    """Take one attribute's trajectory apart by a weighted SVD.
-
-    Args:
-        offsets: [T,M,c] float32, first row 0
-        weights: [M,c] ≥ 0
-        emphasis: how much each snapshot counts, > 0; None is evenly. [T]
-    """
-    snapshots = len(offsets)
-    rows = offsets.flatten(1) * weights.sqrt().flatten()
-    end = rows[-1]
-    power = (end @ end).double()
-    lead = (rows @ end).double() / power if power > 0 else torch.linspace(0, 1, snapshots).double()
+def follow(offsets: Tensor, weights: Tensor) -> Course:
+    """One attribute's course. [T,M,c] float32, [M,c] ≥ 0"""
+    root = weights.sqrt()
+    end = (offsets[-1] * root).flatten()
+    power = float(end.double() @ end.double())
+    lead = torch.linspace(0, 1, len(offsets)).double()
+    if power > 0:
+        lead = ((offsets * root).flatten(1) @ end).double() / power
     lead[0], lead[-1] = 0.0, 1.0
-    residual = torch.addcmul(rows, lead.float()[:, None], end, value=-1)
-    residual[[0, -1]] = 0.0
-    root = torch.ones(snapshots).double() if emphasis is None else emphasis.double().sqrt()
-    # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
-    gram = (residual @ residual.T).double()
-    values, vectors = torch.linalg.eigh(root[:, None] * gram * root)
-    values, vectors = values.flip(0).clamp(min=0), vectors.flip(1)
-    rank = min(int((values > 1e-9 * values[0]).sum()), max(snapshots - 2, 0))
-    values, vectors = values[:rank], vectors[:, :rank]
-    explained = (vectors.square() * values).T / root.square()
-    explained = torch.cat([torch.zeros(1, snapshots).double(), explained.cumsum(0)])
-    energy = (gram.diagonal() - explained).clamp(min=0)
-    return Spectrum(offsets, weights, (root[:, None] * vectors).float(), lead.float(), energy)
+    course = Course(offsets, weights, lead.float(), torch.zeros(0))
+    rows = (course.residual * root).flatten(1)
+    return replace(course, gram=(rows @ rows.T).double())
 
 
-def bases(taken: Spectrum, rank: int, rest_type: torch.dtype = torch.int8) -> AttributeBases:
-    """The first `rank` further bases as stored, with coefficients solved for what is stored.
+def leading_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The best bases of any number, by the inner products of the rows they shall explain (a weighted SVD).
 
     Args:
-        taken: the attribute's trajectory
-        rank: number of bases beside the full offset, ≥ 0; more than there are is all of them
+        gram: of the T rows, row 0 and the last are 0. [T,T] float64
+        emphasis: how much each row counts, > 0; None is evenly. [T] float64
+
+    Returns:
+        How each basis is mixed from the rows, strongest first, and what the bases are multiplied with to give
+        the rows again. [T,R], [T,R] float64; R is as large as there is anything to explain, at most T − 2
+    """
+    root = torch.ones(len(gram), dtype=torch.float64) if emphasis is None else emphasis.double().sqrt()
+    # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
+    values, vectors = torch.linalg.eigh(root[:, None] * gram * root)
+    values, vectors = values.flip(0), vectors.flip(1)
+    rank = int((values > 1e-9 * values[0]).sum()) if float(values[0]) > 0 else 0
+    vectors = vectors[:, : min(rank, max(len(gram) - 2, 0))]
+    return root[:, None] * vectors, vectors / root[:, None]
+
+
+def stored_attribute(course: Course, mix: Tensor, rest_type: torch.dtype = torch.int8) -> AttributeBases:
+    """Bases as stored, with coefficients solved for them as they are stored.
+
+    Args:
+        course: the attribute's course
+        mix: how each basis beside the full offset is mixed from what that leaves. [T,R]
         rest_type: int8, float16 or float32
     """
-    mix = taken.mix[:, : min(rank, taken.largest_rank)]
-    full = taken.offsets[-1].contiguous()
-    shape = (mix.shape[1], *full.shape)
-    residual = taken.offsets.flatten(1) - taken.lead[:, None] * full.flatten()
-    rest, step = stored_bases((mix.T @ residual).reshape(shape), rest_type)
-    table = solved_coefficients(taken.offsets, full, rest.float() * step[:, None], taken.weights)
+    full = course.offsets[-1].contiguous()
+    exact = (mix.T.float() @ course.residual.flatten(1)).reshape(-1, *full.shape)
+    rest, step = stored_bases(exact, rest_type)
+    table = solved_coefficients(course.offsets, full, rest.float() * step[:, None], course.weights)
     return AttributeBases(full, rest, step, table)
 
 
@@ -202,8 +198,13 @@ def fit_separable(
     check_trajectory(strengths, offsets)
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     attributes = {
-        name: bases(spectrum(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type)
+        name: _fitted(follow(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type)
         for name, columns in moving_attributes(offsets).items()
     }
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
+
+
+def _fitted(course: Course, rank: int, rest_type: torch.dtype) -> AttributeBases:
+    mix, _ = leading_modes(course.gram)
+    return stored_attribute(course, mix[:, :rank], rest_type)

@@ -1,0 +1,78 @@
+"""How many bases each attribute gets: by what a byte of it takes from the error in the pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from progdf.field.rendered import Modes, RenderedCourses
+
+NO_DIFFERENCE = 99.0
+"""PSNR, dB, that stands for pictures which do not differ."""
+
+
+def grown_ranks(seen: RenderedCourses, most_bytes: float) -> list[dict[str, int]]:
+    """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
+    widths = {name: course.offsets.shape[2] for name, course in seen.courses.items()}
+    evenly = torch.ones(seen.gram.shape[1], dtype=torch.float64)
+    modes = seen.modes(evenly)
+    ranks = dict.fromkeys(seen.courses, 0)
+    stored = 4.0 * sum(widths.values())
+    path = [dict(ranks)]
+    now = _hardness(seen.mse(modes, ranks))
+    while now > 0:
+        best: tuple[float, str, float] | None = None
+        for name, width in widths.items():
+            if ranks[name] >= modes[name][0].shape[1] or stored + width > most_bytes:
+                continue
+            then = _hardness(seen.mse(modes, {**ranks, name: ranks[name] + 1}))
+            gain = math.log(now / max(then, 1e-30)) / width
+            if best is None or gain > best[0]:
+                best = (gain, name, then)
+        if best is None or now < 1e-10:  # 100 dB
+            break
+        _, name, now = best
+        ranks[name] += 1
+        stored += widths[name]
+        path.append(dict(ranks))
+    return path
+
+
+def _hardness(mse: Tensor) -> float:
+    """Between mean and worst over the snapshots: the fourth-power mean, so that no step is in vain."""
+    return float(mse.pow(4).mean().pow(0.25))
+
+
+def emphasised_modes(seen: RenderedCourses, ranks: Mapping[str, int]) -> Modes:
+    """Bases for these ranks, with snapshots of large error made to count more until the worst is least."""
+    emphasis = torch.ones(seen.gram.shape[1], dtype=torch.float64)
+    best = modes = seen.modes(emphasis)
+    least = mse = seen.mse(modes, ranks)
+    for _ in range(12):
+        inner = mse[1:-1]
+        if not bool((inner > 0).any()):
+            break
+        emphasis[1:-1] *= (inner / inner.mean()).clamp(min=1e-3).pow(0.5)
+        emphasis = emphasis.clamp(1e-3, 1e3)
+        modes = seen.modes(emphasis)
+        mse = seen.mse(modes, ranks)
+        if float(mse.max()) < float(least.max()):
+            best, least = modes, mse
+    return best
+
+
+def expected_worst(seen: RenderedCourses, ranks: Mapping[str, int]) -> float:
+    """Least PSNR over the slider that these ranks should give, dB."""
+    return (
+        decibels(float(seen.mse(emphasised_modes(seen, ranks), ranks).max()))
+        if seen.courses
+        else NO_DIFFERENCE
+    )
+
+
+def decibels(mse: float) -> float:
+    """PSNR of a mean squared error, at most `NO_DIFFERENCE`, dB."""
+    return NO_DIFFERENCE if mse <= 0 else min(NO_DIFFERENCE, -10 * math.log10(mse))

@@ -1,0 +1,101 @@
+"""The trajectory as pictures see it: how much each attribute's course beside its straight end shows, and
+with what.
+
+Numbers of different attributes cannot be compared, and an error that no picture shows is none. So every
+attribute is straightened (its offset replaced by a_0(s) times the full one), one at a time, at every
+snapshot, and what changes in
+the pictures is kept: one row of pixels per attribute and snapshot. All that the choice of ranks needs is in
+the inner products of these rows; the errors of several attributes may add up or cancel, and both is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.field.separable import Course, follow, leading_modes, moving_attributes
+
+Render = Callable[[Tensor], Tensor]
+"""Offsets of the members -> the pixels that count, of some views side by side. [M,C] -> [P,3]"""
+
+MOST_PIXELS = 40_000
+"""Pixels kept of each render; of more, evenly spread ones."""
+
+
+UNSEEN = 0.1
+"""Say of the bare numbers beside the pictures, for members that these views do not show."""
+
+Modes = Mapping[str, tuple[Tensor, Tensor]]
+"""By attribute, as `separable.leading_modes` gives them."""
+
+
+@dataclass(frozen=True)
+class RenderedCourses:
+    """What straightening each attribute changes in the pictures.
+
+    Args:
+        courses: by attribute
+        gram: inner products of these changes over pixels and colours. [A,T,A,T] float64
+        values: numbers that each inner product sums over
+        channels: width of a packed row
+    """
+
+    courses: Mapping[str, Course]
+    gram: Tensor
+    values: int
+    channels: int
+
+    def modes(self, emphasis: Tensor) -> Modes:
+        """Each attribute's best bases, when the snapshots count as `emphasis` says. [T] float64, > 0"""
+        found = {}
+        for i, (name, course) in enumerate(self.courses.items()):
+            seen = self.gram[i, :, i]
+            parameters = float(course.gram.diagonal().sum())
+            share = UNSEEN * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
+            found[name] = leading_modes(seen + share * course.gram, emphasis)
+        return found
+
+    def mse(self, modes: Modes, ranks: Mapping[str, int]) -> Tensor:
+        """Expected mean squared error of the pictures at each snapshot. [T] float64"""
+        snapshots = self.gram.shape[1]
+        left = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.courses), 1, 1)
+        for i, name in enumerate(self.courses):
+            mix, table = (part[:, : ranks.get(name, 0)] for part in modes[name])
+            left[i] -= table @ mix.T  # row t: what remains there, as a sum of the rows of pixels
+        half = torch.einsum("ats,asbu->atbu", left, self.gram)
+        return torch.einsum("atbu,btu->t", half, left).clamp(min=0) / self.values
+
+
+def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> RenderedCourses:
+    """Straighten every attribute at every snapshot, and look.
+
+    Args:
+        offsets: [T,M,C] float32, the first row 0
+        weights: how much an error of each number shows, ≥ 0. [M,C]
+        render: called (1 + A)·(T − 2) times
+    """
+    attributes = moving_attributes(offsets)
+    courses = {
+        name: follow(offsets[:, :, columns], weights[:, columns]) for name, columns in attributes.items()
+    }
+    snapshots = len(offsets)
+    changes: list[list[Tensor]] = [[] for _ in attributes]
+    with torch.no_grad():
+        for t in range(1, snapshots - 1):
+            pixels = render(offsets[t])
+            stride = max(1, -(-len(pixels) // MOST_PIXELS))
+            for i, (name, columns) in enumerate(attributes.items()):
+                straight = offsets[t].clone()
+                straight[:, columns] = courses[name].lead[t] * offsets[-1, :, columns]
+                changes[i].append((pixels - render(straight))[::stride].flatten())
+    gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
+    if not attributes or snapshots < 3:
+        return RenderedCourses(courses, gram, 1, offsets.shape[2])
+    rows = torch.cat([torch.stack(own) for own in changes])
+    inner = snapshots - 2
+    products = (rows @ rows.T).double().reshape(len(attributes), inner, len(attributes), inner)
+    gram[:, 1:-1, :, 1:-1] = products
+    return RenderedCourses(courses, gram, rows.shape[1], offsets.shape[2])
