@@ -41,7 +41,7 @@ def random_gaussians(
 def orbit_camera(
     width: int = 40, height: int = 24, azimuth: float = 0.4, elevation: float = 0.3, distance: float = 4.0
 ) -> Camera:
-    """A camera on a sphere around the origin (angles in radians, y down), with a vertical field of view of 0.9."""
+    """A camera on a sphere around the origin (angles in radians, y down); vertical field of view 0.9."""
     az, el = torch.tensor(azimuth).double(), torch.tensor(elevation).double()
     eye = distance * torch.stack([az.sin() * el.cos(), -el.sin(), -az.cos() * el.cos()])
     viewmat = look_at(eye, torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
@@ -61,7 +61,7 @@ def one_gaussian(
     opacity: float = 0.8,
     rgb: tuple[float, float, float] = (0.9, 0.3, 0.1),
 ) -> Gaussians:
-    """A single Gaussian in activated units (opacity 0..1, standard deviations in world units, colour 0..1)."""
+    """A single Gaussian in activated units: opacity 0..1, deviations in world units, colour 0..1."""
     return Gaussians(
         means=torch.tensor([mean]),
         quats=torch.tensor([quat]),
@@ -111,7 +111,7 @@ class HardCase:
 
 
 def hard_cases() -> dict[str, HardCase]:
-    """Every hard case by name; the names are sentences' subjects, for test ids. Small images: each is quick."""
+    """Every hard case by name, for test ids. Small images: each is quick."""
     front = front_camera()
     cases: dict[str, HardCase] = {}
 

@@ -1,12 +1,13 @@
 """The differentiable rasteriser: one signature, several engines.
 
-`reference` is plain torch, slow, in any floating type: the oracle. `cpu` is numba, fast, with an analytic backward.
-The conventions both follow are in `conventions.py`; beyond those numbers:
+`reference` is plain torch, slow, in any floating type: the oracle. `cpu` is numba, fast, with an analytic
+backward. The conventions both follow are in `conventions.py`; beyond those numbers:
 
 - the support of a Gaussian is exactly {alpha ≥ 1/255}, whatever the tile size;
 - the near plane cuts at camera z > `near`; order is camera z in float32, ties by index;
 - pixel centres lie at column + 0.5, row + 0.5;
-- a Gaussian with a number that is not finite is not drawn; a quaternion that is zero or not finite is the identity.
+- a Gaussian with a number that is not finite is not drawn; a quaternion that is zero or not finite is the
+identity.
 """
 
 from __future__ import annotations
@@ -64,12 +65,14 @@ def rasterize(
         near: camera z below and at which nothing is drawn, world units
         sh_degree: 0..3; None where `colors` is rgb
         antialiased: scale opacities by sqrt(det/dilated det) of the 2D covariance (Mip-Splatting)
-        engine: a key of `ENGINES`; "cpu" computes in float32 (projection in float64) whatever the inputs' type
-        crop: draw only this window, with the full image's conventions; equals the slice of the full image bit for
-            bit. Gaussians that do not touch it cost next to nothing
+        engine: a key of `ENGINES`; "cpu" computes in float32 (projection in float64) whatever the inputs'
+            type
+        crop: draw only this window, with the full image's conventions; equals the slice of the full image
+            bit for bit. Gaussians that do not touch it cost next to nothing
 
     Returns:
-        image [H,W,3], transmittance [H,W] (of the window where there is a crop), and what the projection found.
+        image [H,W,3], transmittance [H,W] (of the window where there is a crop), and what the projection
+        found.
 
     Raises:
         ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown.

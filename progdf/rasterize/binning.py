@@ -1,7 +1,7 @@
 """Kernels: depth order by radix sort of the Gaussians, then a stable counting sort of them into tiles.
 
-Sorting N Gaussians once is much less than sorting their intersections with tiles; both sorts are stable, so the
-result does not depend on the number of threads.
+Sorting N Gaussians once is much less than sorting their intersections with tiles; both sorts are stable, so
+the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
@@ -97,19 +97,19 @@ def row_bounds(splat: Array, window: Array) -> tuple[int, int]:
 
 
 @kernel(inline=True)
-def side_points(splat: Array) -> float:
-    """How far above the centre the leftmost point of the support lies (and the rightmost below it), pixels."""
+def side_points(splat: Array) -> Number:
+    """dy of the leftmost point of the support, pixels; the rightmost has minus that."""
     inverse2 = 1.0 / (splat[L22] * splat[L22])
     inclined = splat[SLOPE] * inverse2
     return inclined * math.sqrt(splat[R2] / (splat[INV_L11] * splat[INV_L11] + splat[SLOPE] * inclined))
 
 
 @kernel(inline=True)
-def tile_columns(splat: Array, side: float, y_first: int, y_last: int, window: Array) -> tuple[int, int]:
+def tile_columns(splat: Array, side: Number, y_first: int, y_last: int, window: Array) -> tuple[int, int]:
     """First tile column and one past the last that the splat may reach in pixel rows y_first..y_last.
 
-    Columns count from the left edge of the full image. The bound is exact up to 1e-6 px: within a band of rows the
-    support's left edge is farthest out where the leftmost point is, or at the band's nearest row.
+    Columns count from the left edge of the full image. The bound is exact up to 1e-6 px: within a band of
+    rows the support's left edge is farthest out where the leftmost point is, or at the band's nearest row.
     """
     low, high = y_first + 0.5 - splat[MY], y_last + 0.5 - splat[MY]
     left_at, right_at = min(max(side, low), high), min(max(-side, low), high)
@@ -159,7 +159,8 @@ def count_tiles(splats: Array, window: Array, grid: Array, counts: Array, per_sp
 
 @kernel(cache=True)
 def place_tiles(counts: Array, tile_starts: Array, per_splat: Array) -> int:
-    """Turn counts into places, in place: where each part writes in each tile, and where each splat's list begins.
+    """Turn counts into places, in place: where each part writes in each tile, and where each splat's list
+    begins.
 
     Args:
         counts: as from `count_tiles`; out: the first place of each part in each tile. [parts, tiles] int64
@@ -193,8 +194,8 @@ def fill_tiles(
         splats, window, grid: as in `count_tiles`
         places, per_splat: as from `place_tiles`; places is used up
         members: out, the splats of all tiles, tile after tile. [I] int32
-        slots: out, for each member its place in an order by splat, so that gradients can be added up in one fixed
-            order. [I] int64, or [0] where nobody will ask
+        slots: out, for each member its place in an order by splat, so that gradients can be added up in one
+            fixed order. [I] int64, or [0] where nobody will ask
     """
     parts = places.shape[0]
     count = splats.shape[0]

@@ -10,28 +10,46 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.pixels import (
-    BATCH, BLUE, CARD, END, FIRST, GREEN, LANES, PEAK, PLANE, RED, START, STEP, STOP, TOP, U_PEAK, exp2, make_cards,
+    BATCH,
+    BLUE,
+    CARD,
+    END,
+    FIRST,
+    GREEN,
+    LANES,
+    PEAK,
+    PLANE,
+    RED,
+    START,
+    STEP,
+    STOP,
+    TOP,
+    U_PEAK,
+    exp2,
+    make_cards,
     tile_bounds,
 )  # fmt: skip
 
 Array = NDArray[Any]
 
-_ALPHA_MAX = np.float32(ALPHA_MAX)
-_T_MIN = np.float32(TRANSMITTANCE_MIN)
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ALPHA_MAX: Number = np.float32(ALPHA_MAX)
+_T_MIN: Number = np.float32(TRANSMITTANCE_MIN)
+_ZERO: Number = np.float32(0.0)
+_ONE: Number = np.float32(1.0)
 # planes of the state: transmittance (negative: the pixel is done), rgb, place in the tile's list of the last
 # contributor (-1: none; float32 holds it exactly up to 2^24)
 _G, _B, _LAST = PLANE * np.uint64(2), PLANE * np.uint64(3), PLANE * np.uint64(4)
 
 
 @kernel(fast=True, inline=True)
-def blend_row(state: Array, cards: Array, card: int, row: int, place: float) -> None:
+def blend_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> None:
     """Blend one row of a splat into a tile's state; `card` is where its card begins, see `pixels`."""
     start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
     peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
-    top, red, green, blue = cards[card + TOP + row], cards[card + RED], cards[card + GREEN], cards[card + BLUE]
+    top = cards[card + TOP + row]
+    red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
     begin = np.uint64(start) // LANES * LANES
     end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
@@ -76,8 +94,8 @@ def blend_tile(
 
 @kernel(parallel=True, cache=True)
 def blend(
-    splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, background: Array,
-    workers: int, image: Array, transmittance: Array, last: Array,
+    splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array,
+    background: Array, workers: int, image: Array, transmittance: Array, last: Array,
 ) -> None:  # fmt: skip
     """Blend all tiles.
 

@@ -1,8 +1,8 @@
 """Kernel: gradients of the blending, back to front, into one row per (splat, tile) intersection.
 
-Each row holds nine sums over the tile's pixels: the colour's gradient (3), and for g = alpha · dL/dalpha the moments
-Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v². In the whitened coordinates u, v they stay of the size of the result however thin
-the Gaussian is; in pixels they would cancel.
+Each row holds nine sums over the tile's pixels: the colour's gradient (3), and for g = alpha · dL/dalpha the
+moments Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v². In the whitened coordinates u, v they stay of the size of the
+result however thin the Gaussian is; in pixels they would cancel.
 """
 
 from __future__ import annotations
@@ -15,9 +15,26 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.pixels import (
-    BATCH, BLUE, CARD, END, FIRST, GREEN, LANES, PEAK, PLANE, RED, START, STEP, STOP, TOP, U_PEAK, V, exp2, make_cards,
+    BATCH,
+    BLUE,
+    CARD,
+    END,
+    FIRST,
+    GREEN,
+    LANES,
+    PEAK,
+    PLANE,
+    RED,
+    START,
+    STEP,
+    STOP,
+    TOP,
+    U_PEAK,
+    V,
+    exp2,
+    make_cards,
     tile_bounds,
 )  # fmt: skip
 
@@ -26,21 +43,23 @@ Array = NDArray[Any]
 SUMS = 9
 """Numbers of one intersection's row."""
 
-_ALPHA_MAX = np.float32(ALPHA_MAX)
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-# planes of the state: transmittance after the splat at hand; what lies behind it, times the gradient; the image's
-# gradient (3); place of the last contributor
+_ALPHA_MAX: Number = np.float32(ALPHA_MAX)
+_ZERO: Number = np.float32(0.0)
+_ONE: Number = np.float32(1.0)
+# planes of the state: transmittance after the splat at hand; what lies behind it, times the gradient; the
+# image's gradient (3); place of the last contributor
 _BEHIND, _G0, _G1 = PLANE, PLANE * np.uint64(2), PLANE * np.uint64(3)
 _G2, _LAST = PLANE * np.uint64(4), PLANE * np.uint64(5)
 
 
 @kernel(fast=True, inline=True)
-def unblend_row(state: Array, cards: Array, card: int, row: int, place: float) -> tuple[float, ...]:
+def unblend_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> tuple[Number, ...]:
     """Take one row of a splat off a tile's state; as `blend_row`. Returns Σ colour (3), Σg, Σg·u, Σg·u²."""
     start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
     sum_r = sum_g = sum_b = sum_0 = sum_u = sum_uu = _ZERO
     peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
-    top, red, green, blue = cards[card + TOP + row], cards[card + RED], cards[card + GREEN], cards[card + BLUE]
+    top = cards[card + TOP + row]
+    red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
     begin = np.uint64(start) // LANES * LANES
     end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
@@ -71,20 +90,21 @@ def unblend_row(state: Array, cards: Array, card: int, row: int, place: float) -
 
 @kernel(fast=True)
 def unblend_tile(
-    state: Array, x: int, y: int, members: Array, slots: Array, splats: Array, rgb: Array, bounds: Array, cards: Array,
-    sums: Array,
+    state: Array, x: int, y: int, members: Array, slots: Array, splats: Array, rgb: Array, bounds: Array,
+    cards: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """Take the splats off a tile, from its last contributor on; state is [6·PLANE], the rest as in `make_cards`."""
+    """Take the splats off a tile, last contributor first; state is [6·PLANE], the rest as in `make_cards`."""
     plane = np.int64(PLANE)
-    deepest = -_ONE
+    deepest: Number = -_ONE
     for p in range(5 * plane, 6 * plane):
         deepest = max(deepest, state[p])
-    seen = np.int64(deepest) + 1
+    seen: Number = np.int64(deepest) + 1
     for place in range(seen, members.size):
         for k in range(SUMS):
             sums[slots[place], k] = _ZERO
     for batch in range((seen + BATCH - 1) // BATCH - 1, -1, -1):
-        begin, end = batch * BATCH, min((batch + 1) * BATCH, seen)
+        begin: Number = batch * BATCH
+        end: Number = min(begin + BATCH, seen)
         make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
         for place in range(end - 1, begin - 1, -1):
             card = np.uint64(place - begin) * CARD
@@ -110,8 +130,8 @@ def unblend_tile(
 @kernel(parallel=True, cache=True)
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
-    background: Array, workers: int, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
-    sums: Array,
+    background: Array, workers: int, transmittance: Array, last: Array, grad_image: Array,
+    grad_transmittance: Array, sums: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same arguments.
 

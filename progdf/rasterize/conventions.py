@@ -19,7 +19,7 @@ TRANSMITTANCE_MIN = 1e-4
 """A Gaussian that would bring the transmittance to this or below is left out, and the pixel is done."""
 
 FRUSTUM_MARGIN = 0.3
-"""x/z and y/z in the Jacobian are clamped to the frustum plus this share of tan(fov/2) on each side (gsplat)."""
+"""x/z and y/z in the Jacobian are clamped to the frustum plus this share of tan(fov/2) on each side."""
 
 ANTIALIAS_FLOOR = 0.005
 """Least det(before dilation) / det(after) that the antialias option takes the root of."""
@@ -30,7 +30,8 @@ class RasterInfo:
     """What the projection found, not differentiable.
 
     Args:
-        means2d: centres in pixels; 0 for a Gaussian that is not in front of the near plane or not finite. [N,2]
+        means2d: centres in pixels; 0 for a Gaussian that is not in front of the near plane or not finite.
+            [N,2]
         depths: camera z, world units; 0 likewise. [N] float32
         visible: the box around its {alpha ≥ 1/255} touches the window that was rendered. [N] bool
     """

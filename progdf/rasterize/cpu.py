@@ -1,7 +1,7 @@
 """The fast engine: numba kernels behind one `torch.autograd.Function`.
 
-Projection is computed in float64, pixels in float32, whatever the type of the inputs; results are float32. The picture
-and the gradients are the same bits in every run and for every number of threads.
+Projection is computed in float64, pixels in float32, whatever the type of the inputs; results are float32.
+The picture and the gradients are the same bits in every run and for every number of threads.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Lists:
-    """What a forward pass found out, kept for the backward pass; see `projection` and `binning` for the layouts."""
+    """What a forward pass found out and the backward pass needs; layouts: `projection` and `binning`."""
 
     ids: Array
     ranks: Array
@@ -76,7 +76,8 @@ def rasterize(
     """See `progdf.rasterize.rasterize`."""
     view = _view(viewmat, K, width, height, near, sh_degree, antialiased, crop)
     inputs = [_float32(t) for t in (means, quats, scales, opacities, colors, background)]
-    image, transmittance, centres, depths, visible = _Rasterize.apply(view, *inputs, viewmat, K)
+    drawn = _Rasterize.apply(view, *inputs, viewmat, K)  # type: ignore[no-untyped-call]
+    image, transmittance, centres, depths, visible = drawn
     return image, transmittance, RasterInfo(centres, depths, visible)
 
 
@@ -151,8 +152,8 @@ def _list_splats(
     splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
     visible = np.zeros(n, np.bool_)
     projection.project(
-        ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
-        view.window, view.antialiased, splats, rgb, visible,
+        ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
+        view.size, view.window, view.antialiased, splats, rgb, visible,
     )  # fmt: skip
     tiles = int(view.grid[2] * view.grid[3])
     counts, per_splat = np.empty((workers, tiles), np.int64), np.empty(len(ids) + 1, np.int64)
@@ -183,8 +184,8 @@ class _Rasterize(torch.autograd.Function):
         with running("forward", 15) as workers:
             lists, found = _list_splats(view, gaussians, workers, any(ctx.needs_input_grad))
             blend(
-                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, background, workers,
-                image, transmittance, last,
+                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
+                background, workers, image, transmittance, last,
             )  # fmt: skip
         results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
         ctx.mark_non_differentiable(*results[2:])
@@ -193,7 +194,7 @@ class _Rasterize(torch.autograd.Function):
         return results
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         view, lists = ctx.view, ctx.lists
         *tensors, saved_transmittance = ctx.saved_tensors
@@ -205,15 +206,20 @@ class _Rasterize(torch.autograd.Function):
         grad_image, grad_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads[:2])
         sums = np.empty((len(lists.members), SUMS), np.float32)
         gradients = [np.zeros(array.shape, np.float32) for array in gaussians]
+        means, quats, scales, opacities, colors = gaussians
+        by_means, by_quats, by_scales, by_opacities, by_colors = gradients
         grad_camera = np.zeros((PARTS, CAMERA))
         with running("backward", 10) as workers:
             unblend(
-                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
-                background, workers, transmittance, ctx.last, grad_image, grad_transmittance, sums,
+                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
+                lists.slots, background, workers, transmittance, ctx.last, grad_image, grad_transmittance,
+                sums,
             )  # fmt: skip
             project_backward(
-                lists.ids, lists.ranks, *gaussians, view.degree, view.viewmat, view.intrinsics, view.size, view.antialiased,
-                lists.splats, lists.per_splat, sums, *gradients, grad_camera,
+                lists.ids, lists.ranks, means, quats, scales, opacities, colors, view.degree,
+                view.viewmat, view.intrinsics, view.size,
+                view.antialiased, lists.splats, lists.per_splat, sums,
+                by_means, by_quats, by_scales, by_opacities, by_colors, grad_camera,
             )  # fmt: skip
         results: list[Tensor | None] = [
             torch.from_numpy(array.reshape(shape)) for array, shape in zip(gradients, shapes, strict=True)

@@ -81,7 +81,7 @@ class Lens(NamedTuple):
 
 @kernel()
 def make_lens(viewmat: Array, intrinsics: Array, size: Array) -> Lens:
-    """A camera from world → camera [4,4], (fx, fy, cx, cy) [4], both float64, and (width, height) [2] int64."""
+    """A camera; world → camera [4,4] and fx, fy, cx, cy [4] in float64, width, height [2] in int64."""
     rows = (vec(viewmat, 0), vec(viewmat, 1), vec(viewmat, 2))
     shift = (viewmat[0, 3], viewmat[1, 3], viewmat[2, 3])
     turned = row_times(shift, rows)
@@ -92,7 +92,8 @@ def make_lens(viewmat: Array, intrinsics: Array, size: Array) -> Lens:
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
     return Lens(
         rows, shift, (-turned[0], -turned[1], -turned[2]), fx, fy, cx, cy,
-        -(cx / fx + margin_x), (width - cx) / fx + margin_x, -(cy / fy + margin_y), (height - cy) / fy + margin_y,
+        -(cx / fx + margin_x), (width - cx) / fx + margin_x, -(cy / fy + margin_y),
+        (height - cy) / fy + margin_y,
     )  # fmt: skip
 
 
@@ -141,7 +142,7 @@ class Footprint(NamedTuple):
 
 @kernel(contract=True, inline=True)
 def unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
-    """Unit quaternion and 1/length; the identity and 0 where it is zero or not finite, as `normalize_quats`."""
+    """Unit quaternion and 1/length; the identity and 0 where it is zero or not finite."""
     largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
     total = abs(w) + abs(x) + abs(y) + abs(z)
     if not (largest > 0.0 and total < np.inf):
@@ -181,5 +182,6 @@ def footprint(lens: Lens, mean: Vec, q0: float, q1: float, q2: float, q3: float,
     det0 = dot(normal, normal)
     return Footprint(
         x, y, inv_z, tan_x, tan_y, tan_x == ratio_x, tan_y == ratio_y, (qw, qx, qy, qz), inv_length, rotation,
-        a0, a1, turned0, turned1, p0, p1, a, b, c, normal, det0, det0 + DILATION * (a + c) + DILATION * DILATION,
+        a0, a1, turned0, turned1, p0, p1, a, b, c, normal, det0,
+        det0 + DILATION * (a + c) + DILATION * DILATION,
     )  # fmt: skip

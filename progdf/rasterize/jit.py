@@ -21,18 +21,22 @@ from progdf.rasterize.threads import threads
 log = logging.getLogger("progdf")
 
 FAST = {"nnan", "ninf", "nsz", "contract", "reassoc", "afn"}
-"""Float flags of the pixel loops: all but `arcp`, which costs a factor of 10 in gradient accuracy and buys nothing."""
+"""Float flags of the pixel loops: all but `arcp`, which costs gradients a decimal and buys no time."""
 
 if config.THREADING_LAYER == "default":
-    # OpenMP's threads spin between launches: with a busy neighbour, or torch's own threads, 1 ms becomes 90 ms
+    # OpenMP's threads spin between launches: with a busy neighbour, or torch's own threads, 1 ms becomes 90
+    # ms
     config.THREADING_LAYER = "workqueue"
+
+Number = Any
+"""A number inside a kernel, of the type numba infers: python's int and float cannot say float32 or uint64."""
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _lock = threading.RLock()
 
 
 def _source_version() -> str:
-    """Of all files here: numba's own cache notices neither changed constants nor changed imported functions."""
+    """Of all files here: numba's cache notices neither changed constants nor changed imported functions."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
@@ -40,7 +44,7 @@ def _source_version() -> str:
 
 
 def _cache_folder() -> Path:
-    """A folder of this user's that can be written, for this version of the kernels; never in the source tree."""
+    """A folder that this user may write, for this version of the kernels; never in the source tree."""
     if "NUMBA_CACHE_DIR" in os.environ:
         root = Path(os.environ["NUMBA_CACHE_DIR"])
     elif sys.platform == "win32":
@@ -63,7 +67,12 @@ CACHE = _cache_folder()
 
 
 def kernel(
-    *, fast: bool = False, contract: bool = False, parallel: bool = False, cache: bool = False, inline: bool = False
+    *,
+    fast: bool = False,
+    contract: bool = False,
+    parallel: bool = False,
+    cache: bool = False,
+    inline: bool = False,
 ) -> Callable[[_F], _F]:
     """Compile a function with numba.
 
@@ -101,7 +110,8 @@ def kernel(
 def running(stage: str, seconds: int) -> Iterator[int]:
     """Hold the kernels for one call and give the number of threads to use.
 
-    numba's `workqueue` layer aborts when two Python threads launch kernels at once, so one waits for the other.
+    numba's `workqueue` layer aborts when two Python threads launch kernels at once, so one waits for the
+    other.
 
     Args:
         stage: names the kernels that will run, to tell a cold start from a warm one

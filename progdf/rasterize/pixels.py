@@ -1,4 +1,4 @@
-"""What the pixel kernels share: exp2, the support of a splat in one row of a tile, the layout of a tile's state."""
+"""What the pixel kernels share: exp2, the layout of a tile's state, the support of a splat row by row."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MIN
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
@@ -22,11 +22,12 @@ LANES = np.uint64(8)
 """Pixels are worked on in aligned groups of this many."""
 
 PLANE = np.uint64(TILE_W * TILE_H)
-"""A tile's state is planes of this many float32 in one buffer, so that LLVM can tell that they do not overlap."""
+"""A tile's state is planes of this many float32 in one buffer: so LLVM can tell that they do not overlap."""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
-# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding (fitted by reweighted least squares)
+# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding (fitted by reweighted least
+# squares)
 _E1, _E2, _E3 = np.float32(0.6931470643273044), np.float32(0.240224367820186), np.float32(0.05549075707783424)
 _E4, _E5, _E6 = (
     np.float32(0.009579179674631904),
@@ -36,7 +37,7 @@ _E4, _E5, _E6 = (
 _ONE = np.float32(1.0)
 
 
-@intrinsic
+@intrinsic  # type: ignore[untyped-decorator]
 def _as_float(typingctx: Any, bits: Any) -> Any:
     """Bits of an int32 as a float32."""
 
@@ -46,7 +47,7 @@ def _as_float(typingctx: Any, bits: Any) -> Any:
     return types.float32(types.int32), generate
 
 
-@intrinsic
+@intrinsic  # type: ignore[untyped-decorator]
 def _as_int(typingctx: Any, number: Any) -> Any:
     """Bits of a float32 as an int32."""
 
@@ -57,7 +58,7 @@ def _as_int(typingctx: Any, number: Any) -> Any:
 
 
 @kernel(fast=True, inline=True)
-def exp2(x: float) -> float:
+def exp2(x: Number) -> Number:
     """2^x for x ≤ 0, below -126 as at -126; branch-free, so that loops around it vectorise. float32"""
     x = max(x, np.float32(-126.0))
     whole = np.int32(x)
@@ -70,12 +71,12 @@ BATCH = 16
 """Splats whose cards are made out at once: the pixel loops then branch on numbers that are long known."""
 
 START, STOP, PEAK, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
-"""Where a card holds its rows: first column of the support and one past its last, from the tile's left edge (none
-where the second is not the greater); the column nearest to the row's peak; u there, so that u = u_peak + l11 ·
-(column − peak); v; log2 of alpha where u is 0."""
+"""Where a card holds its rows: first column of the support and one past its last, from the tile's left edge
+(none where the second is not the greater); the column nearest to the row's peak; u there, so that u = u_peak
++ l11 · (column − peak); v; log2 of alpha where u is 0."""
 
 FIRST, END, STEP, RED, GREEN, BLUE = (np.uint64(6 * TILE_H + k) for k in range(6))
-"""Where a card holds: first row of the support and one past its last, from the tile's top; l11; the colour."""
+"""Where a card holds: first row of the support and one past its last, from the tile's top; l11; colour."""
 
 CARD = np.uint64(64)
 """float32 numbers of a card."""
@@ -83,8 +84,9 @@ CARD = np.uint64(64)
 
 @kernel(fast=True, inline=True)
 def make_cards(
-    members: Array, begin: int, end: int, splats: Array, rgb: Array, x: int, y: int, bounds: Array, cards: Array
-) -> None:
+    members: Array, begin: Number, end: Number, splats: Array, rgb: Array, x: int, y: int, bounds: Array,
+    cards: Array,
+) -> None:  # fmt: skip
     """Where some splats of a tile are at least 1/255, row by row, decided in float64.
 
     Args:
@@ -100,7 +102,8 @@ def make_cards(
     for place in range(begin, end):
         at = np.uint64(place - begin) * CARD
         s = members[place]
-        mx, my, slope, l11 = splats[s, MX] - x - 0.5, splats[s, MY] - y - 0.5, splats[s, SLOPE], splats[s, L11]
+        mx, my = splats[s, MX] - x - 0.5, splats[s, MY] - y - 0.5
+        slope, l11 = splats[s, SLOPE], splats[s, L11]
         inv_l11, l22, r2 = splats[s, INV_L11], splats[s, L22], splats[s, R2]
         for row in range(np.uint64(TILE_H)):
             dy = np.float64(np.int32(row)) - my
@@ -110,8 +113,8 @@ def make_cards(
             half = np.sqrt(max(rest, 0.0)) * inv_l11
             start = max(np.ceil(centre - half), low)
             stop = min(np.floor(centre + half) + 1.0, high)
-            # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far peaks
-            # (needles, giants) lie where l11 is small
+            # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far
+            # peaks (needles, giants) lie where l11 is small
             peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
             cards[at + START + row] = min(start, high)
             cards[at + STOP + row] = max(stop, low) if rest >= 0.0 else low
@@ -127,6 +130,6 @@ def make_cards(
 
 @kernel(inline=True)
 def tile_bounds(x: int, y: int, window: Array, bounds: Array) -> None:
-    """left, top, right, bottom of the part of a tile that lies in the window, from the tile's first pixel (x, y)."""
+    """left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""
     bounds[0], bounds[1] = max(0, window[0] - x), max(0, window[1] - y)
     bounds[2], bounds[3] = min(TILE_W, window[2] - x), min(TILE_H, window[3] - y)

@@ -1,7 +1,8 @@
 """Kernels: cull to the window, then project the survivors, in float64.
 
-A projected Gaussian ("splat") is eight float64, one cache line, in units in which alpha = 2^-(u² + v²) · opacity:
-u = l11 · (dx + slope · dy) and v = l22 · dy for a pixel at offset (dx, dy) from the centre. l is the Cholesky factor
+A projected Gaussian ("splat") is eight float64, one cache line, in units in which alpha = 2^-(u² + v²) ·
+opacity: u = l11 · (dx + slope · dy) and v = l22 · dy for a pixel at offset (dx, dy) from the centre. l is
+    the Cholesky factor
 of the conic times sqrt(log2(e) / 2), so the exponent cannot become positive however thin the Gaussian is.
 """
 
@@ -22,7 +23,7 @@ from progdf.rasterize.shading import fill_basis, view_direction
 Array = NDArray[Any]
 
 MX, MY, SLOPE, L11, INV_L11, L22, R2, EXTENT_Y = range(8)
-"""Columns of a splat: centre in pixels, the three shape numbers, u² + v² at alpha = 1/255, half height in pixels."""
+"""Columns of a splat: centre in pixels, shape, u² + v² at alpha = 1/255, half height in pixels."""
 
 UNIT = math.sqrt(0.5 * math.log2(math.e))
 """u and v per standard deviation."""
@@ -37,7 +38,8 @@ def _cull_range(
     size: Array, window: Array, near: float, centres: Array, depths: Array, candidates: Array,
 ) -> None:  # fmt: skip
     lens = make_lens(viewmat, intrinsics, size)
-    x0, y0, x1, y1 = np.float64(window[0]), np.float64(window[1]), np.float64(window[2]), np.float64(window[3])
+    x0, y0 = np.float64(window[0]), np.float64(window[1])
+    x1, y1 = np.float64(window[2]), np.float64(window[3])
     for i in range(begin, end):
         mean, scale, opacity = vec(means, i), vec(scales, i), np.float64(opacities[i])
         x, y = dot(lens.rows[0], mean) + lens.shift[0], dot(lens.rows[1], mean) + lens.shift[1]
@@ -65,8 +67,8 @@ def _cull_range(
 
 @kernel(parallel=True, cache=True)
 def cull(
-    means: Array, scales: Array, opacities: Array, viewmat: Array, intrinsics: Array, size: Array, window: Array,
-    near: float, centres: Array, depths: Array, candidates: Array,
+    means: Array, scales: Array, opacities: Array, viewmat: Array, intrinsics: Array, size: Array,
+    window: Array, near: float, centres: Array, depths: Array, candidates: Array,
 ) -> None:  # fmt: skip
     """Mark the Gaussians that may touch the window, by a bound that needs no covariance.
 
@@ -84,19 +86,20 @@ def cull(
     n = means.shape[0]
     for part in prange((n + _CHUNK - 1) // _CHUNK):
         _cull_range(
-            part * _CHUNK, min(n, (part + 1) * _CHUNK), means, scales, opacities, viewmat, intrinsics, size, window,
-            near, centres, depths, candidates,
+            part * _CHUNK, min(n, (part + 1) * _CHUNK), means, scales, opacities, viewmat, intrinsics, size,
+            window, near, centres, depths, candidates,
         )  # fmt: skip
 
 
 @kernel(contract=True)
 def _project_range(
-    begin: int, end: int, ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array,
-    colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array, window: Array, antialiased: bool,
-    splats: Array, rgb: Array, visible: Array,
+    begin: int, end: int, ids: Array, ranks: Array, means: Array, quats: Array, scales: Array,
+    opacities: Array, colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array,
+    window: Array, antialiased: bool, splats: Array, rgb: Array, visible: Array,
 ) -> None:  # fmt: skip
     lens = make_lens(viewmat, intrinsics, size)
-    x0, y0, x1, y1 = np.float64(window[0]), np.float64(window[1]), np.float64(window[2]), np.float64(window[3])
+    x0, y0 = np.float64(window[0]), np.float64(window[1])
+    x1, y1 = np.float64(window[2]), np.float64(window[3])
     basis = np.empty(16)
     bands = max(1, (degree + 1) ** 2)
     for k in range(begin, end):
@@ -129,13 +132,10 @@ def _project_range(
                 red += basis[band] * colors[i, band, 0]
                 green += basis[band] * colors[i, band, 1]
                 blue += basis[band] * colors[i, band, 2]
-            red, green, blue = (
-                0.0 if red < 0.0 else red,
-                0.0 if green < 0.0 else green,
-                0.0 if blue < 0.0 else blue,
-            )  # max() would hide a NaN
         if not abs(red) + abs(green) + abs(blue) < np.inf:
             continue
+        if degree >= 0:
+            red, green, blue = max(0.0, red), max(0.0, green), max(0.0, blue)
         visible[i] = True
         sigma_y, root = math.sqrt(var_y), math.sqrt(seen.det)
         splats[s, MX], splats[s, MY] = px, py
@@ -149,8 +149,8 @@ def _project_range(
 
 @kernel(parallel=True, cache=True)
 def project(
-    ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array, degree: int,
-    viewmat: Array, intrinsics: Array, size: Array, window: Array, antialiased: bool,
+    ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
+    degree: int, viewmat: Array, intrinsics: Array, size: Array, window: Array, antialiased: bool,
     splats: Array, rgb: Array, visible: Array,
 ) -> None:  # fmt: skip
     """Project and shade the candidates; read in the order of the scene, written in the order of depth.
@@ -168,6 +168,6 @@ def project(
     count = ids.size
     for part in prange((count + _CHUNK - 1) // _CHUNK):
         _project_range(
-            part * _CHUNK, min(count, (part + 1) * _CHUNK), ids, ranks, means, quats, scales, opacities, colors,
-            degree, viewmat, intrinsics, size, window, antialiased, splats, rgb, visible,
+            part * _CHUNK, min(count, (part + 1) * _CHUNK), ids, ranks, means, quats, scales, opacities,
+            colors, degree, viewmat, intrinsics, size, window, antialiased, splats, rgb, visible,
         )  # fmt: skip

@@ -1,8 +1,9 @@
 """Kernel: from the sums of all intersections to gradients of the inputs, in float64, in one fixed order.
 
-With σ = ½|Lᵀd|² and e = Lᵀd (that is u, v), a change δΣ of the 2D covariance changes σ by −½ eᵀ(Lᵀ δΣ L)e and a move
-δm of the centre by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ are all that is needed, and Lᵀ meets the 2D axes
-M = J·W·R·S in the product LᵀM, which does not cancel for needles when it is written with a cross product.
+With σ = ½|Lᵀd|² and e = Lᵀd (that is u, v), a change δΣ of the 2D covariance changes σ by −½ eᵀ(Lᵀ δΣ L)e
+and a move δm of the centre by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ are all that is needed, and Lᵀ meets
+the 2D axes M = J·W·R·S in the product LᵀM, which does not cancel for needles when it is written with a cross
+product.
 """
 
 from __future__ import annotations
@@ -16,7 +17,19 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.blend_backward import SUMS
 from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION
-from progdf.rasterize.geometry import Footprint, Lens, Vec, blend2, cross, dot, footprint, make_lens, row_times, times, vec
+from progdf.rasterize.geometry import (
+    Footprint,
+    Lens,
+    Vec,
+    blend2,
+    cross,
+    dot,
+    footprint,
+    make_lens,
+    row_times,
+    times,
+    vec,
+)  # fmt: skip
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection import R2, UNIT
 from progdf.rasterize.shading import shade_backward
@@ -24,7 +37,7 @@ from progdf.rasterize.shading import shade_backward
 Array = NDArray[Any]
 
 PARTS = 64
-"""The camera's gradients are added up in this many parts, whatever the number of threads: their bits depend on it."""
+"""The camera's gradients are added up in this many parts, for any number of threads: so bits are the same."""
 
 CAMERA = 16
 """Numbers of a part: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
@@ -63,17 +76,21 @@ def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, flo
         blend2(seen.a0[1], d0, seen.a1[1], d1),
         blend2(seen.a0[2], d0, seen.a1[2], d1),
     )
-    gw = 2.0 * (q1 * (v2[1] - v1[2]) + q2 * (v0[2] - v2[0]) + q3 * (v1[0] - v0[1]))
-    gx = 2.0 * (q2 * (v0[1] + v1[0]) + q3 * (v0[2] + v2[0]) + q0 * (v2[1] - v1[2]) - 2.0 * q1 * (v1[1] + v2[2]))
-    gy = 2.0 * (q1 * (v0[1] + v1[0]) + q3 * (v1[2] + v2[1]) + q0 * (v0[2] - v2[0]) - 2.0 * q2 * (v0[0] + v2[2]))
-    gz = 2.0 * (q1 * (v0[2] + v2[0]) + q2 * (v1[2] + v2[1]) + q0 * (v1[0] - v0[1]) - 2.0 * q3 * (v0[0] + v1[1]))
+    sym01, sym02, sym12 = v0[1] + v1[0], v0[2] + v2[0], v1[2] + v2[1]
+    skew01, skew02, skew12 = v1[0] - v0[1], v0[2] - v2[0], v2[1] - v1[2]
+    gw = 2.0 * (q1 * skew12 + q2 * skew02 + q3 * skew01)
+    gx = 2.0 * (q2 * sym01 + q3 * sym02 + q0 * skew12 - 2.0 * q1 * (v1[1] + v2[2]))
+    gy = 2.0 * (q1 * sym01 + q3 * sym12 + q0 * skew02 - 2.0 * q2 * (v0[0] + v2[2]))
+    gz = 2.0 * (q1 * sym02 + q2 * sym12 + q0 * skew01 - 2.0 * q3 * (v0[0] + v1[1]))
     radial = gw * q0 + gx * q1 + gy * q2 + gz * q3
     k = seen.inv_length
     return (gw - radial * q0) * k, (gx - radial * q1) * k, (gy - radial * q2) * k, (gz - radial * q3) * k
 
 
 @kernel(contract=True, inline=True)
-def _point_gradient(lens: Lens, seen: Footprint, grad_px: float, grad_py: float, ga: Vec, gb: Vec, camera: Array) -> Vec:
+def _point_gradient(
+    lens: Lens, seen: Footprint, grad_px: float, grad_py: float, ga: Vec, gb: Vec, camera: Array
+) -> Vec:
     """Gradient to the point in camera axes; adds the intrinsics' to `camera`. ga, gb: gradients to a0, a1.
 
     px = fx x/z + cx; a0 = fx/z (W0 − tan_x W2), where tan_x is x/z or a limit ((width − cx) + half)/fx,
@@ -82,7 +99,8 @@ def _point_gradient(lens: Lens, seen: Footprint, grad_px: float, grad_py: float,
     inv_z = seen.inv_z
     jx, jy = lens.fx * inv_z, lens.fy * inv_z
     down_a, down_b = dot(ga, lens.rows[2]), dot(gb, lens.rows[2])
-    grad_jx, grad_jy = dot(ga, lens.rows[0]) - seen.tan_x * down_a, dot(gb, lens.rows[1]) - seen.tan_y * down_b
+    grad_jx = dot(ga, lens.rows[0]) - seen.tan_x * down_a
+    grad_jy = dot(gb, lens.rows[1]) - seen.tan_y * down_b
     slope_x, slope_y = lens.fx * grad_px, lens.fy * grad_py
     camera[12] += grad_px * seen.x * inv_z + grad_jx * inv_z
     camera[13] += grad_py * seen.y * inv_z + grad_jy * inv_z
@@ -104,9 +122,9 @@ def _point_gradient(lens: Lens, seen: Footprint, grad_px: float, grad_py: float,
 
 @kernel(contract=True)
 def _project_backward_range(
-    begin: int, end: int, ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array,
-    colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
-    splats: Array, per_splat: Array, sums: Array,
+    begin: int, end: int, ids: Array, ranks: Array, means: Array, quats: Array, scales: Array,
+    opacities: Array, colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array,
+    antialiased: bool, splats: Array, per_splat: Array, sums: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
     camera: Array,
 ) -> None:  # fmt: skip
@@ -162,8 +180,8 @@ def _project_backward_range(
 
 @kernel(parallel=True, cache=True)
 def project_backward(
-    ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array, degree: int,
-    viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
+    ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
+    degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
     splats: Array, per_splat: Array, sums: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
     grad_camera: Array,
@@ -174,13 +192,14 @@ def project_backward(
         splats: nearest first. [V,8] float64
         per_splat: first row of `sums` of each splat. [V+1] int64
         sums: see `blend_backward`. [I,9] float32
-        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes of inputs
+        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes
+            of inputs
         grad_camera: out, zero on entry. [PARTS, CAMERA] float64
     """
     step = (ids.size + PARTS - 1) // PARTS
     for part in prange(PARTS):
         _project_backward_range(
-            part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities, colors,
-            degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums,
+            part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities,
+            colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera[part],
         )  # fmt: skip

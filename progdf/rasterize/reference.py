@@ -63,7 +63,7 @@ def rasterize(
     antialiased: bool,
     crop: tuple[int, int, int, int],
 ) -> tuple[Tensor, Tensor, RasterInfo]:
-    """See `progdf.rasterize.rasterize`; everything is computed in the type of `means`, projection in float64."""
+    """See `progdf.rasterize.rasterize`; computed in the type of `means`, projection in float64."""
     splats, info = project(
         means, quats, scales, opacities, colors, viewmat, K, width, height, near, sh_degree, antialiased, crop
     )
@@ -168,8 +168,8 @@ def tile_weights(splats: Splats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor
     """Alphas and blending weights of one 16x16 tile whose first pixel is (x, y).
 
     Returns:
-        alphas of the Gaussians that contribute, else 0 [256,n]; weights αT [256,n]; final transmittance [256];
-        the n rows of `splats` that may touch the tile, nearest first [n] int64
+        alphas of the Gaussians that contribute, else 0 [256,n]; weights αT [256,n]; final transmittance
+        [256]; the n rows of `splats` that may touch the tile, nearest first [n] int64
     """
     low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
     near_x = (high[:, 0] >= x) & (low[:, 0] <= x + TILE)
@@ -202,7 +202,8 @@ def alpha_weights(
     height, width = mask.shape
     window = (0, 0, width, height)
     splats, _ = project(
-        means, quats, scales, opacities, means.new_zeros(len(means), 3), viewmat, K, width, height, near, None, False, window
+        means, quats, scales, opacities, means.new_zeros(len(means), 3), viewmat, K, width, height,
+        near, None, False, window,
     )  # fmt: skip
     # two channels, zero beyond the image's edge: the mask, and what is image at all
     inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])

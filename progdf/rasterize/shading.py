@@ -83,8 +83,9 @@ def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array
 
 @kernel(contract=True)
 def shade_backward(
-    i: int, colors: Array, degree: int, point: Vec, eye: Vec, gradient: Vec, basis: Array, slopes: Array, out: Array
-) -> Vec:
+    i: int, colors: Array, degree: int, point: Vec, eye: Vec, gradient: Vec, basis: Array, slopes: Array,
+    out: Array,
+) -> Vec:  # fmt: skip
     """Gradients of Gaussian i's colour max(0, Σ basis·sh + 0.5).
 
     Args:

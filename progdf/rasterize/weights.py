@@ -10,9 +10,21 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.pixels import (
-    BATCH, CARD, END, FIRST, PEAK, START, STEP, STOP, TOP, U_PEAK, exp2, make_cards, tile_bounds,
+    BATCH,
+    CARD,
+    END,
+    FIRST,
+    PEAK,
+    START,
+    STEP,
+    STOP,
+    TOP,
+    U_PEAK,
+    exp2,
+    make_cards,
+    tile_bounds,
 )  # fmt: skip
 
 Array = NDArray[Any]
@@ -20,13 +32,14 @@ Array = NDArray[Any]
 SUMS = 4
 """Numbers of one intersection: Σ w·m, Σ m, Σ w, n."""
 
-_ALPHA_MAX = np.float32(ALPHA_MAX)
-_T_MIN = np.float32(TRANSMITTANCE_MIN)
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ALPHA_MAX: Number = np.float32(ALPHA_MAX)
+_T_MIN: Number = np.float32(TRANSMITTANCE_MIN)
+_ZERO: Number = np.float32(0.0)
+_ONE: Number = np.float32(1.0)
 
 
 @kernel()
-def add_weights(state: Array, cards: Array, card: int, mask: Array, out: Array) -> None:
+def add_weights(state: Array, cards: Array, card: Number, mask: Array, out: Array) -> None:
     """Blend one splat's transmittance into a tile and add its weights to `out`; mask begins at the tile."""
     for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
         peak, u_peak, top = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + TOP + row]
@@ -50,8 +63,8 @@ def add_weights(state: Array, cards: Array, card: int, mask: Array, out: Array) 
 
 @kernel(parallel=True, cache=True)
 def weigh(
-    splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array, mask: Array,
-    workers: int, sums: Array,
+    splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
+    mask: Array, workers: int, sums: Array,
 ) -> None:  # fmt: skip
     """Add up the weights of every (splat, tile) intersection; the first arguments as in `blend.blend`.
 
@@ -72,7 +85,8 @@ def weigh(
                 end = min(begin + BATCH, tile_starts[tile + 1])
                 make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
                 for place in range(begin, end):
-                    add_weights(state, cards, np.uint64(place - begin) * CARD, mask[y:, x:], sums[slots[place]])
+                    card = np.uint64(place - begin) * CARD
+                    add_weights(state, cards, card, mask[y:, x:], sums[slots[place]])
 
 
 @kernel(parallel=True, cache=True)
