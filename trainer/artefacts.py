@@ -1,8 +1,8 @@
 """The run folder: what lies where, whose folder it is, and pictures of views out and in.
 
 RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
-RUN/views/original|mask|final/VIEW.png          the view before, where the region is, after
-RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it, finished and at its other strengths
+RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
+RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
         edit: what identifies the edit (scene, region, editor)
 
     Raises:
-        ProgdfError: it is a file, holds something that is no run, or the run of another edit. Nothing is touched.
+        ProgdfError: it is a file, or holds no run, or the run of another edit. Nothing is touched.
     """
     if root.exists() and not root.is_dir():
         raise ProgdfError(f"{root} is a file; give --out a folder")
@@ -89,8 +89,8 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
         for what, value in edit.items():
             if earlier.get(what) != value:
                 raise ProgdfError(
-                    f"{root} holds a run with another {what} ({earlier.get(what)}); give --out another folder, "
-                    "or delete this one"
+                    f"{root} holds a run with another {what} ({earlier.get(what)}); "
+                    "give --out another folder, or delete this one"
                 )
     root.mkdir(parents=True, exist_ok=True)
     return folder

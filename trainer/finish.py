@@ -70,7 +70,8 @@ def finished(
     field = fitted.chosen.field
     log.say(
         f"{fitted.chosen.label}, the smallest of {fitted.tried} fields that serves: "
-        f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
+        f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
+        f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
     )
     if not fitted.met:
         log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
@@ -98,9 +99,9 @@ def finished(
     write_image(folder.picture, picture)
     edit = report["edit"]
     log.say(
-        f"held-out views: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}; between: "
-        + "; ".join(
-            f"s={s} {e['psnr']} (2 keyframes {e['keyframes2']})" for s, e in report["between"].items()
+        f"held-out views: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
+        + "".join(
+            f"; s={s} {e['psnr']} dB (2 keyframes {e['keyframes2']})" for s, e in report["between"].items()
         )
     )
     log.say(f"wrote {folder.gdf(options['name'])}")
@@ -123,7 +124,7 @@ def end_rows(stand: Stand, trajectory: Trajectory) -> Tensor:
 
 
 def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
-    """Largest difference of any raw number: at s = 1 from the recorded end, and outside the region at any s."""
+    """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
     outside = torch.ones(len(scene), dtype=torch.bool)
     outside[gdf.region.members] = False
     finished = compose(scene, [Layer(gdf, 1.0)])

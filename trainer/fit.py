@@ -1,4 +1,4 @@
-"""From a recorded trajectory to the field that is shipped, with its errors beside those of the honest baselines."""
+"""From a recorded trajectory to the field that is shipped, its errors beside those of honest baselines."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 class TrainOptions:
     """Edit a region of a scene and write its .gdf file.
 
-    Defaults are what measured best (see docs of `trainer.pgs`), where they differ from ProGDF (AAAI 2025).
+    Where a default differs from ProGDF (AAAI 2025), it measured better.
     """
 
     scene: tyro.conf.Positional[Path]
@@ -28,9 +28,9 @@ class TrainOptions:
     out: Path
     """Folder of the run; made if need be."""
     region: str
-    """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r; join with + and -."""
+    """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r; join by + -."""
     editor: str
-    """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, or folder:DIR with edited views."""
+    """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views)."""
     name: str = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     cameras: Path | None = None
@@ -44,7 +44,7 @@ class TrainOptions:
     kind: Literal["auto", "colour", "style", "geometry"] = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor says (folder: style)."""
     stages: int = 8
-    """Strengths that a procedural editor is asked for; 1 is the paper's optimisation towards the end alone."""
+    """Strengths that a procedural editor is asked for; 1 is the paper's way, towards the end alone."""
     progressive: Literal["warmup", "off"] = "off"
     """The paper's progressive constraint (eq. 5) as a warm-up of the learning rate."""
     slider: Slider = "stages"
@@ -103,7 +103,8 @@ def settled(options: TrainOptions) -> TrainOptions:
             raise ProgdfError(f"{what} is {value}; {low} to {high} would be right")
     if options.steps < 4 * options.stages:
         raise ProgdfError(
-            f"--steps is {options.steps}; at least {4 * options.stages} would be right for {options.stages} stages"
+            f"--steps is {options.steps}; at least {4 * options.stages} "
+            f"would be right for {options.stages} stages"
         )
     if not math.isfinite(options.target_psnr):
         raise ProgdfError(

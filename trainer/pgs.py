@@ -1,12 +1,12 @@
-"""PGS, progressive Gaussian splatting (ProGDF, AAAI 2025): the edit optimisation that records how it got there.
+"""PGS, progressive Gaussian splatting (ProGDF, AAAI 2025): the edit optimisation that records its own way.
 
-The paper lets one optimisation run towards the edited views and keeps its path. Its own in-betweens look worse
-than a straight line (method.md 3), so the targets are staged here: the editor pictures the edit at several
-strengths and the members are optimised towards each in turn. Within a stage the target moves too, from the last
-stage's pictures to its own, so that the way between them is short and straight.
+The paper lets one optimisation run towards the edited views and keeps its path. Its own in-betweens look
+worse than a straight line (method.md 3), so the targets are staged here: the editor pictures the edit at
+several strengths and the members are optimised towards each in turn. Within a stage the target moves too, from
+the last stage's pictures to its own, so that the way between them is short and straight.
 
-Measured on playbot_31k, its robot recoloured, held-out views, PSNR to the editor's picture at its stages and, mean
-and worst, half way between them (600 steps): 4 stages 29.3 and 27.4 / 24.2, 8 stages 30.4 and 30.8 / 27.9.
+Measured on playbot_31k, its robot recoloured, 600 steps, held-out views, PSNR to the editor's picture: with 4
+stages 29.3 dB at the stages and 27.4 (worst 24.2) half way between them, with 8 stages 30.4 and 30.8 (27.9).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _RATES_3DGS = {
     "sh0": 2.5e-3,
     "shN": 1.25e-4,
 }
-# How many times those an edit needs to arrive within a few hundred steps (method.md 3, learning rates). A colour edit
-# leaves the geometry alone: moving it too costs 1.4 dB on held-out views (30.6 against 32.0) and 11 floats a Gaussian.
+# How many times those an edit needs to arrive within a few hundred steps (method.md 3). A colour edit leaves
+# the geometry alone: moving it too costs 1.4 dB on held-out views (30.6 against 32.0) and 11 floats a Gaussian.
 _MULTIPLES: dict[EditKind, dict[str, float]] = {
     "colour": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},
     "style": {"means": 2, "log_scales": 2, "quats": 2, "logit_opacities": 0.4, "sh0": 24, "shN": 24},
@@ -54,6 +54,7 @@ class PgsSettings:
         perceptual_weight: weight of the perceptual term, which is paid for every second step
         progressive: "warmup" starts with short steps, "off" does not
         ramp: share of a stage's steps in which its target moves from the last stage's pictures to its own
+        fall: share of a stage's steps, its last, in which the learning rate falls to a tenth
         snapshots: recordings over all stages, about
         seed: order of the views
     """
@@ -62,6 +63,7 @@ class PgsSettings:
     perceptual_weight: float = 0.1
     progressive: Progressive = "off"
     ramp: float = 0.6
+    fall: float = 0.35
     snapshots: int = 32
     seed: int = 0
 
@@ -107,7 +109,7 @@ OnStep = Callable[[int, float], None]
 
 
 def learning_rates(kind: EditKind, channels: int, extent: float) -> Tensor:
-    """Learning rate of every column of a packed row. `extent`: size of what moves, world units. [C] float32"""
+    """Learning rate of every column of a packed row, [C]. `extent`: size of what moves, world units."""
     rates = torch.zeros(channels)
     for name, columns in attribute_slices(channels).items():
         scale = extent if name == "means" else 1.0
@@ -126,8 +128,8 @@ def optimise(
 ) -> Iterator[Snapshot]:
     """Optimise the member rows towards each stage in turn, and yield recordings.
 
-    A recording is made whenever the probes' pictures have moved by a share of what the stage has to move them, and
-    at every stage's end. Only the members exist here, so nothing else can drift.
+    A recording is made whenever the probes' pictures have moved by a share of what the stage has to move
+    them, and at every stage's end. Only the members exist here, so nothing else can drift.
 
     Args:
         original: raw member rows, packed. [M,14] or [M,14+3K]
@@ -167,7 +169,7 @@ def optimise(
             if not queue:
                 queue = torch.randperm(len(crops), generator=order).tolist()
             view = queue.pop()
-            optimiser.param_groups[0]["lr"] = _rate_factor(settings.progressive, step, local, stage.steps)
+            optimiser.param_groups[0]["lr"] = _rate_factor(settings, step, local, stage.steps)
             image, _ = crops[view].render(original + moved * settings.rates, moving)
             share = (local + 1) / max(1.0, settings.ramp * stage.steps)
             arrived = share >= 1.0
@@ -203,11 +205,10 @@ def optimise(
         before = stage.targets
 
 
-def _rate_factor(progressive: Progressive, step: int, local: int, steps: int) -> float:
-    """Flat, falling over the last third of a stage so that it ends near its target; early steps may be short."""
-    left = (steps - local) / steps
-    factor = min(1.0, 0.1 + 0.9 * left / 0.35)
-    return factor * (warmup(step) if progressive == "warmup" else 1.0)
+def _rate_factor(settings: PgsSettings, step: int, local: int, steps: int) -> float:
+    """Falls at a stage's end, so that it ends near its target; early steps may be short."""
+    factor = min(1.0, 0.1 + 0.9 * (steps - local) / (steps * settings.fall))
+    return factor * (warmup(step) if settings.progressive == "warmup" else 1.0)
 
 
 def _mean_distance(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:

@@ -63,7 +63,7 @@ def edited_views(
         views: all views
         strengths: what the editor is asked for
         folder: where the pictures go
-        confined: put back what the editor changed outside the region; members would be pulled over it otherwise
+        confined: put back what changed outside the region; members would be pulled over it otherwise
     """
     edited: dict[float, list[Tensor]] = {}
     for strength in strengths:

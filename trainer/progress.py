@@ -1,4 +1,4 @@
-"""How a run tells what it does: a bar with loss and time left on a terminal, plain lines elsewhere and in log.txt."""
+"""How a run tells what it does: a bar with loss and time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _EVERY_S = 5.0
 
 
 class RunLog:
-    """Writes what happens to log.txt and, unless quiet, to the screen (stderr); measures each stage's seconds.
+    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds.
 
     Args:
         path: log.txt

@@ -94,7 +94,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
 def report_picture(
     judge: Judge, measured: Measured, losses: Sequence[tuple[int, float, float]], title: str
 ) -> Tensor:
-    """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; errors over the slider.
+    """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
 
     Args:
         judge: held-out views; the one that shows most of the region is pictured

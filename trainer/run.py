@@ -1,4 +1,4 @@
-"""The whole job: scene → views → edited views → trajectory → field → .gdf and report, each stage's results on disk."""
+"""The whole job: scene → views → edited views → trajectory → field → .gdf and report, each on disk."""
 
 from __future__ import annotations
 
@@ -202,7 +202,11 @@ def _optimised(
     perceptual: Perceptual,
     log: RunLog,
 ) -> tuple[Trajectory, list[tuple[int, float, float]]]:
-    """PGS over the training views: the trajectory, even in time, and (step, loss to the stage, L1 to the finished edit) of its recordings."""
+    """PGS over the training views.
+
+    Returns:
+        The trajectory, even in time; (step, loss to the stage, L1 to the finished edit) of its recordings
+    """
     scene, members = stand.scene, stand.region.members
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     crops = [crop_scene(scene, members, v.camera, v.box, stand.background) for v in stand.train]
@@ -215,6 +219,9 @@ def _optimised(
         learning_rates(kind, original.shape[1], extent),
         PERCEPTUAL_WEIGHT[kind],
         options.progressive,
+        # one target alone is approached slowly: quick steps towards it shine in all colours half way
+        ramp=0.0 if kind == "geometry" else 0.9 if len(stages) == 1 else 0.6,
+        fall=1.0 if len(stages) == 1 else 0.35,
         seed=options.seed,
     )
     snapshots: list[tuple[int, int, bool, Tensor]] = []

@@ -17,9 +17,6 @@ from progdf.rasterize import Crop, rasterize
 from progdf.region import Region
 from progdf.sh import shade
 
-MOST_VIEWS = 96
-"""As many views as the paper edits at most."""
-
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
@@ -36,8 +33,7 @@ class View:
         mask: the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
         inside: the colour of the members alone, unmixed from what shares a pixel with them; meaningless
             where `mask` is 0. [H,W,3]
-        box: the pixels that an edit of the region can change, at least 64 each way where the image is that
-            large
+        box: the pixels that an edit can change, at least 64 each way where the image is that large
     """
 
     camera: Camera
@@ -124,9 +120,9 @@ def region_box(mask: Tensor, margin: int = 6) -> Crop:
 def region_rig(scene: Gaussians, region: Region, count: int, image_size: int) -> list[Camera]:
     """The orbit rig of the scene, aimed at the region and zoomed in on it.
 
-    The cameras stand where those of the whole scene would, so nothing new comes between them and the region; every
-    other one lets the region fill about 80 % of the picture, the rest 50 %: a hand that is 3 % of the scene is
-    trained on as many pixels as the whole body.
+    The cameras stand where those of the whole scene would, so nothing new comes between them and the region;
+    every other one lets the region fill about 80 % of the picture, the rest 50 %: a hand that is 3 % of the
+    scene is trained on as many pixels as the whole body.
 
     Args:
         scene: see `orbit_rig`

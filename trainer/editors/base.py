@@ -15,7 +15,7 @@ EditKind = Literal["colour", "style", "geometry"]
 class ImageEditor(Protocol):
     """Edits pictures of one region.
 
-    An editor with a dial of its own pictures any strength, one that knows nothing but the finished edit only 1.
+    An editor with a dial of its own pictures any strength, one that only knows the finished edit only 1.
     """
 
     @property

@@ -121,7 +121,7 @@ def stripes(what: str, scene: Gaussians, region: Region, views: Sequence[View]) 
 
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
-    """World axis along which the points spread most, period of seven stripes, phase. [M,3] -> [3], float, float"""
+    """World axis along which points [M,3] spread most, [3]; period of seven stripes; phase."""
     low, high = (torch.quantile(points[:: max(1, len(points) // 100_000)], q, dim=0) for q in (0.01, 0.99))
     longest = int((high - low).argmax())
     axis = torch.zeros(3)
@@ -133,8 +133,8 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
 def recolored(rgb: Tensor, target: Tensor, strength: float | Tensor, reference: Tensor) -> Tensor:
     """`colour.recolor` with calm greys on the way.
 
-    The hue of what is coloured turns; but a grey's hue is noise, and turned it shines in every colour of the rainbow
-    half way. So what has less chroma than the region's typical colour goes straight to its finished colour.
+    The hue of what is coloured turns; but a grey's hue is noise, and turned it shines in every colour of the
+    rainbow half way. So what has less chroma than the region's typical colour goes straight to its end.
 
     Args:
         rgb: sRGB colours. [...,3]
