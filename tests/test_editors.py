@@ -168,6 +168,25 @@ def test_a_folder_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, damag
     assert "\n" not in str(told.value)
 
 
+def test_an_edit_of_the_whole_picture_is_confined_to_the_region() -> None:
+    view = small().views[0]
+    confined = view.confined(1.0 - view.image)
+    assert torch.equal(confined[view.mask == 0], view.image[view.mask == 0])
+    inside = view.mask > 0.5
+    assert torch.allclose(confined[inside], 1.0 - view.image[inside], atol=1e-6)
+
+
+def test_a_box_grows_to_what_an_edit_changes() -> None:
+    view = small().views[0]
+    moved = view.image.clone()
+    moved[0, 0] = 1.0 - moved[0, 0]
+    x0, y0, x1, y1 = view.widened([moved, view.image]).box
+    assert (x0, y0) == (0, 0)
+    assert x1 >= view.box[2]
+    assert y1 >= view.box[3]
+    assert view.widened([view.image]).box == view.box
+
+
 def test_the_rig_covers_a_small_region_with_pixels() -> None:
     case = small("scarf", size=1500)
     for view in case.views:

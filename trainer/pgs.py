@@ -2,8 +2,8 @@
 
 The paper lets one optimisation run towards the edited views and keeps its path. Its own in-betweens look
 worse than a straight line (method.md 3), so the targets are staged here: the editor pictures the edit at
-several strengths and the members are optimised towards each in turn. Within a stage the target moves too, from
-the last stage's pictures to its own, so that the way between them is short and straight.
+several strengths and the members are optimised towards each in turn. Within a stage the target moves too,
+from the last stage's pictures to its own, so that the way between them is short and straight.
 
 Measured on playbot_31k, its robot recoloured, 600 steps, held-out views, PSNR to the editor's picture: with 4
 stages 29.3 dB at the stages and 27.4 (worst 24.2) half way between them, with 8 stages 30.4 and 30.8 (27.9).
@@ -36,7 +36,7 @@ _RATES_3DGS = {
     "shN": 1.25e-4,
 }
 # How many times those an edit needs to arrive within a few hundred steps (method.md 3). A colour edit leaves
-# the geometry alone: moving it too costs 1.4 dB on held-out views (30.6 against 32.0) and 11 floats a Gaussian.
+# the geometry alone: moving it too costs 1.4 dB on held-out views (30.6, not 32.0) and 11 floats a Gaussian.
 _MULTIPLES: dict[EditKind, dict[str, float]] = {
     "colour": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},
     "style": {"means": 2, "log_scales": 2, "quats": 2, "logit_opacities": 0.4, "sh0": 24, "shN": 24},

@@ -52,8 +52,11 @@ class View:
         return (self.image + self.mask[..., None] * change).clamp(0.0, 1.0)
 
     def confined(self, edited: Tensor) -> Tensor:
-        """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]"""
-        return torch.lerp(self.image, edited, self.mask[..., None])
+        """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]
+
+        A pixel that shows the region to a fifth is taken as it is: it is mixed already, as its editor left it.
+        """
+        return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
     def widened(self, edited: Sequence[Tensor]) -> View:
         """The view with its box grown to all that these pictures of it change visibly."""
