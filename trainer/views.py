@@ -54,7 +54,7 @@ class View:
     def confined(self, edited: Tensor) -> Tensor:
         """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]
 
-        A pixel that shows the region to a fifth is taken as it is: it is mixed already, as its editor left it.
+        A pixel that shows the region to a fifth is taken as its editor left it: it is mixed already.
         """
         return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
