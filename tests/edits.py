@@ -1,0 +1,65 @@
+"""Builders of trajectories, fields and edits that tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import torch
+from torch import Tensor
+
+from progdf.checkpoint import Gdf, fingerprint
+from progdf.field import BakedField, fit_separable
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
+from progdf.region import Region
+
+
+def curved_trajectory(
+    members: int,
+    seed: int = 0,
+    channels: int = BASE_CHANNELS,
+    moving: Collection[str] = ATTRIBUTES,
+    snapshots: int = 9,
+) -> tuple[Tensor, Tensor]:
+    """Strengths [T] and offsets [T,M,C] of members that bend away from the straight way in two manners."""
+    rng = torch.Generator().manual_seed(seed)
+    strengths = torch.linspace(0, 1, snapshots)
+    bend, wave = torch.sin(torch.pi * strengths), torch.sin(2 * torch.pi * strengths)
+    offsets = torch.zeros(snapshots, members, channels)
+    for course, size in ((strengths, 1.0), (bend, 0.5), (wave, 0.2)):
+        offsets += course[:, None, None] * size * torch.randn(members, channels, generator=rng)
+    for name, columns in attribute_slices(channels).items():
+        if name not in moving:
+            offsets[:, :, columns] = 0.0
+    offsets[0] = 0.0
+    return strengths, offsets
+
+
+def curved_field(
+    members: int,
+    seed: int = 0,
+    channels: int = BASE_CHANNELS,
+    moving: Collection[str] = ATTRIBUTES,
+    rank: int = 2,
+    rest_type: torch.dtype = torch.int8,
+) -> BakedField:
+    """A separable field of `curved_trajectory`."""
+    strengths, offsets = curved_trajectory(members, seed, channels, moving)
+    return fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), rest_type=rest_type)
+
+
+def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "shirt") -> Gdf:
+    """An edit of these rows ([M] int64, sorted)."""
+    score = torch.zeros(len(scene))
+    score[members] = 1.0
+    return Gdf(name, Region(name, members, score), field, fingerprint(scene), "recolor:#3060d0")
+
+
+def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:
+    """`count` different rows, sorted. [M] int64"""
+    rng = torch.Generator().manual_seed(seed)
+    return torch.randperm(len(scene), generator=rng)[:count].sort().values
+
+
+def bits(gaussians: Gaussians) -> dict[str, bytes]:
+    """Every attribute's bytes, so that 0.0 and −0.0 differ."""
+    return {name: getattr(gaussians, name).contiguous().numpy().tobytes() for name in ATTRIBUTES}

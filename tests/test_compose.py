@@ -1,0 +1,301 @@
+"""The rules of several edits on one scene, and that dragging a slider follows them to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from edits import bits, curved_field, edit_of, some_rows
+from scenes import random_gaussians
+
+from progdf.checkpoint import Gdf
+from progdf.compose import BLENDS, Gains, Layer, compose
+from progdf.composer import Composer
+from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
+from progdf.rasterize import set_threads
+
+COLOUR = ("sh0", "shN")
+
+
+def scene_with_signed_zeros(count: int = 400) -> Gaussians:
+    scene = random_gaussians(count, seed=3, sh_degree=1)
+    return replace(
+        scene, sh0=scene.sh0 * (scene.sh0.abs() > 0.4), means=scene.means.index_fill(0, torch.arange(9), -0.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Gaussians:
+    return scene_with_signed_zeros()
+
+
+@pytest.fixture(scope="module")
+def shirt(scene: Gaussians) -> Gdf:
+    return edit_of(scene, some_rows(scene, 150, 1), curved_field(150, 1), "shirt")
+
+
+@pytest.fixture(scope="module")
+def hat(scene: Gaussians) -> Gdf:
+    return edit_of(scene, some_rows(scene, 120, 2), curved_field(120, 2, moving=("sh0",)), "hat")
+
+
+def change(scene: Gaussians, edited: Gaussians) -> torch.Tensor:
+    return pack(edited, True).double() - pack(scene, True).double()
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_strength_zero_is_the_original_bit_for_bit(
+    scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str
+) -> None:
+    assert bits(compose(scene, [Layer(shirt, 0.0), Layer(hat, -0.0)], blend)) == bits(scene)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_one_layer_at_full_strength_is_the_recorded_end_exactly(
+    scene: Gaussians, shirt: Gdf, blend: str
+) -> None:
+    edited = compose(scene, [Layer(shirt, 1.0)], blend)
+    full = torch.cat([bases.full for bases in shirt.field.attributes.values()], dim=1)
+    expected = scene.replace_rows(shirt.region.members, pack(scene)[shirt.region.members] + full)
+    assert bits(edited) == bits(expected)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_rows_outside_all_members_keep_their_bytes(
+    scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str
+) -> None:
+    outside = torch.ones(len(scene), dtype=torch.bool)
+    outside[shirt.region.members] = False
+    outside[hat.region.members] = False
+    edited = compose(scene, [Layer(shirt, 0.7), Layer(hat, 0.9)], blend)
+    assert bits(edited[outside]) == bits(scene[outside])
+
+
+def test_attributes_that_no_layer_moves_are_the_scenes_own(scene: Gaussians, hat: Gdf) -> None:
+    edited = compose(scene, [Layer(hat, 0.5)])
+    assert edited.means is scene.means
+    assert edited.shN is scene.shN
+
+
+def test_rows_of_weight_zero_keep_their_bytes(scene: Gaussians, shirt: Gdf) -> None:
+    weights = torch.ones(150)
+    weights[::2] = 0.0
+    edited = compose(scene, [Layer(shirt, 0.6, weights=weights)])
+    untouched = shirt.region.members[::2]
+    assert bits(edited[untouched]) == bits(scene[untouched])
+
+
+def test_weights_scale_the_change(scene: Gaussians, shirt: Gdf) -> None:
+    whole = change(scene, compose(scene, [Layer(shirt, 0.6)]))
+    half = change(scene, compose(scene, [Layer(shirt, 0.6, weights=torch.full((150,), 0.5))]))
+    assert torch.allclose(half, whole / 2, atol=1e-6)
+
+
+def test_gains_scale_their_own_kind_of_attribute_only(scene: Gaussians, shirt: Gdf) -> None:
+    whole = change(scene, compose(scene, [Layer(shirt, 0.6)]))
+    found = change(
+        scene, compose(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, colour=2.0))])
+    )
+    slices = attribute_slices(whole.shape[1])
+    for names, gain in ((("means", "log_scales", "quats"), 0.5), (("logit_opacities",), 0.0), (COLOUR, 2.0)):
+        for name in names:
+            assert torch.allclose(found[:, slices[name]], gain * whole[:, slices[name]], atol=1e-6), name
+
+
+def test_disabled_layers_do_nothing(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    assert bits(compose(scene, [Layer(shirt, 0.8), Layer(hat, 1.0, enabled=False)])) == bits(
+        compose(scene, [Layer(shirt, 0.8)])
+    )
+
+
+@pytest.mark.parametrize("blend", ["normalised", "sum"])
+def test_the_order_of_layers_does_not_matter(scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str) -> None:
+    layers = [Layer(shirt, 0.8), Layer(hat, 0.9)]
+    a, b = (change(scene, compose(scene, order, blend)) for order in (layers, layers[::-1]))
+    assert torch.allclose(a, b, atol=1e-6)
+
+
+def test_normalised_is_the_plain_sum_while_strengths_add_up_to_one(
+    scene: Gaussians, shirt: Gdf, hat: Gdf
+) -> None:
+    layers = [Layer(shirt, 0.5), Layer(hat, 0.5)]
+    assert bits(compose(scene, layers, "normalised")) == bits(compose(scene, layers, "sum"))
+
+
+def test_normalised_shares_where_strengths_add_up_to_more(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    layers = [Layer(shirt, 1.0), Layer(hat, 0.5)]
+    both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
+    assert len(both) > 10
+    summed = change(scene, compose(scene, layers, "sum"))[both]
+    shared = change(scene, compose(scene, layers, "normalised"))[both]
+    assert torch.allclose(shared, summed / 1.5, atol=1e-6)
+
+
+def test_over_puts_the_last_layer_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
+    stacked = compose(scene, [Layer(shirt, 1.0), Layer(hat, 1.0)], "over")
+    alone = compose(scene, [Layer(hat, 1.0)])
+    assert torch.allclose(pack(stacked, True)[both], pack(alone, True)[both], atol=1e-6)
+
+
+def test_an_overshooting_layer_alone_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:
+    assert bits(compose(scene, [Layer(shirt, 1.2)])) == bits(compose(scene, [Layer(shirt, 1.2)], "sum"))
+
+
+@pytest.mark.parametrize("strength", [float("nan"), float("inf")])
+def test_strengths_that_are_no_numbers_are_refused(scene: Gaussians, shirt: Gdf, strength: float) -> None:
+    with pytest.raises(ProgdfError, match="the strength of shirt is"):
+        compose(scene, [Layer(shirt, strength)])
+
+
+def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
+    with pytest.raises(ProgdfError, match="normalised, sum, over"):
+        compose(scene, [Layer(shirt)], "multiply")
+
+
+@pytest.mark.parametrize(
+    "weights", [torch.ones(149), torch.full((150,), 1.5), torch.full((150,), float("nan"))]
+)
+def test_weights_that_do_not_fit_are_refused(scene: Gaussians, shirt: Gdf, weights: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="weights of shirt"):
+        compose(scene, [Layer(shirt, 0.5, weights=weights)])
+
+
+def test_an_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> None:
+    with pytest.raises(ProgdfError, match="shirt was made for another scene: it has 400 Gaussians"):
+        compose(random_gaussians(30), [Layer(shirt)])
+
+
+# ---- the fast twin
+
+
+@pytest.fixture(scope="module")
+def wardrobe(scene: Gaussians, shirt: Gdf, hat: Gdf) -> list[Gdf]:
+    """Overlapping edits of every storage type: int8, one member of float32, everything in float16 with SH."""
+    channels = 14 + 9
+    single = edit_of(
+        scene, some_rows(scene, 1, 5), curved_field(1, 5, channels, rest_type=torch.float32), "pin"
+    )
+    night = curved_field(len(scene), 6, channels, ("means", "quats", "shN"), rest_type=torch.float16)
+    return [shirt, hat, single, edit_of(scene, torch.arange(len(scene)), night, "night")]
+
+
+def random_stack(rng: np.random.Generator, wardrobe: list[Gdf], order: np.ndarray) -> list[Layer]:
+    layers = []
+    for place in order:
+        gdf = wardrobe[place]
+        weights = (
+            torch.from_numpy(rng.random(len(gdf.region)).astype(np.float32)) if rng.random() < 0.4 else None
+        )
+        if weights is not None:
+            weights[torch.from_numpy(rng.random(len(weights)) < 0.3)] = 0.0
+        gains = Gains(*(float(gain) for gain in rng.choice([0.0, 1.0, 0.5], 3)))
+        strength = float(rng.choice([0.0, 1.0, 0.5, 1.2, rng.random()]))
+        layers.append(Layer(gdf, strength, bool(rng.random() < 0.9), gains, weights))
+    return layers
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_composer_gives_the_bits_of_compose_through_a_random_session(
+    scene: Gaussians, wardrobe: list[Gdf], blend: str
+) -> None:
+    rng = np.random.default_rng(BLENDS.index(blend))
+    composer = Composer(scene, wardrobe)
+    before = pack(scene, True)
+    for step in range(60):
+        if step % 5 == 0:
+            order = rng.permutation(4)[: rng.integers(0, 5)]
+        layers = random_stack(rng, wardrobe, order)
+        told = composer.update(layers, blend)
+        assert bits(composer.gaussians) == bits(compose(scene, layers, blend))
+        now = pack(composer.gaussians, True).clone()
+        moved = (now != before).any(dim=1).nonzero()[:, 0].numpy()
+        assert np.isin(moved, told.rows).all()
+        for name, columns in attribute_slices(now.shape[1]).items():
+            assert name in told.attributes or torch.equal(now[:, columns], before[:, columns])
+        farthest = float((now[:, :3].double() - before[:, :3].double()).norm(dim=1).max())
+        assert told.largest_move == pytest.approx(farthest, rel=1e-5, abs=1e-7)
+        before = now
+
+
+def test_the_composer_leaves_the_scene_alone(scene: Gaussians, shirt: Gdf) -> None:
+    before = bits(scene)
+    Composer(scene, [shirt]).update([Layer(shirt, 0.5)])
+    assert bits(scene) == before
+
+
+def test_a_slider_changes_the_rows_of_its_own_edit_only(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    composer = Composer(scene, [shirt, hat])
+    composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)])
+    told = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalised")
+    assert np.array_equal(told.rows, hat.region.members.numpy())
+
+
+def test_nothing_is_reported_where_nothing_changed(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    composer.update([Layer(shirt, 0.5)])
+    told = composer.update([Layer(shirt, 0.5)])
+    assert (len(told.rows), told.attributes, told.largest_move) == (0, (), 0.0)
+
+
+def test_a_colour_gain_does_not_ask_for_a_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    composer.update([Layer(shirt, 0.5)])
+    told = composer.update([Layer(shirt, 0.5, gains=Gains(colour=0.3))])
+    assert told.attributes == ("sh0",)
+    assert not told.means_moved
+    assert not told.covariance_moved
+
+
+def test_weights_painted_in_place_are_seen(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    weights = torch.ones(150)
+    composer.update([Layer(shirt, 0.5, weights=weights)])
+    weights[:75] = 0.25
+    composer.update([Layer(shirt, 0.5, weights=weights)])
+    assert bits(composer.gaussians) == bits(compose(scene, [Layer(shirt, 0.5, weights=weights)]))
+
+
+def test_one_thread_and_two_give_the_same_bits() -> None:
+    scene = random_gaussians(40_000, seed=9)
+    edit = edit_of(scene, torch.arange(40_000), curved_field(40_000, 9, moving=("means", "sh0"), rank=1))
+    found = []
+    try:
+        for count in (1, 2):
+            set_threads(count)
+            composer = Composer(scene, [edit])
+            composer.update([Layer(edit, 0.37)])
+            found.append(bits(composer.gaussians))
+    finally:
+        set_threads(None)
+    assert found[0] == found[1]
+
+
+def test_numbers_that_are_not_finite_stay_in_their_row(shirt: Gdf, scene: Gaussians) -> None:
+    spoiled = replace(scene, sh0=scene.sh0.index_fill(0, shirt.region.members[:1], float("nan")))
+    composer = Composer(spoiled, [shirt])
+    composer.update([Layer(shirt, 0.5)])
+    assert composer.gaussians.sh0.isnan().any(dim=1).sum() == 1
+
+
+def test_an_edit_without_any_change_is_an_edit(scene: Gaussians) -> None:
+    still = edit_of(scene, some_rows(scene, 7), curved_field(7, moving=()))
+    composer = Composer(scene, [still])
+    composer.update([Layer(still, 0.5)])
+    assert bits(composer.gaussians) == bits(compose(scene, [Layer(still, 0.5)])) == bits(scene)
+
+
+def test_a_stranger_is_refused_by_the_composer(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    with pytest.raises(ValueError, match="hat is not one of the composer's edits"):
+        Composer(scene, [shirt]).update([Layer(hat, 0.5)])
+
+
+def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
+    everything = curved_field(len(scene), 1, 14 + 9)
+    edit = edit_of(scene, torch.arange(len(scene)), everything)
+    mute = compose(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0))])
+    assert set(everything.attributes) == set(ATTRIBUTES)
+    assert bits(mute) == bits(scene)
