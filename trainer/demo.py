@@ -93,15 +93,15 @@ SHOWS = {
         view=0,
         inside=True,
         # from inside each view shows a part only: more of them, and more steps to come round to each
-        draft=Effort(views=16, image_size=192, steps=320),
-        full=Effort(views=30, image_size=256, steps=800),
+        draft=Effort(views=16, image_size=160, steps=200),
+        full=Effort(views=30, image_size=256, steps=560),
         edits=(
             DemoEdit("rug", ("rug",), "recolor:#3a55b4"),
             DemoEdit("walls", ("walls",), "recolor:#e0a458"),
             DemoEdit(
-                "night",
+                "dusk",
                 ("walls", "rug", "floor", "ceiling", "table", "stool", "ball", "picture"),
-                "night:0.8",
+                "tint:#4f6fd8",
             ),
         ),
     ),
