@@ -98,6 +98,7 @@ class CpuPainter:
         self._presenter = None if ctx is None else Presenter(ctx)
         self._texture: moderngl.Texture | None = None
         self._picture: torch.Tensor | None = None
+        self._shown: torch.Tensor | None = None  # the picture that the texture holds
         self._scene: Gaussians | None = None
 
     def upload(self, scene: Gaussians) -> None:
@@ -143,13 +144,15 @@ class CpuPainter:
     def show(self, framebuffer: moderngl.Framebuffer) -> None:
         assert self._ctx is not None, "nothing to show on without a context"
         assert self._presenter is not None
-        image = self.pixels()
-        size = (image.shape[1], image.shape[0])
-        if self._texture is None or self._texture.size != size:
-            if self._texture is not None:
-                self._texture.release()
-            self._texture = self._ctx.texture(size, 3, dtype="f4")
-        self._texture.write(np.ascontiguousarray(image))
+        if self._shown is not self._picture or self._texture is None:
+            image = np.ascontiguousarray(self.pixels())
+            size = (image.shape[1], image.shape[0])
+            if self._texture is None or self._texture.size != size:
+                if self._texture is not None:
+                    self._texture.release()
+                self._texture = self._ctx.texture(size, 3, dtype="f4")
+            self._texture.write(image)
+            self._shown = self._picture
         self._presenter.show(self._texture, framebuffer)
 
     def release(self) -> None:

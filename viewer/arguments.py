@@ -1,0 +1,162 @@
+"""What people type after `progdf render` and `progdf export`, taken apart; each mistake is one clear line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from progdf.camera import Camera
+from progdf.camera_files import load_cameras
+from progdf.checkpoint import Gdf, load_gdf
+from progdf.colour import parse_color
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+
+from .state import LayerState, Vec3, ViewCamera
+from .turntable import FARTHEST
+
+LARGEST_SIDE = 16_384
+
+
+def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tuple[Gdf, ...]:
+    """The edits of a scene; a second one of the same name becomes NAME-2, so that --set can tell them apart.
+
+    Raises:
+        ProgdfError: a file is missing, broken, or was made for another scene.
+    """
+    gdfs: list[Gdf] = []
+    for path in paths:
+        gdf = load_gdf(path, scene, scene_path.name)
+        taken = {other.name for other in gdfs}
+        name, number = gdf.name, 2
+        while name in taken:
+            name, number = f"{gdf.name}-{number}", number + 1
+        gdfs.append(replace(gdf, name=name))
+    return tuple(gdfs)
+
+
+def layers_of(gdfs: Sequence[Gdf], settings: Sequence[str]) -> tuple[LayerState, ...]:
+    """One layer per edit, at 0 unless a `NAME=S` of `settings` says otherwise.
+
+    Raises:
+        ProgdfError: there is no edit NAME, or S is no number from 0 to 1.
+    """
+    strengths = {gdf.name: 0.0 for gdf in gdfs}
+    for setting in settings:
+        name, equals, text = setting.rpartition("=")
+        if not equals or not name:
+            raise ProgdfError(f"--set {setting} has no NAME=S; write for example --set {_example(gdfs)}=0.7")
+        strengths[known_edit(name, gdfs, "--set")] = _strength(setting, text)
+    return tuple(LayerState(i, gdf.name, strengths[gdf.name]) for i, gdf in enumerate(gdfs))
+
+
+def known_edit(name: str, gdfs: Sequence[Gdf], option: str) -> str:
+    """`name`, when an edit has it.
+
+    Raises:
+        ProgdfError: none has; the message lists those there are.
+    """
+    if name in {gdf.name for gdf in gdfs}:
+        return name
+    if not gdfs:
+        raise ProgdfError(f"{option} {name}: no .gdf file was given; name one after the scene")
+    names = ", ".join(gdf.name for gdf in gdfs)
+    raise ProgdfError(f"{option} {name}: there is no edit of that name; there {_are(gdfs)} {names}")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of `WxH`, pixels.
+
+    Raises:
+        ProgdfError: it is no size, or one that no picture should have.
+    """
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal()):
+        raise ProgdfError(f"--size {text} is not a size; write it as WIDTHxHEIGHT, for example 640x480")
+    size = int(width), int(height)
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise ProgdfError(f"--size {text} cannot be drawn; each side may be 1 to {LARGEST_SIDE} pixels")
+    return size
+
+
+def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
+    """The camera of `AZIMUTH,ELEVATION[,DISTANCE]`: degrees, degrees above the horizon, world units.
+
+    Args:
+        text: what was typed
+        framed: shows the scene; gives the pivot, the up axis, and the distance where none is said
+
+    Raises:
+        ProgdfError: it is not two or three finite numbers, or the camera cannot stand there.
+    """
+    right = "write AZIMUTH,ELEVATION or AZIMUTH,ELEVATION,DISTANCE, for example --orbit 30,15"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ProgdfError(f"--orbit {text} is not a list of numbers; {right}") from None
+    if len(numbers) not in (2, 3) or not all(math.isfinite(number) for number in numbers):
+        raise ProgdfError(f"--orbit {text} is not two or three numbers; {right}")
+    if not -90 <= numbers[1] <= 90:
+        raise ProgdfError(
+            f"--orbit {text}: the elevation is {numbers[1]:g}; -90 to 90 degrees would be right"
+        )
+    distance = numbers[2] if len(numbers) == 3 else framed.distance
+    if not 0 < distance <= FARTHEST:
+        raise ProgdfError(f"--orbit {text}: the distance is {distance:g}; it must be above 0, in world units")
+    return replace(framed, azimuth=numbers[0], elevation=numbers[1], distance=distance)
+
+
+def read_camera(text: str) -> Camera:
+    """The camera of `FILE[:INDEX]`, the first one where no index is given; −1 is the last.
+
+    Raises:
+        ProgdfError: the file is missing or holds no cameras, or not that many.
+    """
+    name, colon, index = text.rpartition(":")
+    numbered = bool(colon) and index.lstrip("-").isdecimal() and not Path(text).exists()
+    path, number = (name, int(index)) if numbered else (text, 0)
+    cameras = load_cameras(path)
+    if not -len(cameras) <= number < len(cameras):
+        last = len(cameras) - 1
+        raise ProgdfError(f"{path} has no camera {number}; it holds {len(cameras)}, numbered 0 to {last}")
+    return cameras[number]
+
+
+def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view in another size, undistorted: what fits vertically stays, the sides are cut or widened."""
+    width, height = size
+    scale = height / camera.height
+    K = camera.K * scale
+    K[2, 2] = 1.0
+    K[0, 2] = width / 2 + (camera.K[0, 2] - camera.width / 2) * scale
+    return replace(camera, K=K, width=width, height=height)
+
+
+def parse_background(text: str) -> Vec3:
+    """The colour of `#rrggbb`, "white" or "black", 0..1.
+
+    Raises:
+        ProgdfError: it is no colour.
+    """
+    red, green, blue = parse_color({"white": "#ffffff", "black": "#000000"}.get(text.lower(), text)).tolist()
+    return red, green, blue
+
+
+def _strength(setting: str, text: str) -> float:
+    try:
+        strength = float(text)
+    except ValueError:
+        strength = math.nan
+    if not 0.0 <= strength <= 1.0:
+        raise ProgdfError(f"--set {setting}: the strength '{text}' is not a number from 0 to 1")
+    return strength
+
+
+def _example(gdfs: Sequence[Gdf]) -> str:
+    return gdfs[0].name if gdfs else "NAME"
+
+
+def _are(gdfs: Sequence[Gdf]) -> str:
+    return "is" if len(gdfs) == 1 else "are"

@@ -1,0 +1,246 @@
+"""The commands `progdf view`, `progdf render` and `progdf export`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from PIL import Image
+
+from progdf.camera import Camera
+from progdf.checkpoint import Gdf
+from progdf.compose import Layer, compose
+from progdf.errors import ProgdfError
+from progdf.files import written_whole
+from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
+from progdf.load_report import counted
+from progdf.ply import load_ply, save_ply
+
+from . import arguments, film
+from .engine import Engine
+from .headless import headless_context
+from .state import ViewState
+from .turntable import first_camera, to_camera
+
+Blend = Literal["normalised", "sum", "over"]
+Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
+Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.ply")]
+Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+
+DEFAULT_SIZE = (640, 480)
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Open the window: the splats, one slider per edit."""
+
+    scene: Scene
+    """The scene, a 3DGS .ply file."""
+    gdfs: Edits = ()
+    """Edits of this scene, the lowest layer first."""
+    set: Settings = ()
+    """Strength of an edit when the window opens, 0 to 1; 0 where not set. Repeat it for several edits."""
+    blend: Blend = "normalised"
+    """How edits that share Gaussians go together."""
+    background: str = "white"
+    """#rrggbb, white or black."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Write a picture of a scene under its edits, without a window."""
+
+    scene: Scene
+    """The scene, a 3DGS .ply file."""
+    out: Out
+    """The picture to write: .png, or with --sweep .gif or .mp4."""
+    gdfs: Edits = ()
+    """Edits of this scene, the lowest layer first."""
+    set: Settings = ()
+    """Strength of an edit, 0 to 1; 0 where not set. Repeat it for several edits."""
+    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE[:INDEX]")] = None
+    """A camera of cameras.json or transforms.json, the first where no INDEX is given."""
+    orbit: Annotated[str | None, tyro.conf.arg(metavar="AZ,EL[,DISTANCE]")] = None
+    """A camera that circles the scene: degrees around it, degrees above it, world units away (fitting)."""
+    size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
+    """Pixels; else the camera's own, or 640x480."""
+    engine: Literal["auto", "gl", "cpu"] = "auto"
+    """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
+    blend: Blend = "normalised"
+    """How edits that share Gaussians go together."""
+    background: str = "white"
+    """#rrggbb, white or black."""
+    sweep: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Move this edit's slider from 0 to 1 and back: an animation."""
+    sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]")] = None
+    """A contact sheet over this edit's slider, or a grid over two sliders."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write a scene under its edits as a 3DGS .ply file."""
+
+    scene: Scene
+    """The scene, a 3DGS .ply file."""
+    out: Out
+    """The .ply file to write."""
+    gdfs: Edits = ()
+    """Edits of this scene, the lowest layer first."""
+    set: Settings = ()
+    """Strength of an edit, 0 to 1; 0 where not set. Repeat it for several edits."""
+    blend: Blend = "normalised"
+    """How edits that share Gaussians go together."""
+
+
+def view(argv: Sequence[str]) -> int:
+    """`progdf view`: open the window and stay until it is closed."""
+    options = tyro.cli(ViewOptions, args=_joined(argv), prog="progdf view")
+    scene, gdfs = _load(options.scene, options.gdfs)
+    state = ViewState(
+        first_camera(scene),
+        arguments.layers_of(gdfs, options.set),
+        options.blend,
+        arguments.parse_background(options.background),
+    )
+    from .app import Document, run  # imgui and glfw, which render and export do without
+
+    return run(Document(options.scene.name, scene, gdfs), state)
+
+
+def render(argv: Sequence[str]) -> int:
+    """`progdf render`: one picture, a sweep, or a contact sheet."""
+    options = tyro.cli(RenderOptions, args=_joined(argv), prog="progdf render")
+    _check_output(options)
+    size = None if options.size is None else arguments.parse_size(options.size)
+    background = arguments.parse_background(options.background)
+    scene, gdfs = _load(options.scene, options.gdfs)
+    layers = arguments.layers_of(gdfs, options.set)
+    swept = [
+        arguments.known_edit(name, gdfs, option)
+        for option, names in (("--sweep", options.sweep), ("--sheet", options.sheet))
+        if names is not None
+        for name in names.split(",")
+    ]
+    camera = _camera(options, scene, size)
+    state = ViewState(layers=layers, blend=options.blend, background=background)
+    with _engine(scene, gdfs, options.engine) as engine, written_whole(options.out) as beside:
+
+        def picture(wanted: ViewState) -> film.Pixels:
+            return film.to_pixels(engine.image(wanted, camera=camera))
+
+        if options.sweep is not None:
+            frames = (picture(moved) for moved in film.sweep(state, options.sweep))
+            write = film.write_gif if options.out.suffix.lower() == ".gif" else film.write_mp4
+            write(beside, frames)
+        else:
+            Image.fromarray(picture(state)).save(beside)
+        drawn_with = engine.draws_with
+    print(f"wrote {options.out} ({camera.width}x{camera.height}, drawn by {drawn_with})")
+    if gdfs and not swept and not any(layer.strength for layer in layers):
+        print(f"every slider is at 0, so this is the original; --set {gdfs[0].name}=1 shows an edit")
+    return 0
+
+
+def export(argv: Sequence[str]) -> int:
+    """`progdf export`: the edited scene as a .ply that any viewer opens."""
+    options = tyro.cli(ExportOptions, args=_joined(argv), prog="progdf export")
+    if options.out.suffix.lower() != ".ply":
+        raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
+    _check_not_an_input(options.out, (options.scene, *options.gdfs))
+    scene, gdfs = _load(options.scene, options.gdfs)
+    states = arguments.layers_of(gdfs, options.set)
+    layers = [Layer(gdfs[state.gdf], state.strength) for state in states]
+    edited = compose(scene, layers, options.blend)
+    with written_whole(options.out) as beside:
+        save_ply(beside, edited)
+        _check_reloaded(edited, load_ply(beside))
+    told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
+    print(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
+    return 0
+
+
+def _load(scene_path: Path, gdf_paths: Sequence[Path]) -> tuple[Gaussians, tuple[Gdf, ...]]:
+    scene = load_ply(scene_path)
+    return scene, arguments.load_edits(gdf_paths, scene, scene_path)
+
+
+def _camera(options: RenderOptions, scene: Gaussians, size: tuple[int, int] | None) -> Camera:
+    if options.camera is not None and options.orbit is not None:
+        raise ProgdfError("--camera and --orbit were both given; give one of them")
+    if options.camera is not None:
+        camera = arguments.read_camera(options.camera)
+        return camera if size is None else arguments.fitted(camera, size)
+    width, height = size or DEFAULT_SIZE
+    framed = first_camera(scene, aspect=width / height)
+    if options.orbit is not None:
+        framed = arguments.parse_orbit(options.orbit, framed)
+    return to_camera(framed, width, height)
+
+
+@contextmanager
+def _engine(scene: Gaussians, gdfs: Sequence[Gdf], draw: str) -> Iterator[Engine]:
+    """An engine for pictures without a window; "auto" does without OpenGL where there is none."""
+    ctx = None
+    if draw != "cpu":
+        try:
+            ctx = headless_context()
+        except ProgdfError:
+            if draw == "gl":
+                raise
+    engine = Engine(ctx, scene, gdfs, draw)
+    try:
+        yield engine
+    finally:
+        engine.release()
+        if ctx is not None:
+            ctx.release()
+
+
+def _check_output(options: RenderOptions) -> None:
+    """Whether the file's name fits what goes into it."""
+    suffix = options.out.suffix.lower()
+    if options.sweep is not None and options.sheet is not None:
+        raise ProgdfError("--sweep and --sheet were both given; give one of them")
+    if options.sweep is not None and suffix not in (".gif", ".mp4"):
+        raise ProgdfError(f"{options.out} cannot hold an animation; --sweep writes a .gif or an .mp4")
+    if options.sweep is None and suffix in (".gif", ".mp4"):
+        raise ProgdfError(f"{options.out} holds an animation; say which slider moves with --sweep NAME")
+    if options.sweep is None and suffix != ".png":
+        raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
+    _check_not_an_input(options.out, (options.scene, *options.gdfs))
+
+
+def _check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
+    for path in inputs:
+        if out.exists() and path.exists() and os.path.samefile(out, path):
+            raise ProgdfError(f"{out} is one of the files to read; choose another name for the result")
+
+
+def _check_reloaded(written: Gaussians, read: Gaussians) -> None:
+    """Raises ProgdfError where the file gives back anything but what was written into it."""
+    for name in ATTRIBUTES:
+        expected, found = getattr(written, name), getattr(read, name)
+        if name == "quats":
+            same = torch.allclose(normalize_quats(expected), found, rtol=0.0, atol=1e-6)
+        else:
+            same = torch.equal(expected, found)
+        if not same:
+            raise ProgdfError(f"the written file does not give back its {name}; check the disk and try again")
+
+
+def _joined(argv: Sequence[str]) -> list[str]:
+    """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option."""
+    joined: list[str] = []
+    for argument in argv:
+        if joined and joined[-1] == "--orbit":
+            joined[-1] = f"--orbit={argument}"
+        else:
+            joined.append(argument)
+    return joined

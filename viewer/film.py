@@ -1,0 +1,89 @@
+"""One slider moved from 0 to 1: as an animation, as a contact sheet; two sliders: as a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from progdf.errors import ProgdfError
+
+from .state import ViewState
+
+Pixels = NDArray[np.uint8]
+
+SWEEP_STEPS = 24
+FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
+SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+def to_pixels(image: NDArray[np.float32]) -> Pixels:
+    """0..1 to 0..255, rounded; what is brighter or darker is cut off."""
+    return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
+    """`view` with the named layers at these strengths."""
+    layers = (
+        replace(layer, strength=strengths.get(layer.name, layer.strength), enabled=True)
+        if layer.name in strengths
+        else layer
+        for layer in view.layers
+    )
+    return replace(view, layers=tuple(layers))
+
+
+def sweep(view: ViewState, name: str, steps: int = SWEEP_STEPS) -> Iterator[ViewState]:
+    """`view` with layer `name` at 0, 1/steps, …, 1: steps + 1 states."""
+    for step in range(steps + 1):
+        yield with_strengths(view, {name: step / steps})
+
+
+def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
+    """An endless animation there and back again, with one palette for all frames so that nothing flickers.
+
+    Args:
+        path: a .gif file
+        frames: from one end of the slider to the other. [H,W,3] each
+    """
+    there = [Image.fromarray(frame) for frame in frames]
+    few = there[:: max(1, len(there) // 4)]
+    mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in few]))
+    palette = mosaic.quantize(256, method=Image.Quantize.MEDIANCUT)
+    indexed = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
+    shown = indexed + indexed[-2:0:-1]
+    rests = {0, len(indexed) - 1}
+    durations = [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))]
+    shown[0].save(path, save_all=True, append_images=shown[1:], duration=durations, loop=0, disposal=1)
+
+
+def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20) -> None:
+    """A film there and back again, H.264; an odd last row or column is repeated, as the codec wants even sides.
+
+    Raises:
+        ProgdfError: the package that brings the encoder is not installed.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise ProgdfError(
+            f"{path.name} needs a video encoder; pip install progdf-studio[video], or write a .gif"
+        ) from None
+    there = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames]
+    hold = round(HOLD_MS * frames_per_second / 1000)
+    shown = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        (there[0].shape[1], there[0].shape[0]),
+        fps=frames_per_second,
+        quality=8,
+        macro_block_size=2,
+    )
+    writer.send(None)
+    for frame in shown:
+        writer.send(np.ascontiguousarray(frame))
+    writer.close()
