@@ -80,6 +80,7 @@ class FieldJudge:
 
     def __init__(self, strengths: Tensor, offsets: Tensor, render: Render) -> None:
         self._render = render
+        self._nothing = torch.zeros_like(offsets[0])
         with torch.no_grad():
             self._expected = [render(_between(strengths, offsets, s)) for s in sample_strengths()]
 
@@ -87,9 +88,13 @@ class FieldJudge:
         """PSNR at `sample_strengths()`, dB."""
         with torch.no_grad():
             return tuple(
-                decibels(float((self._render(field.offsets(s)) - expected).double().square().mean()))
+                decibels(float((self._render(self._offsets(field, s)) - expected).double().square().mean()))
                 for s, expected in zip(sample_strengths(), self._expected, strict=True)
             )
+
+    def _offsets(self, field: BakedField, s: float) -> Tensor:
+        # a field that moves nothing does not know how many members it has
+        return field.offsets(s) if field.attributes else self._nothing
 
     def candidate(self, field: BakedField, label: str) -> Candidate:
         """The field with its error."""
