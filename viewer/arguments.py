@@ -125,7 +125,7 @@ def read_camera(text: str) -> Camera:
 
 
 def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same view in another size, undistorted: what fits vertically stays, the sides are cut or widened."""
+    """The same view in another size, undistorted: the same height of the scene, the sides cut or widened."""
     width, height = size
     scale = height / camera.height
     K = camera.K * scale

@@ -122,12 +122,7 @@ def render(argv: Sequence[str]) -> int:
     background = arguments.parse_background(options.background)
     scene, gdfs = _load(options.scene, options.gdfs)
     layers = arguments.layers_of(gdfs, options.set)
-    swept = [
-        arguments.known_edit(name, gdfs, option)
-        for option, names in (("--sweep", options.sweep), ("--sheet", options.sheet))
-        if names is not None
-        for name in names.split(",")
-    ]
+    swept = _swept(options, gdfs)
     camera = _camera(options, scene, size)
     state = ViewState(layers=layers, blend=options.blend, background=background)
     with _engine(scene, gdfs, options.engine) as engine, written_whole(options.out) as beside:
@@ -136,13 +131,18 @@ def render(argv: Sequence[str]) -> int:
             return film.to_pixels(engine.image(wanted, camera=camera))
 
         if options.sweep is not None:
-            frames = (picture(moved) for moved in film.sweep(state, options.sweep))
+            frames = (picture(moved) for moved in film.sweep(state, swept[0]))
             write = film.write_gif if options.out.suffix.lower() == ".gif" else film.write_mp4
             write(beside, frames)
+        elif len(swept) == 2:
+            Image.fromarray(film.grid(swept[0], swept[1], picture, state)).save(beside)
+        elif swept:
+            Image.fromarray(film.contact_sheet(swept[0], picture, state)).save(beside)
         else:
             Image.fromarray(picture(state)).save(beside)
         drawn_with = engine.draws_with
-    print(f"wrote {options.out} ({camera.width}x{camera.height}, drawn by {drawn_with})")
+    each = "each " if options.sheet is not None else ""
+    print(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_with})")
     if gdfs and not swept and not any(layer.strength for layer in layers):
         print(f"every slider is at 0, so this is the original; --set {gdfs[0].name}=1 shows an edit")
     return 0
@@ -169,6 +169,18 @@ def export(argv: Sequence[str]) -> int:
 def _load(scene_path: Path, gdf_paths: Sequence[Path]) -> tuple[Gaussians, tuple[Gdf, ...]]:
     scene = load_ply(scene_path)
     return scene, arguments.load_edits(gdf_paths, scene, scene_path)
+
+
+def _swept(options: RenderOptions, gdfs: Sequence[Gdf]) -> list[str]:
+    """Names of the edits whose sliders move in the picture: none, one or two."""
+    if options.sweep is not None:
+        return [arguments.known_edit(options.sweep, gdfs, "--sweep")]
+    if options.sheet is None:
+        return []
+    names = [arguments.known_edit(name, gdfs, "--sheet") for name in options.sheet.split(",")]
+    if len(names) > 2 or len(set(names)) < len(names):
+        raise ProgdfError(f"--sheet {options.sheet} does not name one or two different edits; name those")
+    return names
 
 
 def _camera(options: RenderOptions, scene: Gaussians, size: tuple[int, int] | None) -> Camera:
@@ -214,6 +226,7 @@ def _check_output(options: RenderOptions) -> None:
         raise ProgdfError(f"{options.out} holds an animation; say which slider moves with --sweep NAME")
     if options.sweep is None and suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
+    film.check_encoder(options.out)
     _check_not_an_input(options.out, (options.scene, *options.gdfs))
 
 

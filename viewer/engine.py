@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
+from progdf.composer import Composer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.layers import Gains, Layer
 
-from .edited import EditedScene
 from .headless import is_software
 from .painters import CpuPainter, GlPainter, Image, Painter
 from .sort import back_to_front
@@ -103,7 +103,7 @@ class Engine:
         self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
         self.timings = FrameTimings()
         """Of the last picture."""
-        self._edited = EditedScene(scene, self.gdfs)
+        self._composer = Composer(scene, self.gdfs)
         self._edits = _Edits()
         self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
         self._ordered_for: bytes | None = None
@@ -114,7 +114,7 @@ class Engine:
             self._painter = GlPainter(ctx)
         else:
             self._painter = CpuPainter(ctx)
-        self._painter.upload(self._edited.gaussians)
+        self._painter.upload(self._composer.gaussians)
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
@@ -150,7 +150,7 @@ class Engine:
     def gaussians(self, view: ViewState) -> Gaussians:
         """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
         self._compose(_edits(view))
-        return self._edited.gaussians
+        return self._composer.gaussians
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
@@ -173,7 +173,7 @@ class Engine:
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
         started = time.perf_counter()
         if self._painter.wants_order and self._ordered_for != wanted.viewmat:
-            self._order = back_to_front(self._edited.gaussians.means.numpy(), camera)
+            self._order = back_to_front(self._composer.gaussians.means.numpy(), camera)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
         self._painter.draw(camera, view.background, self._order)
@@ -185,7 +185,7 @@ class Engine:
             1e3 * (sorted_at - started),
             1e3 * (drawn_at - sorted_at),
             changed,
-            len(self._order) if self._painter.wants_order else len(self._edited.gaussians),
+            len(self._order) if self._painter.wants_order else len(self._composer.gaussians),
         )
 
     def _compose(self, edits: _Edits) -> tuple[float, float, int]:
@@ -194,12 +194,12 @@ class Engine:
             return 0.0, 0.0, 0
         started = time.perf_counter()
         layers = [Layer(self._gdf(index), strength, True, gains) for index, strength, gains in edits.layers]
-        change = self._edited.compose(layers, edits.blend or "normalised")
+        change = self._composer.update(layers, edits.blend or "normalised")
         composed = time.perf_counter()
         self._edits, self._picture = edits, None
-        if "means" in change.attributes:
+        if change.means_moved:
             self._ordered_for = None
-        self._painter.update(self._edited.gaussians, change.attributes, change.rows)
+        self._painter.update(self._composer.gaussians, change.attributes, change.rows)
         uploaded = time.perf_counter()
         return 1e3 * (composed - started), 1e3 * (uploaded - composed), len(change.rows)
 

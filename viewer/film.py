@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import importlib.util
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from progdf import pictures
 from progdf.errors import ProgdfError
 
 from .state import ViewState
 
 Pixels = NDArray[np.uint8]
+Draw = Callable[[ViewState], Pixels]
 
 SWEEP_STEPS = 24
 FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
@@ -43,6 +47,27 @@ def sweep(view: ViewState, name: str, steps: int = SWEEP_STEPS) -> Iterator[View
         yield with_strengths(view, {name: step / steps})
 
 
+def contact_sheet(name: str, draw: Draw, view: ViewState) -> Pixels:
+    """`view` with layer `name` at five strengths, in a row."""
+    row = [draw(with_strengths(view, {name: s})) for s in SHEET_STRENGTHS]
+    return _sheet([row], [], [f"{name} {s:g}" for s in SHEET_STRENGTHS])
+
+
+def grid(down: str, across: str, draw: Draw, view: ViewState) -> Pixels:
+    """`view` under two sliders: `down` grows from row to row, `across` from column to column."""
+    rows = [
+        [draw(with_strengths(view, {down: s, across: t})) for t in SHEET_STRENGTHS] for s in SHEET_STRENGTHS
+    ]
+    return _sheet(
+        rows, [f"{down} {s:g}" for s in SHEET_STRENGTHS], [f"{across} {t:g}" for t in SHEET_STRENGTHS]
+    )
+
+
+def _sheet(rows: list[list[Pixels]], row_labels: list[str], column_labels: list[str]) -> Pixels:
+    images = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
+    return to_pixels(pictures.contact_sheet(images, row_labels, column_labels).numpy())
+
+
 def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
     """An endless animation there and back again, with one palette for all frames so that nothing flickers.
 
@@ -61,18 +86,16 @@ def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
     shown[0].save(path, save_all=True, append_images=shown[1:], duration=durations, loop=0, disposal=1)
 
 
-def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20) -> None:
-    """A film there and back again, H.264; an odd last row or column is repeated, as the codec wants even sides.
+def check_encoder(path: Path) -> None:
+    """Raises ProgdfError where an .mp4 is wanted and the package that encodes it is not installed."""
+    if path.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ProgdfError(f"{path} needs a video encoder; pip install progdf-studio[video], or write a .gif")
 
-    Raises:
-        ProgdfError: the package that brings the encoder is not installed.
-    """
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise ProgdfError(
-            f"{path.name} needs a video encoder; pip install progdf-studio[video], or write a .gif"
-        ) from None
+
+def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20) -> None:
+    """A film there and back again, H.264; the codec wants even sides, so an odd last row is doubled."""
+    import imageio_ffmpeg  # an extra, see check_encoder
+
     there = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames]
     hold = round(HOLD_MS * frames_per_second / 1000)
     shown = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
