@@ -92,12 +92,12 @@ def plan_rows(members: Sequence[NDArray[np.int64]], changed: frozenset[int]) -> 
 def flat_bases(
     gdfs: Sequence[Gdf],
 ) -> tuple[NDArray[np.float32], NDArray[np.int8], list[dict[str, FlatBases]]]:
-    """All bases back to back, channel by channel, and where each attribute's begin."""
+    """All bases back to back as they are stored, and where each attribute's begin."""
     floats, bytes_ = [np.zeros(0, np.float32)], [np.zeros(0, np.int8)]
 
     def put(kept: list[Any], tensor: Tensor) -> int:
         begin = sum(len(part) for part in kept)
-        kept.append(tensor.transpose(-1, -2).contiguous().view(-1).numpy())
+        kept.append(tensor.contiguous().view(-1).numpy())
         return begin
 
     def laid(bases: AttributeBases) -> FlatBases:

@@ -1,7 +1,7 @@
 """`compose` while a slider is dragged: the same numbers, written in place, members only.
 
-Bases are kept as they are stored (int8), channel by channel, so that a new slider value reads about 84
-bytes a member, writes its 14 numbers, and allocates nothing that grows with the scene.
+Bases are kept as they are stored (int8), so that a new slider value reads about 84 bytes a member, writes its 14
+numbers, and allocates nothing that grows with the scene.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class Composer:
         described = np.zeros(len(stack), LAYER)
         scales: list[NDArray[np.float32]] = [np.zeros(0, np.float32)]
         weights, weights_at = self._flat_weights(stack)
-        length = 0
+        lines = 0
         for i, (edit, layer) in enumerate(stack):
             bases = self._bases[edit].get(name)
             gain = layer.gain(name)
@@ -146,15 +146,18 @@ class Composer:
             if bases is None or gain == 0:
                 continue
             entry["moves"], entry["rank"], entry["rest_is_float"] = 1, len(bases.step), bases.rest_is_float
-            entry["full"], entry["rest"], entry["coefficients"] = bases.full, bases.rest, length
+            entry["full"], entry["rest"], entry["factors"] = bases.full, bases.rest, lines
             scales.append(factors(self._nodes[edit], bases, layer.strength).reshape(-1))
-            length += len(scales[-1])
+            lines += 1 + len(bases.step)
+        # a little below 1: sums in float32 may round up to where the kernel has to look
+        crowded = blend == "normalised" and sum(layer.cover for _, layer in stack) > 1 - 1e-6
+        base = self._base[name]
         blocks = -(-len(plan.rows) // BLOCK)
         bounds = np.array([plan.bounds[edit] for edit, _ in stack], np.int64).reshape(len(stack), blocks + 1)
         arguments = (
-            self._base[name], self._out[name], plan.rows, described, bounds, plan.members, plan.places,
-            self._floats, self._bytes, np.concatenate(scales), weights,
-            blend == "over", blend == "normalised", name == "means",
+            base.reshape(-1), self._out[name].reshape(-1), base.shape[1], plan.rows, described, bounds,
+            plan.members, plan.places, self._floats, self._bytes, np.concatenate(scales), weights,
+            blend == "over", crowded, name == "means",
         )  # fmt: skip
         count = min(threads(), 1 + len(plan.rows) // WORTH_A_THREAD, max(blocks, 1))
         if count == 1:

@@ -204,7 +204,7 @@ def test_bases_that_do_not_fit_each_other_are_refused() -> None:
         {"full": bases.full.double()},
         {"rest": bases.rest.int()},
     ):
-        with pytest.raises(ValueError, match="expected|fit|coefficients"):
+        with pytest.raises(ValueError, match=r"expected|fit|coefficients"):
             replace(bases, **broken)
 
 
