@@ -1,0 +1,29 @@
+"""The rasteriser's benchmark runs, and the engine keeps its floor of speed at its ceiling of error."""
+
+from __future__ import annotations
+
+import pytest
+
+from progdf import bench_rasterize
+from progdf.bench_rasterize import Case, measure, tables
+
+
+def test_the_rasteriser_benchmark_names_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_rasterize, "CASES", (Case(60, 32), Case(90, 40, baseline=False)))
+    monkeypatch.setattr(bench_rasterize, "measure", lambda case: measure(case, rounds=1, torch_rounds=1))
+    (table,) = tables()
+    assert [row[0] for row in table.rows] == ["60", "90"]
+    assert table.rows[0][5].endswith("×")
+    assert float(table.rows[0][6]) <= 2e-6
+    assert float(table.rows[1][6]) <= 2e-6
+    assert float(table.rows[0][7].split()[0]) <= 2e-5
+    assert "not run" in table.rows[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [Case(2_000, 128), Case(20_000, 256)], ids=["2k", "20k"])
+def test_the_cpu_engine_is_at_least_forty_times_a_tiled_torch_renderer(case: Case) -> None:
+    result = measure(case)
+    assert result.ratio >= 40.0
+    assert result.image_error <= 2e-6
+    assert max(result.gradient_errors.values()) <= 2e-5, result.gradient_errors
