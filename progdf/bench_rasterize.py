@@ -1,6 +1,7 @@
 """`progdf bench rasterize`: the cpu engine's speed beside its error, against a tiled renderer in plain torch.
 
-What it is compared with is the reference engine in float32: dense within tiles of 16x16 pixels, differentiated
+What it is compared with is the reference engine in float32: dense within tiles of 16x16 pixels,
+    differentiated
 by autograd, on as many threads. Both take turns in one process, so that a busy machine slows both.
 """
 
@@ -66,8 +67,8 @@ class Result:
 def cloud(case: Case) -> tuple[list[Tensor], Camera]:
     """Activated means, quats, scales, opacities, rgb, seeded, and a camera that sees most of them.
 
-    A Gaussian's standard deviation is about 1.4 pixels, axes differ by a factor of about 2: what a trained scene
-    looks like from where its pictures were taken.
+    A Gaussian's standard deviation is about 1.4 pixels, axes differ by a factor of about 2: what a trained
+    scene looks like from where its pictures were taken.
     """
     rng = torch.Generator().manual_seed(case.count)
     means = torch.randn(case.count, 3, generator=rng) * 0.7 + torch.tensor([0.0, 0.0, 4.0])
