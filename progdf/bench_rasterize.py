@@ -91,7 +91,8 @@ def draw(
     target = (ramp[:, None] * ramp)[..., None].expand(-1, -1, 3)
     begin = time.perf_counter()
     image, _, _ = rasterize(
-        means, quats, scales, opacities, colors, camera.viewmat, camera.K, camera.width, camera.height, engine=engine
+        means, quats, scales, opacities, colors, camera.viewmat, camera.K, camera.width, camera.height,
+        engine=engine,
     )  # fmt: skip
     if backward:
         (image - target).square().sum().backward()  # type: ignore[no-untyped-call]
@@ -158,8 +159,8 @@ def tables() -> list[Table]:
         "worst gradient error",
     )
     note = (
-        "Median and range; the engines take turns in one process. Errors are against float64: largest difference "
-        "of a colour; largest difference of a gradient over the largest gradient, worst input named."
+        "Median and range; the engines take turns in one process. Errors are against float64: largest "
+        "difference of a colour; largest difference of a gradient over the largest gradient, worst input named."
     )
     return [Table("rasterize", "CPU rasteriser", columns, tuple(rows), note)]
 
