@@ -100,8 +100,7 @@ class SplatRenderer:
         """
         size = (camera.width, camera.height)
         if self._target is None or self._target.texture.size != size:
-            if self._target is not None:
-                self._target.release()
+            self._release_target()
             self._target = self._make_target(size)
         target = self._target
         target.framebuffer.use()  # also for the transform feedback: without a framebuffer it writes zeros
@@ -121,8 +120,7 @@ class SplatRenderer:
 
     def release(self) -> None:
         """Give everything back; the renderer is of no use afterwards."""
-        if self._target is not None:
-            self._target.release()
+        self._release_target()
         self._release_scene()
         self._project.release()
         self._splat.release()
@@ -143,6 +141,13 @@ class SplatRenderer:
         texture = self.ctx.texture(size, 4, dtype="f4")
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return _Target(texture, self.ctx.framebuffer([texture]))
+
+    def _release_target(self) -> None:
+        if self._target is not None:
+            # moderngl will bind the present one again, which then must not be a deleted one
+            self.ctx.detect_framebuffer(0).use()
+            self._target.release()
+            self._target = None
 
     def _release_scene(self) -> None:
         if self._buffers is not None:
