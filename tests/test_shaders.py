@@ -1,4 +1,4 @@
-"""GLSL sources: includes, messages with file and line, layouts that match the numpy dtypes beside them."""
+"""GLSL sources: includes, messages with file and line, layouts that match the dtypes beside them."""
 
 from __future__ import annotations
 
