@@ -160,7 +160,7 @@ def tables() -> list[Table]:
     )
     note = (
         "Median and range; the engines take turns in one process. Errors are against float64: largest "
-        "difference of a colour; largest difference of a gradient over the largest gradient, worst input named."
+        "difference of a colour; largest difference of a gradient over the largest gradient, worst input."
     )
     return [Table("rasterize", "CPU rasteriser", columns, tuple(rows), note)]
 

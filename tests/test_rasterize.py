@@ -203,6 +203,35 @@ def test_gradients_of_a_crop_match_the_references() -> None:
     assert torch.equal(found.info.visible, expected.info.visible)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine: str) -> None:
+    scene, camera = random_gaussians(200, seed=12, sh_degree=1), orbit_camera(90, 61)
+    rows = torch.arange(3, 200, 7)
+    inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
+    found = []
+    for wanted in (None, rows):
+        leaves = [tensor.double().requires_grad_() for tensor in inputs]
+        image, _, _ = rasterize(
+            *leaves, camera.viewmat, camera.K, 90, 61, sh_degree=1, engine=engine, grad_rows=wanted
+        )
+        (image[20:] ** 2).sum().backward()
+        found.append([leaf.grad for leaf in leaves])
+    others = torch.ones(200, dtype=torch.bool).index_fill(0, rows, False)
+    for every, some in zip(*found, strict=True):
+        assert float((every - some)[rows].abs().max()) <= 1e-6 * float(every.abs().max())
+        assert float(some[rows].abs().max()) > 0
+        assert not bool(some[others].any())
+
+
+def test_camera_gradients_of_some_rows_only_are_refused() -> None:
+    scene, camera = one_gaussian(), front_camera()
+    with pytest.raises(ValueError, match="viewmat or K wants gradients, which need all rows"):
+        rasterize(
+            scene.means, scene.quats, scene.scales, scene.opacities, torch.ones(1, 3),
+            camera.viewmat.clone().requires_grad_(), camera.K, 40, 24, grad_rows=torch.tensor([0]),
+        )  # fmt: skip
+
+
 def test_bits_do_not_depend_on_the_run_or_the_number_of_threads() -> None:
     scene, camera = random_gaussians(2000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")

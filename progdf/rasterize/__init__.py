@@ -49,6 +49,7 @@ def rasterize(
     antialiased: bool = False,
     engine: str = "cpu",
     crop: Crop | None = None,
+    grad_rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """Draw Gaussians in activated units (Kerbl et al. 2023), differentiable in every floating input.
 
@@ -70,16 +71,22 @@ def rasterize(
         crop: draw only this window, with the full image's conventions; equals the slice of the full image
             bit for bit. Gaussians that do not touch it cost next to nothing
 
+        grad_rows: only these rows get gradients, all others zero; takes much less time where they are few.
+            [M] int64
+
     Returns:
         image [H,W,3], transmittance [H,W] (of the window where there is a crop), and what the projection
         found.
 
     Raises:
-        ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown.
+        ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown,
+            `grad_rows` are given although the camera wants gradients, which need all rows.
         ProgdfError: more (Gaussian, tile) pairs than memory should hold.
     """
     _check_shapes(means, quats, scales, opacities, colors, viewmat, K, sh_degree)
     window = _checked_crop(crop, width, height)
+    if grad_rows is not None and (viewmat.requires_grad or K.requires_grad):
+        raise ValueError("grad_rows are given, but viewmat or K wants gradients, which need all rows")
     if background is None:
         background = means.new_zeros(3)
     elif not isinstance(background, Tensor):
@@ -88,7 +95,7 @@ def rasterize(
         raise ValueError(f"background has shape {list(background.shape)}, expected [3]")
     image, transmittance, info = _engine(engine).rasterize(
         means, quats, scales, opacities, colors, viewmat, K, width, height,
-        background, near, sh_degree, antialiased, window,
+        background, near, sh_degree, antialiased, window, grad_rows,
     )  # fmt: skip
     return image, transmittance, info
 

@@ -88,10 +88,31 @@ def unblend_row(state: Array, cards: Array, card: Number, row: Number, place: Nu
     return sum_r, sum_g, sum_b, sum_0, sum_u, sum_uu
 
 
+@kernel(fast=True, inline=True)
+def pass_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> None:
+    """As `unblend_row` for a splat whose own gradient nobody wants."""
+    start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
+    peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
+    top = cards[card + TOP + row]
+    red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
+    begin = np.uint64(start) // LANES * LANES
+    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
+    for j in range(begin, end):
+        p = row * np.uint64(TILE_W) + j
+        column = np.int32(j)
+        u = u_peak + step * (np.float32(column) - peak)
+        alpha = min(_ALPHA_MAX, exp2(top - u * u))
+        alpha = alpha if (column >= start) & (column < stop) & (place <= state[p + _LAST]) else _ZERO
+        before = state[p] / (_ONE - alpha)
+        shown = red * state[p + _G0] + green * state[p + _G1] + blue * state[p + _G2]
+        state[p] = before
+        state[p + _BEHIND] += alpha * before * shown
+
+
 @kernel(fast=True)
 def unblend_tile(
     state: Array, x: int, y: int, members: Array, slots: Array, splats: Array, rgb: Array, bounds: Array,
-    cards: Array, sums: Array,
+    cards: Array, sums: Array, wanted: Array,
 ) -> None:  # fmt: skip
     """Take the splats off a tile, last contributor first; state is [6·PLANE], the rest as in `make_cards`."""
     plane = np.int64(PLANE)
@@ -108,6 +129,10 @@ def unblend_tile(
         make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
         for place in range(end - 1, begin - 1, -1):
             card = np.uint64(place - begin) * CARD
+            if not wanted[members[place]]:
+                for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
+                    pass_row(state, cards, card, row, np.float32(place))
+                continue
             s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = _ZERO
             for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
                 r, g, b, g_0, g_u, g_uu = unblend_row(state, cards, card, row, np.float32(place))
@@ -131,14 +156,15 @@ def unblend_tile(
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     background: Array, workers: int, transmittance: Array, last: Array, grad_image: Array,
-    grad_transmittance: Array, sums: Array,
+    grad_transmittance: Array, sums: Array, wanted: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same arguments.
 
     Args:
         slots: row of `sums` that belongs to each entry of `members`. [I] int64
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
-        sums: out, one row per intersection. [I,9] float32
+        sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
+        wanted: splats whose gradients are wanted. [V] bool
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
@@ -167,4 +193,6 @@ def unblend(
                     state[2 * plane + p], state[3 * plane + p], state[4 * plane + p] = g0, g1, g2
                     state[5 * plane + p] = last[i, j]
             listed = slice(tile_starts[tile], tile_starts[tile + 1])
-            unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums)
+            unblend_tile(
+                state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted
+            )

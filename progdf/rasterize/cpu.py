@@ -72,11 +72,12 @@ def rasterize(
     sh_degree: int | None,
     antialiased: bool,
     crop: tuple[int, int, int, int],
+    grad_rows: Tensor | None,
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.rasterize`."""
     view = _view(viewmat, K, width, height, near, sh_degree, antialiased, crop)
     inputs = [_float32(t) for t in (means, quats, scales, opacities, colors, background)]
-    drawn = _Rasterize.apply(view, *inputs, viewmat, K)  # type: ignore[no-untyped-call]
+    drawn = _Rasterize.apply(view, grad_rows, *inputs, viewmat, K)  # type: ignore[no-untyped-call]
     image, transmittance, centres, depths, visible = drawn
     return image, transmittance, RasterInfo(centres, depths, visible)
 
@@ -173,7 +174,7 @@ def _list_splats(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, view: _View, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, view: _View, grad_rows: Tensor | None, *tensors: Tensor) -> tuple[Tensor, ...]:
         arrays = [tensor.detach().numpy() for tensor in tensors[:6]]
         *gaussians, background = arrays
         if view.degree < 0:
@@ -189,7 +190,7 @@ class _Rasterize(torch.autograd.Function):
             )  # fmt: skip
         results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
         ctx.mark_non_differentiable(*results[2:])
-        ctx.view, ctx.lists, ctx.last = view, lists, last
+        ctx.view, ctx.grad_rows, ctx.lists, ctx.last = view, grad_rows, lists, last
         ctx.save_for_backward(*tensors, results[1])
         return results
 
@@ -209,29 +210,40 @@ class _Rasterize(torch.autograd.Function):
         means, quats, scales, opacities, colors = gaussians
         by_means, by_quats, by_scales, by_opacities, by_colors = gradients
         grad_camera = np.zeros((PARTS, CAMERA))
+        wanted = _wanted_splats(lists, len(means), ctx.grad_rows)
         with running("backward", 10) as workers:
             unblend(
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
                 lists.slots, background, workers, transmittance, ctx.last, grad_image, grad_transmittance,
-                sums,
+                sums, wanted,
             )  # fmt: skip
             project_backward(
                 lists.ids, lists.ranks, means, quats, scales, opacities, colors, view.degree,
                 view.viewmat, view.intrinsics, view.size,
-                view.antialiased, lists.splats, lists.per_splat, sums,
+                view.antialiased, lists.splats, lists.per_splat, sums, wanted,
                 by_means, by_quats, by_scales, by_opacities, by_colors, grad_camera,
             )  # fmt: skip
         results: list[Tensor | None] = [
             torch.from_numpy(array.reshape(shape)) for array, shape in zip(gradients, shapes, strict=True)
         ]
-        needs = ctx.needs_input_grad[6:]
+        needs = ctx.needs_input_grad[7:]
         results.append(_background_gradient(transmittance, grad_image) if needs[0] else None)
         camera = torch.from_numpy(grad_camera.sum(axis=0))
         viewmat, K = tensors[6:]
         grad_viewmat, grad_K = torch.zeros(4, 4, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
         grad_viewmat[:3] = camera[:12].reshape(3, 4)
         grad_K[0, 0], grad_K[1, 1], grad_K[0, 2], grad_K[1, 2] = camera[12:]
-        return None, *results, grad_viewmat.to(viewmat), grad_K.to(K)
+        return None, None, *results, grad_viewmat.to(viewmat), grad_K.to(K)
+
+
+def _wanted_splats(lists: _Lists, count: int, grad_rows: Tensor | None) -> Array:
+    """Which splats belong to the rows that want gradients. [V] bool"""
+    wanted = np.ones(len(lists.ids), np.bool_)
+    if grad_rows is not None:
+        rows = np.zeros(count, np.bool_)
+        rows[grad_rows.detach().cpu().numpy()] = True
+        wanted[lists.ranks] = rows[lists.ids]
+    return wanted
 
 
 def _background_gradient(transmittance: Array, grad_image: Array) -> Tensor:

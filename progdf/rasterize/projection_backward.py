@@ -124,7 +124,7 @@ def _point_gradient(
 def _project_backward_range(
     begin: int, end: int, ids: Array, ranks: Array, means: Array, quats: Array, scales: Array,
     opacities: Array, colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array,
-    antialiased: bool, splats: Array, per_splat: Array, sums: Array,
+    antialiased: bool, splats: Array, per_splat: Array, sums: Array, wanted: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
     camera: Array,
 ) -> None:  # fmt: skip
@@ -132,7 +132,7 @@ def _project_backward_range(
     total, basis, slopes = np.empty(SUMS), np.empty(16), np.zeros((16, 3))
     for n in range(begin, end):
         i, s = ids[n], ranks[n]
-        if splats[s, R2] < 0.0 or per_splat[s] == per_splat[s + 1]:
+        if not wanted[s] or splats[s, R2] < 0.0 or per_splat[s] == per_splat[s + 1]:
             continue
         for k in range(SUMS):
             total[k] = 0.0
@@ -182,7 +182,7 @@ def _project_backward_range(
 def project_backward(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
-    splats: Array, per_splat: Array, sums: Array,
+    splats: Array, per_splat: Array, sums: Array, wanted: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
     grad_camera: Array,
 ) -> None:  # fmt: skip
@@ -192,6 +192,7 @@ def project_backward(
         splats: nearest first. [V,8] float64
         per_splat: first row of `sums` of each splat. [V+1] int64
         sums: see `blend_backward`. [I,9] float32
+        wanted: splats whose gradients are filled in. [V] bool
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes
             of inputs
         grad_camera: out, zero on entry. [PARTS, CAMERA] float64
@@ -200,6 +201,6 @@ def project_backward(
     for part in prange(PARTS):
         _project_backward_range(
             part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities,
-            colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums,
+            colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums, wanted,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera[part],
         )  # fmt: skip

@@ -62,8 +62,14 @@ def rasterize(
     sh_degree: int | None,
     antialiased: bool,
     crop: tuple[int, int, int, int],
+    grad_rows: Tensor | None,
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.rasterize`; computed in the type of `means`, projection in float64."""
+    if grad_rows is not None:
+        means, quats, scales, opacities, colors = (
+            tensor.detach().index_copy(0, grad_rows, tensor[grad_rows])
+            for tensor in (means, quats, scales, opacities, colors)
+        )
     splats, info = project(
         means, quats, scales, opacities, colors, viewmat, K, width, height, near, sh_degree, antialiased, crop
     )
