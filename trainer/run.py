@@ -221,6 +221,7 @@ def _optimised(
         options.progressive,
         # one target alone is approached slowly: quick steps towards it shine in all colours half way
         ramp=0.0 if kind == "geometry" else 0.9 if len(stages) == 1 else 0.6,
+        reach=0.0 if kind == "geometry" else 0.05,
         fall=1.0 if len(stages) == 1 else 0.35,
         seed=options.seed,
     )
