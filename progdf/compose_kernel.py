@@ -55,7 +55,7 @@ def blend_rows(
     first_block: int,
     last_block: int,
 ) -> float:
-    """Write base + blend of the layers' offsets into `out`, for blocks of `rows`; as `progdf.compose.compose`.
+    """Write base + blend of the layers' offsets into `out`, for blocks of `rows`, as `compose` does.
 
     Args:
         base, out: the scene's and the edited attribute, N rows of `width` numbers

@@ -1,7 +1,7 @@
 """`compose` while a slider is dragged: the same numbers, written in place, members only.
 
-Bases are kept as they are stored (int8), so that a new slider value reads about 84 bytes a member, writes its 14
-numbers, and allocates nothing that grows with the scene.
+Bases are kept as they are stored (int8): a new slider value reads about 84 bytes a member, writes its
+14 numbers, and allocates nothing that grows with the scene.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ ranks are grown on what that predicts, and the pictures have the last word.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +25,9 @@ Kind = Literal["auto", "separable", "keyframes"]
 
 MOST_BYTES = 400.0
 """Bytes a member beyond which a separable field is not grown; nine keyframes of 14 numbers take 448."""
+
+CLOSE = 0.02
+"""Share of its bytes that may be saved in vain before the search for ranks goes on."""
 
 KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 SAMPLES = 25
@@ -76,13 +79,21 @@ class FieldJudge:
         strengths: of the snapshots. [T]
         offsets: [T,M,C]
         render: the pixels that count; held-out views are the honest choice
+        truth: the offsets at any strength, [M,C]; None is straight from snapshot to snapshot
     """
 
-    def __init__(self, strengths: Tensor, offsets: Tensor, render: Render) -> None:
+    def __init__(
+        self,
+        strengths: Tensor,
+        offsets: Tensor,
+        render: Render,
+        truth: Callable[[float], Tensor] | None = None,
+    ) -> None:
+        course = truth or (lambda s: _between(strengths, offsets, s))
         self._render = render
         self._nothing = torch.zeros_like(offsets[0])
         with torch.no_grad():
-            self._expected = [render(_between(strengths, offsets, s)) for s in sample_strengths()]
+            self._expected = [render(course(s)) for s in sample_strengths()]
 
     def curve(self, field: BakedField) -> tuple[float, ...]:
         """PSNR at `sample_strengths()`, dB."""
@@ -169,7 +180,9 @@ def _grown(
 ) -> list[Candidate]:
     """Separable fields along the path of growing ranks, until one just meets the target."""
     path = grown_ranks(seen, budget or MOST_BYTES)
-    expected = [expected_worst(seen, ranks) for ranks in path]
+    expected = expected_worst(seen, path)
+    widths = {name: course.offsets.shape[2] for name, course in seen.courses.items()}
+    stored = [sum((4 + ranks[name]) * width for name, width in widths.items()) for ranks in path]
     tried: dict[int, Candidate] = {}
 
     def look(i: int) -> Candidate:
@@ -177,10 +190,12 @@ def _grown(
             tried[i] = _separable(seen, strengths, path[i], judge, recorded)
         return tried[i]
 
-    # the prediction leads to the place, each look corrects it; then the smallest that holds is cornered
+    # the prediction leads to the place, each look corrects it; then the smallest that holds is nearly cornered
     low, high = -1, len(path)
     correction = 0.0
     while high - low > 1:
+        if low >= 0 and high < len(path) and stored[high] - stored[low] <= CLOSE * stored[high]:
+            break
         likely = [i for i in range(low + 1, high) if expected[i] + correction >= target]
         i = likely[0] if likely else high - 1
         found = look(i)

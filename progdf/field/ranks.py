@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -64,13 +64,10 @@ def emphasised_modes(seen: RenderedCourses, ranks: Mapping[str, int]) -> Modes:
     return best
 
 
-def expected_worst(seen: RenderedCourses, ranks: Mapping[str, int]) -> float:
-    """Least PSNR over the slider that these ranks should give, dB."""
-    return (
-        decibels(float(seen.mse(emphasised_modes(seen, ranks), ranks).max()))
-        if seen.courses
-        else NO_DIFFERENCE
-    )
+def expected_worst(seen: RenderedCourses, path: Sequence[Mapping[str, int]]) -> list[float]:
+    """Least PSNR over the slider that each of these ranks should give at least, dB."""
+    modes = seen.modes(torch.ones(seen.gram.shape[1], dtype=torch.float64))
+    return [decibels(float(seen.mse(modes, ranks).max())) for ranks in path]
 
 
 def decibels(mse: float) -> float:
