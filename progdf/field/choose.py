@@ -190,7 +190,7 @@ def _grown(
             tried[i] = _separable(seen, strengths, path[i], judge, recorded)
         return tried[i]
 
-    # the prediction leads to the place, each look corrects it; then the smallest that holds is nearly cornered
+    # the prediction leads to the place, each look corrects it, until the smallest that holds is cornered
     low, high = -1, len(path)
     correction = 0.0
     while high - low > 1:
