@@ -7,13 +7,13 @@ the result does not depend on the number of threads.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from progdf.rasterize.jit import Number, kernel
+from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
@@ -86,39 +86,51 @@ def depth_order(depths: Array, candidates: Array, parts: int) -> tuple[Array, Ar
     return ids, ranks
 
 
+class Outline(NamedTuple):
+    """What binning needs of a splat, see `projection`; side: dy of its support's leftmost point."""
+
+    mx: float
+    my: float
+    slope: float
+    inv_l11: float
+    l22: float
+    r2: float
+    side: float
+
+
+@kernel(contract=True, inline=True)
+def _outline(splats: Array, s: int) -> Outline:
+    slope, inv_l11, l22, r2 = splats[s, SLOPE], splats[s, INV_L11], splats[s, L22], splats[s, R2]
+    inclined = slope / (l22 * l22)
+    side = inclined * math.sqrt(r2 / (inv_l11 * inv_l11 + slope * inclined))
+    return Outline(splats[s, MX], splats[s, MY], slope, inv_l11, l22, r2, side)
+
+
 @kernel(inline=True)
-def row_bounds(splat: Array, window: Array) -> tuple[int, int]:
-    """First pixel row and one past the last whose centres the splat may reach, within the window."""
-    top = max(np.ceil(splat[MY] - splat[EXTENT_Y] - 0.5 - 1e-6), float(window[1]))
-    bottom = min(np.floor(splat[MY] + splat[EXTENT_Y] - 0.5 + 1e-6) + 1.0, float(window[3]))
+def _row_bounds(my: float, extent: float, first: float, end: float) -> tuple[int, int]:
+    """First pixel row and one past the last whose centres the splat may reach, within first..end."""
+    top = max(np.ceil(my - extent - 0.5 - 1e-6), first)
+    bottom = min(np.floor(my + extent - 0.5 + 1e-6) + 1.0, end)
     if not top < bottom:
         return 0, 0
     return int(top), int(bottom)
 
 
-@kernel(inline=True)
-def side_points(splat: Array) -> Number:
-    """dy of the leftmost point of the support, pixels; the rightmost has minus that."""
-    inverse2 = 1.0 / (splat[L22] * splat[L22])
-    inclined = splat[SLOPE] * inverse2
-    return inclined * math.sqrt(splat[R2] / (splat[INV_L11] * splat[INV_L11] + splat[SLOPE] * inclined))
-
-
-@kernel(inline=True)
-def tile_columns(splat: Array, side: Number, y_first: int, y_last: int, window: Array) -> tuple[int, int]:
+@kernel(contract=True, inline=True)
+def _tile_columns(o: Outline, y_first: int, y_last: int, left: float, right: float) -> tuple[int, int]:
     """First tile column and one past the last that the splat may reach in pixel rows y_first..y_last.
 
-    Columns count from the left edge of the full image. The bound is exact up to 1e-6 px: within a band of
-    rows the support's left edge is farthest out where the leftmost point is, or at the band's nearest row.
+    Columns count from the left edge of the full image; left, right: the window's. The bound is exact
+    up to 1e-6 px: within a band of rows the support's left edge is farthest out where its leftmost point is, or
+    at the band's nearest row.
     """
-    low, high = y_first + 0.5 - splat[MY], y_last + 0.5 - splat[MY]
-    left_at, right_at = min(max(side, low), high), min(max(-side, low), high)
-    v = splat[L22] * left_at
-    left = splat[MX] - splat[SLOPE] * left_at - math.sqrt(max(0.0, splat[R2] - v * v)) * splat[INV_L11]
-    v = splat[L22] * right_at
-    right = splat[MX] - splat[SLOPE] * right_at + math.sqrt(max(0.0, splat[R2] - v * v)) * splat[INV_L11]
-    first = max(np.ceil(left - 0.5 - 1e-6), float(window[0]))
-    last = min(np.floor(right - 0.5 + 1e-6), float(window[2] - 1))
+    low, high = y_first + 0.5 - o.my, y_last + 0.5 - o.my
+    left_at, right_at = min(max(o.side, low), high), min(max(-o.side, low), high)
+    v, w = o.l22 * left_at, o.l22 * right_at
+    outermost = o.mx - o.slope * left_at - math.sqrt(max(0.0, o.r2 - v * v)) * o.inv_l11
+    first = max(np.ceil(outermost - 0.5 - 1e-6), left)
+    outermost = o.mx - o.slope * right_at + math.sqrt(max(0.0, o.r2 - w * w)) * o.inv_l11
+    last = min(np.floor(outermost - 0.5 + 1e-6), right - 1.0)
     if not first <= last:
         return 0, 0
     return int(first) // TILE_W, int(last) // TILE_W + 1
@@ -138,18 +150,19 @@ def count_tiles(splats: Array, window: Array, grid: Array, counts: Array, per_sp
     parts = counts.shape[0]
     count = splats.shape[0]
     step = (count + parts - 1) // parts
+    x0, y0 = np.float64(window[0]), np.float64(window[1])
+    x1, y1 = np.float64(window[2]), np.float64(window[3])
     per_splat[0] = 0
     for p in prange(parts):
         counts[p] = 0
         for s in range(p * step, min(count, (p + 1) * step)):
-            splat = splats[s]
             touched = 0
-            top, bottom = row_bounds(splat, window)
+            top, bottom = _row_bounds(splats[s, MY], splats[s, EXTENT_Y], y0, y1)
             if top < bottom:
-                side = side_points(splat)
+                outline = _outline(splats, s)
                 for row in range(top // TILE_H, (bottom - 1) // TILE_H + 1):
                     y_first, y_last = max(top, row * TILE_H), min(bottom, (row + 1) * TILE_H) - 1
-                    first, end = tile_columns(splat, side, y_first, y_last, window)
+                    first, end = _tile_columns(outline, y_first, y_last, x0, x1)
                     base = (row - grid[1]) * grid[2] - grid[0]
                     for column in range(first, end):
                         counts[p, base + column] += 1
@@ -200,16 +213,17 @@ def fill_tiles(
     parts = places.shape[0]
     count = splats.shape[0]
     step = (count + parts - 1) // parts
+    x0, y0 = np.float64(window[0]), np.float64(window[1])
+    x1, y1 = np.float64(window[2]), np.float64(window[3])
     for p in prange(parts):
         for s in range(p * step, min(count, (p + 1) * step)):
-            splat = splats[s]
             slot = per_splat[s]
-            top, bottom = row_bounds(splat, window)
+            top, bottom = _row_bounds(splats[s, MY], splats[s, EXTENT_Y], y0, y1)
             if top < bottom:
-                side = side_points(splat)
+                outline = _outline(splats, s)
                 for row in range(top // TILE_H, (bottom - 1) // TILE_H + 1):
                     y_first, y_last = max(top, row * TILE_H), min(bottom, (row + 1) * TILE_H) - 1
-                    first, end = tile_columns(splat, side, y_first, y_last, window)
+                    first, end = _tile_columns(outline, y_first, y_last, x0, x1)
                     base = (row - grid[1]) * grid[2] - grid[0]
                     for column in range(first, end):
                         at = places[p, base + column]

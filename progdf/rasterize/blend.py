@@ -69,6 +69,24 @@ def blend_row(state: Array, cards: Array, card: Number, row: Number, place: Numb
         state[p + _LAST] = place if weight > _ZERO else state[p + _LAST]
 
 
+@kernel(fast=True, inline=True)
+def _shrink(state: Array, bounds: Array) -> Number:
+    """Leave rows whose pixels are all done out of `bounds`, from above and below; whether any row is left."""
+    while bounds[1] < bounds[3] and _is_done(state, bounds[1], bounds):
+        bounds[1] += 1
+    while bounds[1] < bounds[3] and _is_done(state, bounds[3] - 1, bounds):
+        bounds[3] -= 1
+    return bounds[1] < bounds[3]
+
+
+@kernel(fast=True, inline=True)
+def _is_done(state: Array, row: int, bounds: Array) -> Number:
+    highest = _ZERO
+    for j in range(np.uint64(bounds[0]), np.uint64(bounds[2])):
+        highest = max(highest, state[np.uint64(row) * np.uint64(TILE_W) + j])
+    return highest <= _ZERO
+
+
 @kernel(fast=True)
 def blend_tile(
     state: Array, x: int, y: int, members: Array, splats: Array, rgb: Array, bounds: Array, cards: Array
@@ -85,10 +103,7 @@ def blend_tile(
             card = np.uint64(place - begin) * CARD
             for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
                 blend_row(state, cards, card, row, np.float32(place))
-        highest = _ZERO
-        for p in range(plane):
-            highest = max(highest, state[p])
-        if highest <= _ZERO:  # every pixel is done
+        if not _shrink(state, bounds):
             break
 
 
@@ -120,6 +135,7 @@ def blend(
             tile_bounds(x, y, window, bounds)
             listed = members[tile_starts[tile] : tile_starts[tile + 1]]
             blend_tile(state, x, y, listed, splats, rgb, bounds, cards)
+            tile_bounds(x, y, window, bounds)  # blending shrank it
             for row in range(y + bounds[1], y + bounds[3]):
                 for column in range(x + bounds[0], x + bounds[2]):
                     p = (row - y) * TILE_W + column - x

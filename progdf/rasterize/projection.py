@@ -104,6 +104,7 @@ def _project_range(
     bands = max(1, (degree + 1) ** 2)
     for k in range(begin, end):
         i, s = ids[k], ranks[k]
+        splats[s, MX] = splats[s, MY] = 0.0  # and not what the memory held, which may be NaN
         splats[s, R2] = splats[s, EXTENT_Y] = -1.0
         mean = vec(means, i)
         seen = footprint(
