@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import moderngl
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from progdf.gaussians import ATTRIBUTES, Gaussians
@@ -78,30 +77,31 @@ class SplatTextures:
         Returns:
             Bytes sent.
         """
+        runs = [(0, self.rows)] if rows is None else list(row_runs(rows))
         touched = []
         for attribute in attributes:
             place = _PLACES[attribute]
-            if place.texture not in self._memory or (rows is not None and not len(rows)):
+            if place.texture not in self._memory:
                 continue
-            source = getattr(scene, attribute).detach()
+            values = getattr(scene, attribute).detach()
             if attribute == "shN":
-                source = source[:, : self.sh_coefficients].flatten(1)
-            values = source[:, None] if source.ndim == 1 else source
-            target = torch.from_numpy(self._memory[place.texture])
-            columns = target[: self.count, place.channel : place.channel + values.shape[1]]
-            if rows is None:
-                columns.copy_(values)
-            else:
-                index = torch.from_numpy(rows)
-                columns[index] = values[index].to(columns.dtype)
+                values = values[:, : self.sh_coefficients].flatten(1)
+            columns = _two_dimensional(values.numpy())
+            memory = self._memory[place.texture][:, place.channel : place.channel + columns.shape[1]]
+            for (
+                first,
+                last,
+            ) in runs:  # whole runs: gathering the changed rows alone takes several times longer
+                begin, end = first * SPLATS_PER_ROW, min(last * SPLATS_PER_ROW, self.count)
+                memory[begin:end] = columns[begin:end]
             if place.texture not in touched:
                 touched.append(place.texture)
-        return sum(self._send(name, rows) for name in touched)
+        return sum(self._send(name, runs) for name in touched)
 
-    def _send(self, name: str, rows: NDArray[np.int64] | None) -> int:
+    def _send(self, name: str, runs: list[tuple[int, int]]) -> int:
         texture, memory = self.textures[name], self._memory[name]
         sent = 0
-        for first, last in [(0, self.rows)] if rows is None else row_runs(rows):
+        for first, last in runs:
             part = memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
             texture.write(part, viewport=(0, first, texture.width, last - first))
             sent += part.nbytes
@@ -121,9 +121,15 @@ class SplatTextures:
 
 def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     """Texture rows [first, last) that hold the Gaussians `rows` (sorted), near ones joined."""
+    if not len(rows):
+        return
     touched = rows // SPLATS_PER_ROW
     breaks = np.flatnonzero(np.diff(touched) > _GAP)
     firsts = touched[np.concatenate([[0], breaks + 1])]
     lasts = touched[np.concatenate([breaks, [len(touched) - 1]])]
     for first, last in zip(firsts, lasts, strict=True):
         yield int(first), int(last) + 1
+
+
+def _two_dimensional(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return values[:, None] if values.ndim == 1 else values
