@@ -42,3 +42,10 @@ lint: setup
 
 bench: setup
 	$(BIN)/progdf bench
+
+# Everything the README shows that a command made.
+pictures: setup window
+	$(BIN)/progdf demo --out demo --no-window
+	cp demo/hero.png demo/two-sliders.png assets/
+	assets/window.sh $(BIN)/progdf demo assets/window.png
+	$(BIN)/progdf bench --readme README.md

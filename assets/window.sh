@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# Takes the README's picture of the window: a real window on a virtual screen, its own screenshot key.
+# usage: assets/window.sh PROGDF DEMO_FOLDER OUT.png
+set -euo pipefail
+progdf=$(realpath "$1") demo=$(realpath "$2") out=$(realpath -m "$3")
+export DISPLAY=:97
+folder=$(mktemp -d)
+Xvfb "$DISPLAY" -screen 0 1280x800x24 >/dev/null 2>&1 &
+screen=$!
+trap 'kill "$screen"; rm -rf "$folder"' EXIT
+sleep 1
+cd "$folder"
+"$progdf" view "$demo/scene.ply" "$demo"/*/scarf.gdf "$demo"/*/gold.gdf "$demo"/*/frost.gdf \
+  --set scarf=0.8 --set gold=0.6 --background '#bfd8f1' &
+window=$!
+xdotool search --sync --onlyvisible --name scene.ply >/dev/null
+sleep 20 # the first picture on a machine compiles the rasteriser
+xdotool key shift+F2
+sleep 3
+xdotool key ctrl+q
+wait "$window"
+mv "$folder"/*.png "$out"
