@@ -121,8 +121,8 @@ def _tile_columns(o: Outline, y_first: int, y_last: int, left: float, right: flo
     """First tile column and one past the last that the splat may reach in pixel rows y_first..y_last.
 
     Columns count from the left edge of the full image; left, right: the window's. The bound is exact
-    up to 1e-6 px: within a band of rows the support's left edge is farthest out where its leftmost point is, or
-    at the band's nearest row.
+    up to 1e-6 px: within a band of rows the support's left edge is farthest out where its leftmost point is,
+    or at the band's nearest row.
     """
     low, high = y_first + 0.5 - o.my, y_last + 0.5 - o.my
     left_at, right_at = min(max(o.side, low), high), min(max(-o.side, low), high)
