@@ -8,7 +8,7 @@ ranks are grown on what that predicts, and the pictures have the last word.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,10 +16,21 @@ import torch
 from torch import Tensor
 
 from progdf.field.baked import BakedField
+from progdf.field.judge import Candidate, FieldJudge, sample_strengths
 from progdf.field.keyframes import fit_keyframes
-from progdf.field.ranks import decibels, emphasised_modes, expected_worst, grown_ranks
+from progdf.field.ranks import emphasised_modes, expected_worst, grown_ranks
 from progdf.field.rendered import Render, RenderedCourses, rendered_courses
 from progdf.field.separable import channel_weights, check_trajectory, leading_modes, stored_attribute
+
+__all__ = [
+    "Candidate",
+    "Choice",
+    "FieldJudge",
+    "Kind",
+    "choose_field",
+    "sample_strengths",
+    "separable_within",
+]
 
 Kind = Literal["auto", "separable", "keyframes"]
 
@@ -30,32 +41,6 @@ CLOSE = 0.02
 """Share of its bytes that may be saved in vain before the search for ranks goes on."""
 
 KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
-SAMPLES = 25
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A field and its error against the trajectory.
-
-    Args:
-        field: the field
-        curve: PSNR at `sample_strengths()`, dB
-        label: what it is, e.g. "separable (means 2, sh0 3)"
-    """
-
-    field: BakedField
-    curve: tuple[float, ...]
-    label: str
-
-    @property
-    def worst(self) -> float:
-        """Least PSNR over the slider, dB."""
-        return min(self.curve)
-
-    @property
-    def mean(self) -> float:
-        """Mean PSNR over the slider, dB."""
-        return sum(self.curve) / len(self.curve)
 
 
 @dataclass(frozen=True)
@@ -65,51 +50,6 @@ class Choice:
     best: Candidate
     met: bool
     tried: tuple[Candidate, ...]
-
-
-def sample_strengths() -> tuple[float, ...]:
-    """Strengths at which errors are taken: even, the ends left out where the error is 0 by construction."""
-    return tuple((i + 1) / (SAMPLES + 1) for i in range(SAMPLES))
-
-
-class FieldJudge:
-    """Renders fields and compares them with the trajectory, whose pictures are made once.
-
-    Args:
-        strengths: of the snapshots. [T]
-        offsets: [T,M,C]
-        render: the pixels that count; held-out views are the honest choice
-        truth: the offsets at any strength, [M,C]; None is straight from snapshot to snapshot
-    """
-
-    def __init__(
-        self,
-        strengths: Tensor,
-        offsets: Tensor,
-        render: Render,
-        truth: Callable[[float], Tensor] | None = None,
-    ) -> None:
-        course = truth or (lambda s: _between(strengths, offsets, s))
-        self._render = render
-        self._nothing = torch.zeros_like(offsets[0])
-        with torch.no_grad():
-            self._expected = [render(course(s)) for s in sample_strengths()]
-
-    def curve(self, field: BakedField) -> tuple[float, ...]:
-        """PSNR at `sample_strengths()`, dB."""
-        with torch.no_grad():
-            return tuple(
-                decibels(float((self._render(self._offsets(field, s)) - expected).double().square().mean()))
-                for s, expected in zip(sample_strengths(), self._expected, strict=True)
-            )
-
-    def _offsets(self, field: BakedField, s: float) -> Tensor:
-        # a field that moves nothing does not know how many members it has
-        return field.offsets(s) if field.attributes else self._nothing
-
-    def candidate(self, field: BakedField, label: str) -> Candidate:
-        """The field with its error."""
-        return Candidate(field, self.curve(field), label)
 
 
 def choose_field(
@@ -187,17 +127,17 @@ def _grown(
 
     def look(i: int) -> Candidate:
         if i not in tried:
-            tried[i] = _separable(seen, strengths, path[i], judge, recorded)
+            tried[i] = _separable(seen, strengths, path[i], judge, recorded, target)
         return tried[i]
 
     # the prediction leads to the place, each look corrects it, until the smallest that holds is cornered
     low, high = -1, len(path)
     correction = 0.0
     while high - low > 1:
-        if low >= 0 and high < len(path) and stored[high] - stored[low] <= CLOSE * stored[high]:
-            break
         likely = [i for i in range(low + 1, high) if expected[i] + correction >= target]
         i = likely[0] if likely else high - 1
+        if high < len(path) and stored[high] - stored[i] <= CLOSE * stored[high]:
+            break
         found = look(i)
         correction = found.worst - expected[i]
         low, high = (low, i) if found.worst >= target else (i, high)
@@ -210,8 +150,9 @@ def _separable(
     ranks: Mapping[str, int],
     judge: FieldJudge,
     recorded: Sequence[float] | None,
+    enough: float = math.inf,
 ) -> Candidate:
-    """The field of these ranks: bases as pictures or as the bare numbers want them, whichever looks better.
+    """The field of these ranks: pictures choose the bases or, short of `enough` dB, numbers if better.
 
     Pictures are the better guide but for parts that move far, where straightening an attribute changes more
     than a sum of effects can say.
@@ -226,7 +167,7 @@ def _separable(
         }
         field = BakedField("separable", strengths.float(), attributes, seen.channels, ticks)
         found.append(judge.candidate(field, f"separable ({label})"))
-        if not any(ranks.values()):
+        if found[-1].worst >= enough or not any(ranks.values()):
             break
     return max(found, key=lambda candidate: candidate.worst)
 
@@ -239,22 +180,17 @@ def _keyframes(
     judge: FieldJudge,
     recorded: Sequence[float] | None,
 ) -> list[Candidate]:
-    """Keyframe fields, ever more, until one meets the target or is larger than what is known to."""
+    """Keyframe fields: ever more of them until the target is met, or from the most bytes down while it is."""
+    counts = [count for count in KEYFRAMES if count <= len(strengths)]
+    fields = {count: fit_keyframes(strengths, offsets, count, recorded, torch.int8) for count in counts}
+    bounded = math.isfinite(most_bytes)
+    if bounded:
+        counts = [count for count in counts if fields[count].bytes_per_member <= most_bytes][::-1] or counts[
+            :1
+        ]
     tried: list[Candidate] = []
-    for count in (n for n in KEYFRAMES if n <= len(strengths)):
-        field = fit_keyframes(strengths, offsets, count, recorded, torch.int8)
-        if tried and field.bytes_per_member > most_bytes:
-            break
-        tried.append(judge.candidate(field, f"{count} keyframes"))
-        if tried[-1].worst >= target:
+    for count in counts:
+        tried.append(judge.candidate(fields[count], f"{count} keyframes"))
+        if (tried[-1].worst >= target) != bounded:
             break
     return tried
-
-
-def _between(strengths: Tensor, offsets: Tensor, s: float) -> Tensor:
-    """The trajectory at `s`, linear between snapshots. [M,C]"""
-    right = int(
-        torch.searchsorted(strengths, torch.tensor(s, dtype=strengths.dtype)).clamp(1, len(strengths) - 1)
-    )
-    low, high = float(strengths[right - 1]), float(strengths[right])
-    return torch.lerp(offsets[right - 1], offsets[right], (s - low) / (high - low))

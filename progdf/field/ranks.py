@@ -51,7 +51,7 @@ def emphasised_modes(seen: RenderedCourses, ranks: Mapping[str, int]) -> Modes:
     emphasis = torch.ones(seen.gram.shape[1], dtype=torch.float64)
     best = modes = seen.modes(emphasis)
     least = mse = seen.mse(modes, ranks)
-    for _ in range(12):
+    for _ in range(8):
         inner = mse[1:-1]
         if not bool((inner > 0).any()):
             break
