@@ -103,6 +103,7 @@ def test_a_sweep_is_an_animation_there_and_back(run: Run) -> None:
             animation.seek(i)
             frames.append(np.asarray(animation.convert("RGB")).astype(int))
     assert np.abs(frames[0] - frames[1]).max() > 60, "both ends of the slider"
+    assert (frames[0][0, 0] == 255).all(), "a white page stays white"
     assert np.array_equal(frames[2], frames[3]), "the way back is the way there"
 
 

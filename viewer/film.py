@@ -78,12 +78,22 @@ def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
     there = [Image.fromarray(frame) for frame in frames]
     few = there[:: max(1, len(there) // 4)]
     mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in few]))
-    palette = mosaic.quantize(256, method=Image.Quantize.MEDIANCUT)
+    palette = _with_exact_background(mosaic, mosaic.quantize(256, method=Image.Quantize.MEDIANCUT))
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
     shown = indexed + indexed[-2:0:-1]
     rests = {0, len(indexed) - 1}
     durations = [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))]
     shown[0].save(path, save_all=True, append_images=shown[1:], duration=durations, loop=0, disposal=1)
+
+
+def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
+    """The same palette, its entry next to the commonest colour being that colour: white stays white."""
+    counts = picture.getcolors(picture.width * picture.height) or []
+    commonest = np.array(max(counts)[1])
+    colours = np.array(indexed.getpalette(), np.int64).reshape(-1, 3)
+    colours[np.abs(colours - commonest).sum(axis=1).argmin()] = commonest
+    indexed.putpalette(colours.ravel().tolist())
+    return indexed
 
 
 def check_encoder(path: Path) -> None:
