@@ -28,6 +28,7 @@ from progdf.scenes import DemoScene, bear, room
 from trainer.options import TrainOptions
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
+_HERO_HEIGHT = 400
 _GRID = (0.0, 1 / 3, 2 / 3, 1.0)
 
 
@@ -201,8 +202,7 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
         [f"{second} {step}" for step in steps],
         "Two sliders, every mixture",
     )
-    mixtures: list[dict[str, float]] = [{}, {first: 1.0}, {first: 1.0, second: 1.0}, {third: 1.0}]
-    hero = torch.cat([shot(480, strengths) for strengths in mixtures], dim=1)
+    hero = torch.cat([shot(_HERO_HEIGHT, {third: strength}) for strength in STRENGTHS], dim=1)
     written = []
     for name, image in (("sliders", sliders), ("two-sliders", grid), ("hero", hero)):
         written.append(folder / f"{name}.png")
