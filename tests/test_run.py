@@ -198,6 +198,12 @@ def test_bad_input_is_one_line_and_leaves_no_edit(folder: Path, tmp_path: Path, 
     assert not list(tmp_path.rglob("*.gdf"))
 
 
+def test_an_edit_that_changes_nothing_is_told_before_training(folder: Path, done: RunResult) -> None:
+    originals = done.folder.root / "views" / "original"
+    with pytest.raises(ProgdfError, match="changes none of the views; "):
+        train(quick_options(folder, "nothing", editor=f"folder:{originals}"), quiet=True)
+
+
 def test_fitting_what_is_no_run_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="progdf train"):
         cli.fit([str(tmp_path)])

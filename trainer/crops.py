@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.gaussians import ATTRIBUTES, Gaussians, unpack
+from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import Crop, rasterize
 from progdf.sh import basis, shade
 from trainer.losses import clamp_towards
@@ -67,14 +67,14 @@ class CropScene:
         """
         members = unpack(packed, self.member_shN)
 
-        def now(name: str, original: Tensor, values: Tensor) -> Tensor:
-            return original.index_copy(0, self.rows, values) if name in moving else original
+        def put(values: Tensor, into: Tensor) -> Tensor:
+            return into.index_copy(0, self.rows, values)
 
         image, transmittance = self._draw(
-            now("means", self.means, members.means),
-            now("quats", self.quats, members.quats),
-            now("log_scales", self.scales, members.scales),
-            now("logit_opacities", self.opacities, members.opacities),
+            put(members.means, self.means) if "means" in moving else self.means,
+            put(members.quats, self.quats) if "quats" in moving else self.quats,
+            put(members.scales, self.scales) if "log_scales" in moving else self.scales,
+            put(members.opacities, self.opacities) if "logit_opacities" in moving else self.opacities,
             self.colors.index_copy(0, self.rows, member_colors(members, self.camera.position)),
         )
         return clamp_towards(image, 0.0, 1.0), transmittance
@@ -145,7 +145,15 @@ def crop_scene(scene: Gaussians, members: Tensor, camera: Camera, box: Crop, bac
     )
 
 
-def render_all(crops: Sequence[CropScene], packed: Tensor) -> list[Tensor]:
+def render_all(
+    crops: Sequence[CropScene], packed: Tensor, moving: Collection[str] = ATTRIBUTES
+) -> list[Tensor]:
     """Every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
     with torch.no_grad():
-        return [crop.render(packed)[0] for crop in crops]
+        return [crop.render(packed, moving)[0] for crop in crops]
+
+
+def moving_attributes(offsets: Tensor) -> list[str]:
+    """The attributes that these offsets [M,14] or [M,14+3K] move at all."""
+    slices = attribute_slices(offsets.shape[1])
+    return [name for name, columns in slices.items() if bool(offsets[:, columns].any())]

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField, fit_keyframes
-from progdf.field.choose import Candidate, FieldJudge, Kind, choose_field
+from progdf.field import BakedField, Candidate, FieldJudge, choose_field, fit_keyframes
+from progdf.field.choose import Kind
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
 from trainer.judge import Judge

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians, pack
 from progdf.region import Region
-from trainer.crops import CropScene, crop_scene, render_all
+from trainer.crops import CropScene, crop_scene, moving_attributes, render_all
 from trainer.losses import Perceptual
 from trainer.views import View, crop
 
@@ -40,7 +40,10 @@ class Judge:
 
     def pictures(self, offsets: Tensor) -> list[Tensor]:
         """Every view with these offsets. [M,C] -> [h,w,3] each"""
-        return render_all(self.crops, self.original[:, : offsets.shape[1]] + offsets)
+        if not len(offsets):  # a field that moves nothing does not know how many members it has
+            offsets = torch.zeros_like(self.original)
+        rows = self.original[:, : offsets.shape[1]] + offsets
+        return render_all(self.crops, rows, moving_attributes(offsets))
 
     def psnr(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""

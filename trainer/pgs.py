@@ -197,7 +197,7 @@ def optimise(
             last = local == stage.steps - 1
             if not last and local % 2:
                 continue
-            pictures = render_all(probes, original + average)
+            pictures = render_all(probes, original + average, moving)
             if last or _mean_distance(pictures, last_pictures) >= spacing:
                 last_pictures = pictures
                 loss_mean, left_mean = torch.tensor(losses).mean(dim=0).tolist()

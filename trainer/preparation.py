@@ -70,7 +70,7 @@ def edited_views(
         made = [editor.edit(view, strength) for view in views]
         if confined:
             made = [view.confined(picture) for view, picture in zip(views, made, strict=True)]
-        pictures = [_eight_bits(picture) for picture in made]
+        pictures = [eight_bits(picture) for picture in made]
         named_pictures = {view.camera.name: p for view, p in zip(views, pictures, strict=True)}
         write_views(folder, "edited", named_pictures, strength)
         edited[strength] = pictures
@@ -100,5 +100,6 @@ def probes(stand: Stand) -> list[CropScene]:
     ]
 
 
-def _eight_bits(image: Tensor) -> Tensor:
+def eight_bits(image: Tensor) -> Tensor:
+    """What is left of an image in an 8-bit file. [H,W,3] -> [H,W,3]"""
     return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.choose import sample_strengths
+from progdf.field.judge import sample_strengths
 from progdf.pictures import contact_sheet, to_picture
 from progdf.slider_statistics import SliderStatistics, slider_statistics
 from trainer.fit import Fitted, field_figures

@@ -20,7 +20,7 @@ from progdf.rasterize import render, set_threads
 from progdf.region import Region
 from progdf.region_spec import parse_region
 from trainer.artefacts import RunFolder, claim, remove_stale_views, signature, write_views
-from trainer.crops import crop_scene, render_all
+from trainer.crops import crop_scene, moving_attributes, render_all
 from trainer.editors import check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor
@@ -34,6 +34,7 @@ from trainer.preparation import (
     Pictures,
     Stand,
     edited_views,
+    eight_bits,
     make_stand,
     probes,
     strengths_to_ask,
@@ -103,6 +104,12 @@ def _trained(
         edited = edited_views(editor, views, strengths, folder, confined)
         train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
         stand = widened(stand, train_edits)
+    if all(
+        torch.equal(p, eight_bits(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
+    ):
+        raise ProgdfError(
+            f"{options.editor} changes none of the views; check the region and what the editor is asked for"
+        )
     log.say(f"{options.editor}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
 
     with log.stage("optimise"):
@@ -254,8 +261,10 @@ def _retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Tra
     small = probes(stand)
     rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
 
+    moving = moving_attributes(trajectory.end)
+
     def seen(offsets: Tensor) -> Tensor:
-        return torch.cat([picture.flatten() for picture in render_all(small, rows + offsets)])
+        return torch.cat([picture.flatten() for picture in render_all(small, rows + offsets, moving)])
 
     return retime(straightened(trajectory, seen), seen, options.slider)
 

@@ -87,7 +87,7 @@ def retime(
     render: Callable[[Tensor], Tensor],
     slider: Slider = "stages",
     passes: int = 3,
-    samples: int = 12,
+    samples: int = 6,
 ) -> Trajectory:
     """Give every recording the slider value at which its visible change is due.
 
