@@ -90,11 +90,12 @@ def finished(
             "stages": list(trajectory.strengths),
             "attribute_worth_db": about["attribute_worth_db"],
         },
-        "time": {**_earlier_times(folder), **log.rounded_seconds()},
+        "time": {**(_earlier_times(folder) if log.appends else {}), **log.rounded_seconds()},
         "memory_mb": _peak_memory_mb(),
         "options": options,
     }
-    save_gdf(folder.gdf(options["name"]), replace(gdf, report=report))
+    own = {part: value for part, value in report.items() if part != "options"}  # the .gdf has them beside it
+    save_gdf(folder.gdf(options["name"]), replace(gdf, report=own))
     write_json(folder.report, report)
     write_image(folder.picture, picture)
     edit = report["edit"]

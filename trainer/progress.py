@@ -34,6 +34,7 @@ class RunLog:
 
     def __init__(self, path: Path, quiet: bool = False, append: bool = False) -> None:
         self.seconds: dict[str, float] = {}
+        self.appends = append
         self._start = time.perf_counter()
         self._file = path.open("a" if append else "w", encoding="utf-8", buffering=1)
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
@@ -44,9 +45,9 @@ class RunLog:
         self._file.write(text + "\n")
 
     def rounded_seconds(self) -> dict[str, float]:
-        """Seconds by stage, and the total since the log was opened."""
-        total = time.perf_counter() - self._start
-        return {name: round(seconds, 2) for name, seconds in {**self.seconds, "total": total}.items()}
+        """Seconds by stage, and since the log was opened: the total, or of a refit its own."""
+        all_of_it = {"refit" if self.appends else "total": time.perf_counter() - self._start}
+        return {name: round(seconds, 2) for name, seconds in {**self.seconds, **all_of_it}.items()}
 
     def say(self, text: str) -> None:
         """One line."""

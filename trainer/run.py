@@ -133,13 +133,12 @@ def _trained(
     }
     extra = {"members": region.members, "score": region.score}
     save_trajectory(folder.trajectory, trajectory, extra, about)
-    result = finished(folder, stand, trajectory, about, perceptual, log, options.field)
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(stand, trajectory))
         with torch.no_grad():
             finals = {v.camera.name: render(edited_scene, v.camera, stand.background) for v in views}
         write_views(folder, "final", finals)
-    return result
+    return finished(folder, stand, trajectory, about, perceptual, log, options.field)
 
 
 def refit(options: FitOptions, quiet: bool = False) -> RunResult:
