@@ -22,6 +22,9 @@ Draw = Callable[[ViewState], Pixels]
 
 SWEEP_STEPS = 24
 FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
+_PALETTE_REACH = 8  # levels: Pillow looks for the palette's nearest colour in steps of 4, not for each colour
+    4  # levels: Pillow takes a palette's nearest colour for cells of this size, not for each colour
+)
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -87,11 +90,12 @@ def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
 
 
 def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
-    """The same palette, its entry next to the commonest colour being that colour: white stays white."""
+    """The same palette, but what is nearly the commonest colour becomes that colour: white stays white."""
     counts = picture.getcolors(picture.width * picture.height) or []
     commonest = np.array(max(counts)[1])
     colours = np.array(indexed.getpalette(), np.int64).reshape(-1, 3)
-    colours[np.abs(colours - commonest).sum(axis=1).argmin()] = commonest
+    distances = np.abs(colours - commonest).max(axis=1)
+    colours[distances <= max(_PALETTE_REACH, int(distances.min()))] = commonest
     indexed.putpalette(colours.ravel().tolist())
     return indexed
 
