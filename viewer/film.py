@@ -22,9 +22,7 @@ Draw = Callable[[ViewState], Pixels]
 
 SWEEP_STEPS = 24
 FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
-_PALETTE_REACH = 8  # levels: Pillow looks for the palette's nearest colour in steps of 4, not for each colour
-    4  # levels: Pillow takes a palette's nearest colour for cells of this size, not for each colour
-)
+_PALETTE_REACH = 8  # levels: Pillow looks up the nearest colour of a palette in steps of 4
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
