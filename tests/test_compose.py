@@ -221,6 +221,23 @@ def test_the_composer_gives_the_bits_of_compose_through_a_random_session(
         before = now
 
 
+@pytest.mark.parametrize("blend", BLENDS)
+def test_edits_that_overlap_the_dragged_one_keep_their_part(
+    scene: Gaussians, wardrobe: list[Gdf], blend: str
+) -> None:
+    composer = Composer(scene, wardrobe)
+    weights = torch.linspace(0, 1, 120)
+    for strength in (0.5, 0.6, 1.0, 0.0):
+        layers = [
+            Layer(wardrobe[3], 0.3),
+            Layer(wardrobe[0], strength),
+            Layer(wardrobe[1], 0.4, weights=weights),
+            Layer(wardrobe[2], 0.8),
+        ]
+        composer.update(layers, blend)
+        assert bits(composer.gaussians) == bits(compose(scene, layers, blend))
+
+
 def test_the_composer_leaves_the_scene_alone(scene: Gaussians, shirt: Gdf) -> None:
     before = bits(scene)
     Composer(scene, [shirt]).update([Layer(shirt, 0.5)])

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from progdf.field import AttributeBases, BakedField, FieldJudge, choose_field, fit_keyframes, fit_separable
+from progdf.field.choose import separable_within
 from progdf.field.rendered import Render, rendered_courses
 from progdf.field.separable import channel_weights, stored_bases
 from progdf.gaussians import ATTRIBUTES, attribute_slices
@@ -281,6 +282,33 @@ def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> N
         for s, o in zip(strengths, offsets, strict=True)
     ]
     assert torch.allclose(expected, torch.tensor(found, dtype=torch.float64), rtol=1e-3, atol=1e-12)
+
+
+def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
+    _, offsets = curved_trajectory(40, snapshots=17)
+    render = linear_pictures(40, 14)
+    seen = rendered_courses(offsets, channel_weights(None, 40, 14), render)
+    modes = seen.modes(torch.ones(17, dtype=torch.float64))
+    left = torch.zeros_like(offsets)
+    for name, columns in attribute_slices(14).items():
+        mix, table = (part[:, :1].float() for part in modes[name])
+        residual = seen.courses[name].residual.flatten(1)
+        left[:, :, columns] = (residual - table @ (mix.T @ residual)).reshape(left[:, :, columns].shape)
+    found = torch.stack([render(o).double().square().mean() for o in left])
+    expected = seen.mse(modes, dict.fromkeys(ATTRIBUTES, 1))
+    assert torch.allclose(expected, found, rtol=1e-2, atol=1e-9)
+
+
+def test_bytes_go_first_to_what_shows_most() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    render = linear_pictures(60, 14)
+    judge = FieldJudge(strengths, offsets, render)
+    seen = rendered_courses(offsets, channel_weights(None, 60, 14), render)
+    best = separable_within(seen, strengths, 62, judge)
+    assert best.field.bytes_per_member <= 62
+    for ranks in ({"means": 2}, {"means": 1, "log_scales": 1}, {"quats": 1, "logit_opacities": 2}):
+        other = fit_separable(strengths, offsets, ranks)
+        assert best.worst > judge.candidate(other, "").worst
 
 
 def test_the_judge_finds_no_error_in_all_snapshots() -> None:
