@@ -175,6 +175,8 @@ def test_a_mistake_is_one_line_and_leaves_no_file(
         (("render", "bear.ply", "-o", "x.jpg"), "x.jpg is not a .png file"),
         (("render", "bear.ply", "-o", "x.gif"), "x.gif holds an animation; say which slider moves"),
         (("render", "bear.ply", "--sweep", "ears", "-o", "x.gif"), "--sweep ears: no .gdf file was given"),
+        (("view", "nope.ply"), "nope.ply does not exist"),
+        (("view", "bear.ply", "scarf.gdf", "--set", "hat=1"), "--set hat: there is no edit of that name"),
         (("export", "bear.ply", "ears.gdf", "-o", "bear.ply"), "bear.ply is one of the files to read"),
         (("export", "bear.ply", "ears.gdf", "-o", "x.obj"), "x.obj is not a .ply file"),
         (
