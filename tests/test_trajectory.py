@@ -81,6 +81,12 @@ def test_jitter_does_not_count_as_change() -> None:
     assert float(arc[-1]) > 1.2 * float(noisy.end.abs().mean()), "the jitter is there"
 
 
+def test_three_passes_are_more_even_than_one_where_recordings_jitter() -> None:
+    noisy = along([1 - (1 - i / 20) ** 2 for i in range(1, 21)], noise=0.05)
+    once, thrice = (even_chords(retime(noisy, seen, passes=passes), 6) for passes in (1, 3))
+    assert float(thrice.min() / thrice.max()) > float(once.min() / once.max()) + 0.05
+
+
 def test_stage_ends_keep_their_strengths_whatever_happens_between() -> None:
     progress = [0.01, 0.02, 0.05, 0.1, 0.3, 0.95, 1.0]
     trajectory = retime(along(progress, [2, 4, 5, 7]), seen, "stages")

@@ -52,8 +52,6 @@ class Trajectory:
 
     def at(self, s: float) -> Tensor:
         """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
-        if s >= 1.0:
-            return self.end
         right = int(torch.searchsorted(self.s, torch.tensor(s, dtype=self.s.dtype), right=True))
         right = min(max(right, 1), len(self) - 1)
         low, high = float(self.s[right - 1]), float(self.s[right])
