@@ -23,6 +23,7 @@ from trainer.editors.base import EditKind
 from trainer.views import View
 
 _GREY, _COLOURED = 0.5, 1.3  # of the typical chroma: up to here a grey, from here a colour
+_COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
 
 
@@ -62,6 +63,12 @@ class StripesEditor:
     kind: EditKind = "colour"
     stages: tuple[float, ...] = ()
 
+    def painted(self, rgb: Tensor, strength: float) -> Tensor:
+        """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
+        covered = strength * self.pattern
+        plainer = torch.lerp(rgb, self.reference.expand_as(rgb), (_COVER * covered)[:, None])
+        return recolored(plainer, self.target, covered, self.reference)
+
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
@@ -69,7 +76,7 @@ class StripesEditor:
         scene, members, camera = self.scene, self.members, view.camera
         directions = torch.nn.functional.normalize(scene.means[members] - camera.position, dim=1)
         before = shade(min(scene.sh_degree, 3), directions, scene.sh[members])
-        painted = recolored(before, self.target, strength * self.pattern, self.reference)
+        painted = self.painted(before, strength)
         colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
         with torch.no_grad():
             premultiplied, _, _ = rasterize(
