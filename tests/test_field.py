@@ -271,6 +271,13 @@ def test_an_edit_that_moves_nothing_is_a_choice_too() -> None:
     assert chosen.best.field.bytes_per_member == 0
 
 
+def test_an_edit_that_no_view_shows_gets_the_fewest_bytes() -> None:
+    strengths, offsets = curved_trajectory(20)
+    chosen = choose_field(strengths, offsets, lambda moved: torch.zeros(0, 3))
+    assert chosen.met
+    assert chosen.best.field.bytes_per_member == 56
+
+
 def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> None:
     strengths, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)

@@ -98,4 +98,4 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
     inner = snapshots - 2
     products = (rows @ rows.T).double().reshape(len(attributes), inner, len(attributes), inner)
     gram[:, 1:-1, :, 1:-1] = products
-    return RenderedCourses(courses, gram, rows.shape[1], offsets.shape[2])
+    return RenderedCourses(courses, gram, max(1, rows.shape[1]), offsets.shape[2])
