@@ -1,9 +1,9 @@
 """`progdf bench rasterize`: the cpu engine's speed beside its error, against a tiled renderer in plain torch.
 
-What it is compared with is the reference engine in float32: dense within tiles of 16x16 pixels that the box
-around a Gaussian's {alpha ≥ 1/255} touches, differentiated by autograd. Both take turns in one process, on one
-thread each: torch's threads wait for each other by spinning, which on a busy machine would flatter ours by any
-factor.
+What it is compared with is the reference engine in float32: dense within tiles of 16x16 pixels that the
+box around a Gaussian's {alpha ≥ 1/255} touches, differentiated by autograd. Both take turns in one process,
+on one thread each: torch's threads wait for each other by spinning, which on a busy machine would flatter
+ours by any factor.
 """
 
 from __future__ import annotations

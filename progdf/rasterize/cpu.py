@@ -98,7 +98,7 @@ def alpha_weights(
     gaussians = [_float32(tensor).detach().numpy() for tensor in (means, quats, scales, opacities)]
     gaussians.append(np.zeros((len(means), 1, 3), np.float32))
     totals = np.zeros((len(means), weights.SUMS))
-    with running("weights", 8) as workers:
+    with running("weights", 2) as workers:
         lists, _ = _list_splats(view, gaussians, workers, for_gradients=True)
         sums = np.zeros((len(lists.members), weights.SUMS))
         weights.weigh(
@@ -211,7 +211,7 @@ class _Rasterize(torch.autograd.Function):
         by_means, by_quats, by_scales, by_opacities, by_colors = gradients
         grad_camera = np.zeros((PARTS, CAMERA))
         wanted = _wanted_splats(lists, len(means), ctx.grad_rows)
-        with running("backward", 10) as workers:
+        with running("backward", 7) as workers:
             unblend(
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
                 lists.slots, background, workers, transmittance, ctx.last, grad_image, grad_transmittance,
