@@ -28,13 +28,14 @@ Floats = npt.NDArray[np.float32]
 
 _log = logging.getLogger(__name__)
 
-_GEOMETRY = {
+GEOMETRY = {
     "means": ("x", "y", "z"),
     "sh0": ("f_dc_0", "f_dc_1", "f_dc_2"),
     "logit_opacities": ("opacity",),
     "log_scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
+"""The columns of each attribute that every 3DGS .ply has."""
 _NORMALS = ("nx", "ny", "nz")
 _SH_REST = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 _MOST_THREADS = 4
@@ -60,7 +61,7 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
     name = os.fspath(path)
     vertex = _vertex(name, header)
     rest = _check_properties(name, header, vertex)
-    columns = dict(_GEOMETRY)
+    columns = dict(GEOMETRY)
     columns["shN"] = tuple(f"f_rest_{i}" for i in range(rest))
     used = tuple(column for names in columns.values() for column in names)
     attributes = {key: np.empty((vertex.count, len(names)), np.float32) for key, names in columns.items()}
@@ -142,7 +143,7 @@ def _vertex(name: str, header: PlyHeader) -> Element:
 def _check_properties(name: str, header: PlyHeader, vertex: Element) -> int:
     """The number of f_rest properties, once every property that 3DGS needs is known to be there."""
     present = {column.name for column in vertex.properties if not column.count_type}
-    missing = [column for names in _GEOMETRY.values() for column in names if column not in present]
+    missing = [column for names in GEOMETRY.values() for column in names if column not in present]
     if missing:
         raise ProgdfError(f"{name} {_what_it_is(header, present, missing)}")
     rest = sum(column.startswith("f_rest_") for column in present)

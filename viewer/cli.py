@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 import tyro
 from PIL import Image
+from plyfile import PlyData
 
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
@@ -20,7 +22,7 @@ from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.load_report import counted
-from progdf.ply import load_ply, save_ply
+from progdf.ply import GEOMETRY, load_ply, save_ply
 
 from . import arguments, film
 from .engine import Engine
@@ -161,6 +163,7 @@ def export(argv: Sequence[str]) -> int:
     with written_whole(options.out) as beside:
         save_ply(beside, edited)
         _check_reloaded(edited, load_ply(beside))
+        _check_by_plyfile(edited, beside)
     told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
     print(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
     return 0
@@ -246,6 +249,15 @@ def _check_reloaded(written: Gaussians, read: Gaussians) -> None:
             same = torch.equal(expected, found)
         if not same:
             raise ProgdfError(f"the written file does not give back its {name}; check the disk and try again")
+
+
+def _check_by_plyfile(written: Gaussians, path: Path) -> None:
+    """The same by a reader that is not ours, as other programs will read the file."""
+    vertex = PlyData.read(path)["vertex"]
+    for name, columns in GEOMETRY.items():
+        found = np.stack([vertex[column] for column in columns], axis=1)
+        if not np.array_equal(found, getattr(written, name).reshape(len(written), -1).numpy()):
+            raise ProgdfError(f"plyfile reads other {name} than were written; check the disk and try again")
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
