@@ -95,6 +95,7 @@ class CropScene:
             camera.height,
             background=self.background,
             crop=self.box,
+            grad_rows=self.rows,
         )
         return image, transmittance
 
