@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -150,6 +149,11 @@ def _earlier_times(folder: RunFolder) -> dict[str, float]:
         return {}
 
 
-def _peak_memory_mb() -> int:
+def _peak_memory_mb() -> int | None:
+    """Peak memory of this process in MB; None on Windows, whose Python cannot tell."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (1 << 20 if sys.platform == "darwin" else 1 << 10))
