@@ -20,13 +20,22 @@ def test_the_rasteriser_benchmark_names_an_error_beside_every_speed(monkeypatch:
     assert "not run" in table.rows[1]
 
 
+SHORT_OF_IT = pytest.mark.xfail(reason="30 times so far: overhead of a call at few Gaussians", strict=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("case", "floor"), [(Case(2_000, 128), 20.0), (Case(20_000, 256), 30.0)], ids=["2k", "20k"]
+    "case",
+    [pytest.param(Case(2_000, 128), marks=SHORT_OF_IT, id="2k"), pytest.param(Case(20_000, 256), id="20k")],
 )
-def test_the_cpu_engine_is_many_times_faster_than_a_tiled_torch_renderer(case: Case, floor: float) -> None:
-    """31 and 44 times were measured on one thread each; the floor leaves a busy machine a third."""
-    result = measure(case)
-    assert result.ratio >= floor
+def test_the_cpu_engine_is_40_times_faster_than_a_tiled_torch_renderer(case: Case) -> None:
+    """The floor of the goal of 100 and 70 times; 30 and 45 were measured, on one thread each."""
+    assert measure(case).ratio >= 40.0
+
+
+@pytest.mark.parametrize("case", [Case(2_000, 128), Case(20_000, 256)], ids=["2k", "20k"])
+@pytest.mark.slow
+def test_the_cpu_engine_is_that_fast_at_the_error_it_promises(case: Case) -> None:
+    result = measure(case, rounds=1, torch_rounds=1)
     assert result.image_error <= 2e-6
     assert max(result.gradient_errors.values()) <= 2e-5, result.gradient_errors
