@@ -14,6 +14,7 @@ from tests.trained import WHITE, Small, masked_psnr, small
 from trainer.crops import crop_scene
 from trainer.editors import make_editor
 from trainer.losses import GradientL1
+from trainer.objective import LossWeights, Objective
 from trainer.pgs import PgsSettings, Snapshot, Stage, learning_rates, optimise
 from trainer.views import crop
 
@@ -27,7 +28,8 @@ def run(case: Small, steps: int = 40, **more: object) -> tuple[Tensor, list[Snap
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     stages = [Stage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in STRENGTHS]
     settings = replace(PgsSettings(learning_rates("colour", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
-    return original, list(optimise(original, crops, crops[:2], stages, GradientL1(), settings))
+    objective = Objective(GradientL1(), LossWeights())
+    return original, list(optimise(original, crops, crops[:2], stages, objective, settings))
 
 
 def test_the_members_arrive_at_the_edited_views() -> None:
@@ -45,7 +47,7 @@ def test_the_members_arrive_at_the_edited_views() -> None:
 
 def test_the_distance_from_the_finished_edit_falls() -> None:
     _, found = run(small("body"))
-    assert found[-1].left < 0.25 * found[0].left
+    assert found[-1].means["left"] < 0.25 * found[0].means["left"]
 
 
 def test_each_stage_ends_with_a_recording_and_steps_ascend() -> None:
@@ -77,7 +79,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
 
 def test_the_warm_up_takes_shorter_steps_at_first() -> None:
     case = small("body")
-    free, warm = (run(case, steps=6, progressive=how)[1][-1].offsets for how in ("off", "warmup"))
+    free, warm = (run(case, steps=6, warmup=on)[1][-1].offsets for on in (False, True))
     assert float(warm.abs().mean()) < 0.5 * float(free.abs().mean())
 
 

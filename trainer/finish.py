@@ -78,9 +78,8 @@ def finished(
         measured = measure(judge, fitted, perceptual)
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
         endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
-        losses = [(int(step), float(loss), float(left)) for step, loss, left in about["losses"]]
         title = f"{options['name']}: {options['editor']}"
-        picture = report_picture(judge, measured, losses, title)
+        picture = report_picture(judge, measured, about["losses"], title)
     report = {
         **figures(measured, endpoint, outside),
         "trajectory": {
@@ -89,6 +88,7 @@ def finished(
             "stages": list(trajectory.strengths),
             "attribute_worth_db": about["attribute_worth_db"],
         },
+        "losses": about["losses"],
         "time": {**(_earlier_times(folder) if log.appends else {}), **log.rounded_seconds()},
         "memory_mb": _peak_memory_mb(),
         "options": options,

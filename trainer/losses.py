@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.lpips import Features, Lpips
+
+_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
 class _ClampTowards(torch.autograd.Function):
@@ -122,3 +124,54 @@ def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) 
     what helps is that early steps are short (method.md 3, L_prog).
     """
     return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
+
+
+def progressive_change(
+    moved: Tensor, previous: Tensor, step: int, grows: bool, alpha: float = 0.05, beta: float = 1.1
+) -> Tensor:
+    """The paper's progressive constraint as it is printed: L_prog = α·β^(±t/50)·Σ|ΔΘ|, without its λ2. []
+
+    ΔΘ is what the last step changed, summed over all raw parameters of all members. "growth" is the printed
+    exponent +t/50, which allows ever shorter steps; "decay" is −t/50, which lets go of them.
+    """
+    period = 50.0
+    factor: float = alpha * beta ** ((step if grows else -step) / period)
+    change = (moved - previous.detach()).abs().sum()
+    return factor * change
+
+
+def sharpness(
+    image: Tensor, target: Tensor, form: Literal["hinge", "paper"], inside: Tensor | None = None
+) -> Tensor:
+    """The paper's L_render. []
+
+    "paper" is the printed −∇²R, signed, over the whole picture. "hinge" asks for no more than the target
+    has: max(0, S(target) − S(image)), S the mean of |∇²Y| inside the region, Y the luma.
+
+    Args:
+        image: the render. [h,w,3]
+        target: what it should be. [h,w,3]
+        form: see above
+        inside: the pixels that count under "hinge"; None: all. [h,w] bool
+    """
+    if form == "paper":
+        return -laplacian(image.mean(dim=2)).mean()
+    weights = torch.ones_like(image[1:-1, 1:-1, 0]) if inside is None else inside[1:-1, 1:-1].to(image.dtype)
+    count = weights.sum().clamp_min(1.0)
+
+    def edges(picture: Tensor) -> Tensor:
+        return (laplacian(picture @ picture.new_tensor(_LUMA)).abs() * weights).sum() / count
+
+    return (edges(target) - edges(image)).clamp_min(0.0)
+
+
+def laplacian(luma: Tensor) -> Tensor:
+    """Sum of the four neighbours minus four times the pixel, where all four exist. [h,w] -> [h-2,w-2]"""
+    around = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:]
+    return around - 4.0 * luma[1:-1, 1:-1]
+
+
+def eroded(mask: Tensor, by: int = 2) -> Tensor:
+    """The mask without its rim of `by` pixels, beyond the picture counting as inside. [h,w] -> [h,w] bool"""
+    outside = (mask <= 0.5).float()
+    return max_pool2d(outside[None, None], 2 * by + 1, 1, by)[0, 0] < 0.5

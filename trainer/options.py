@@ -11,6 +11,7 @@ import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.choose import Kind
+from trainer.objective import Progressive
 from trainer.trajectory import Slider
 
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
@@ -45,8 +46,9 @@ class TrainOptions:
     """What the edit moves; sets learning rates and loss weights. auto: as the editor says (folder: style)."""
     stages: int = 8
     """Strengths that a procedural editor is asked for; 1 is the paper's way, towards the end alone."""
-    progressive: Literal["warmup", "off"] = "off"
-    """The paper's progressive constraint (eq. 5) as a warm-up of the learning rate."""
+    progressive: Progressive = "off"
+    """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as the loss that it
+    is, which lets go of the steps (decay) or tightens (growth)."""
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
     field: Kind = "auto"

@@ -12,7 +12,7 @@ stages 29.3 dB at the stages and 27.4 (worst 24.2) half way between them, with 8
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,9 +22,10 @@ from torch import Tensor
 from progdf.gaussians import attribute_slices
 from trainer.crops import CropScene, render_all
 from trainer.editors.base import EditKind
-from trainer.losses import Perceptual, l1, warmup
+from trainer.losses import l1, warmup
+from trainer.objective import Moment, Objective, TermMeans, summed
 
-Progressive = Literal["warmup", "off"]
+Rates = Literal["kind", "3dgs"]
 
 # learning rates of 3DGS (Kerbl 2023) for a scene of extent 1
 _RATES_3DGS = {
@@ -51,22 +52,25 @@ class PgsSettings:
 
     Args:
         rates: learning rate of each column of a packed row, raw units. [C]
-        perceptual_weight: weight of the perceptual term, which is paid for every second step
-        progressive: "warmup" starts with short steps, "off" does not
+        warmup: start with short steps
+        damped: hold members still that hardly show, see `_Adam`; False is Adam as printed
         ramp: share of a stage's steps in which its target moves from the last stage's pictures to its own
-        fall: share of a stage's steps, its last, in which the learning rate falls to a tenth
+        fall: share of a stage's steps, its last, in which the learning rate falls to a tenth; 0: flat
         reach: mean change of the changing pixels in a stage for which the rates are right; a shorter way gets
             smaller steps, down to a quarter, a longer one larger, up to 1.5 times; 0: the same for all
+        smoothing: share that the recorded running mean keeps of itself at each step; 0 records the bare
+            iterates
         snapshots: recordings over all stages, about
         seed: order of the views
     """
 
     rates: Tensor
-    perceptual_weight: float = 0.1
-    progressive: Progressive = "off"
+    warmup: bool = False
+    damped: bool = True
     ramp: float = 0.6
     fall: float = 0.35
     reach: float = 0.05
+    smoothing: float = 0.9
     snapshots: int = 32
     seed: int = 0
 
@@ -95,28 +99,35 @@ class Snapshot:
         stage: index of the stage
         ends_stage: whether it is the last of its stage
         offsets: raw-space offsets of the members. [M,C] float32
-        loss: mean loss towards the stage's target since the last recording
-        left: mean L1 distance from the finished edit since the last recording
+        means: since the last recording: each loss term, weighted, over the steps that paid for it, and
+            "left", the L1 distance from the finished edit
     """
 
     step: int
     stage: int
     ends_stage: bool
     offsets: Tensor
-    loss: float
-    left: float
+    means: Mapping[str, float]
 
 
 OnStep = Callable[[int, float], None]
 """Called after every step: steps done, running mean of the L1 distance from the finished edit."""
 
 
-def learning_rates(kind: EditKind, channels: int, extent: float) -> Tensor:
-    """Learning rate of every column of a packed row, [C]. `extent`: size of what moves, world units."""
+def learning_rates(kind: EditKind, channels: int, extent: float, form: Rates = "kind") -> Tensor:
+    """Learning rate of every column of a packed row, [C].
+
+    Args:
+        kind: what the edit moves
+        channels: columns of a packed row
+        extent: size of what moves, world units
+        form: "kind": the multiples of 3DGS's rates that the kind needs; "3dgs": those rates as they are, all
+            attributes free
+    """
     rates = torch.zeros(channels)
     for name, columns in attribute_slices(channels).items():
         scale = extent if name == "means" else 1.0
-        rates[columns] = _RATES_3DGS[name] * _MULTIPLES[kind][name] * scale
+        rates[columns] = _RATES_3DGS[name] * scale * (_MULTIPLES[kind][name] if form == "kind" else 1.0)
     return rates
 
 
@@ -125,7 +136,7 @@ def optimise(
     crops: Sequence[CropScene],
     probes: Sequence[CropScene],
     stages: Sequence[Stage],
-    perceptual: Perceptual,
+    objective: Objective,
     settings: PgsSettings,
     on_step: OnStep | None = None,
 ) -> Iterator[Snapshot]:
@@ -139,7 +150,7 @@ def optimise(
         crops: the training views, in the order of the stages' targets
         probes: a few small views in which movement is measured
         stages: strengths ascending
-        perceptual: distance whose targets are cached per stage
+        objective: what each step is charged with
         settings: see PgsSettings
         on_step: progress
 
@@ -152,8 +163,10 @@ def optimise(
         if bool((settings.rates[columns] > 0).any())
     }
     moved = torch.zeros_like(original, requires_grad=True)
-    adam = _Adam(settings.rates, original)
+    previous = torch.zeros_like(original)
+    adam = _Adam(settings.rates, original, settings.damped)
     average = torch.zeros_like(original)
+    means = TermMeans()
     order = torch.Generator().manual_seed(settings.seed)
     queue: list[int] = []
     step = 0
@@ -161,11 +174,10 @@ def optimise(
     last_pictures = render_all(probes, original)
     before: Sequence[Tensor] = render_all(crops, original)
     for index, stage in enumerate(stages):
-        perceptual.forget()
+        objective.begin_stage()
         change, reach = _way(stage.targets, before)
         spacing = change * len(stages) / settings.snapshots
         size = min(1.5, max(0.25, reach / settings.reach)) if settings.reach > 0 else 1.0
-        losses: list[tuple[float, float]] = []
         for local in range(stage.steps):
             if not queue:
                 queue = torch.randperm(len(crops), generator=order).tolist()
@@ -174,24 +186,23 @@ def optimise(
             share = (local + 1) / max(1.0, settings.ramp * stage.steps)
             arrived = share >= 1.0
             target = stage.targets[view] if arrived else torch.lerp(before[view], stage.targets[view], share)
-            loss = l1(image, target)
-            if settings.perceptual_weight > 0 and arrived and local % 2 == 0:
-                loss = loss + settings.perceptual_weight * perceptual(image, target, view)
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                raise FloatingPointError(f"the loss is {value} at step {step}")
+            terms = objective.terms(Moment(image, target, view, step, local, arrived, moved, previous))
+            loss = summed(terms)
+            if not math.isfinite(float(loss.detach())):
+                raise FloatingPointError(f"the loss is {float(loss.detach())} at step {step}")
             moved.grad = None
             loss.backward()  # type: ignore[no-untyped-call]
             assert moved.grad is not None
             with torch.no_grad():
+                previous.copy_(moved)
                 moved -= size * _rate_factor(settings, step, local, stage.steps) * adam.step(moved.grad)
             # starts exactly at the original, and soon averages over the last ten steps
-            decay = min(0.9, (step + 1) / (step + 10))
+            decay = min(settings.smoothing, (step + 1) / (step + 10))
             average.lerp_(moved.detach(), 1.0 - decay)
             step += 1
             left = float(l1(image.detach(), stages[-1].targets[view]))
             running = left if math.isnan(running) else 0.95 * running + 0.05 * left
-            losses.append((value, left))
+            means.add({name: float(term.detach()) for name, term in terms.items()} | {"left": left})
             if on_step is not None:
                 on_step(step, running)
             last = local == stage.steps - 1
@@ -200,9 +211,7 @@ def optimise(
             pictures = render_all(probes, original + average, moving)
             if last or _mean_distance(pictures, last_pictures) >= spacing:
                 last_pictures = pictures
-                loss_mean, left_mean = torch.tensor(losses).mean(dim=0).tolist()
-                yield Snapshot(step, index, last, average.clone(), loss_mean, left_mean)
-                losses = []
+                yield Snapshot(step, index, last, average.clone(), means.read())
         before = stage.targets
 
 
@@ -214,8 +223,9 @@ class _Adam:
     (Bear at night, held-out PSNR at the stages: 37.2 dB without, 40.6 with it and steps sized by the way.)
     """
 
-    def __init__(self, rates: Tensor, rows: Tensor) -> None:
+    def __init__(self, rates: Tensor, rows: Tensor, damped: bool = True) -> None:
         self._rates = rates
+        self._damping = 0.1 if damped else 0.0
         self._slices = attribute_slices(rows.shape[1])
         self._first, self._second = torch.zeros_like(rows), torch.zeros_like(rows)
         self._steps = 0
@@ -229,7 +239,7 @@ class _Adam:
         spread = (self._second / (1 - 0.999**self._steps)).sqrt()
         floor = torch.empty_like(self._rates)
         for columns in self._slices.values():
-            floor[columns] = 0.1 * spread[:, columns].square().mean().sqrt() + 1e-15
+            floor[columns] = self._damping * spread[:, columns].square().mean().sqrt() + 1e-15
         return self._rates * mean / (spread + floor)
 
 
@@ -246,8 +256,8 @@ def _way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, fl
 
 def _rate_factor(settings: PgsSettings, step: int, local: int, steps: int) -> float:
     """Falls at a stage's end, so that it ends near its target; early steps may be short."""
-    factor = min(1.0, 0.1 + 0.9 * (steps - local) / (steps * settings.fall))
-    return factor * (warmup(step) if settings.progressive == "warmup" else 1.0)
+    factor = min(1.0, 0.1 + 0.9 * (steps - local) / (steps * settings.fall)) if settings.fall > 0 else 1.0
+    return factor * (warmup(step) if settings.warmup else 1.0)
 
 
 def _mean_distance(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:

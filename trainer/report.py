@@ -19,11 +19,12 @@ from progdf.slider_statistics import SliderStatistics, slider_statistics
 from trainer.fit import Fitted, field_figures
 from trainer.judge import Judge
 from trainer.losses import Perceptual
+from trainer.objective import Losses
 
 SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 _PAPER, _INK, _PALE, _GRID = (250, 249, 246), (38, 36, 34), (118, 113, 107), (228, 225, 219)
-_LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160))
+_LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158, 28))
 _THUMBNAIL = 240
 
 Lines = Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -91,15 +92,13 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
     }
 
 
-def report_picture(
-    judge: Judge, measured: Measured, losses: Sequence[tuple[int, float, float]], title: str
-) -> Tensor:
+def report_picture(judge: Judge, measured: Measured, losses: Losses, title: str) -> Tensor:
     """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
 
     Args:
         judge: held-out views; the one that shows most of the region is pictured
         measured: see `Measured`
-        losses: (step, loss towards the stage, L1 to the finished edit) of the recordings
+        losses: mean of every loss term per recording
         title: one line
     """
     fitted, slider = measured.fitted, measured.slider
@@ -142,10 +141,14 @@ def report_picture(
             "slider": (at, [ours for ours, _ in measured.between.values()]),
             "2 keyframes": (at, [plain for _, plain in measured.between.values()]),
         }
-    steps = [float(step) for step, _, _ in losses]
-    plots["training, over steps"] = {
-        "L1 to the finished edit": (steps, [left for _, _, left in losses]),
-        "loss to the stage": (steps, [loss for _, loss, _ in losses]),
+    names = {"left": "L1 to the finished edit", "l1": "L1 to the stage"}
+    plots["training: weighted loss terms over steps"] = {
+        names.get(term, term): (
+            [step for step, value in zip(losses["step"], column, strict=True) if step and value is not None],
+            [value for value in column if value is not None],
+        )
+        for term, column in losses.items()
+        if term != "step"
     }
     return _stacked(sheet, plots)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +27,8 @@ from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
-from trainer.losses import Perceptual, perceptual_loss
+from trainer.losses import Perceptual, eroded, perceptual_loss
+from trainer.objective import Losses, LossWeights, Objective, loss_table
 from trainer.options import FitOptions, TrainOptions, settled
 from trainer.pgs import PERCEPTUAL_WEIGHT, PgsSettings, Stage, learning_rates, optimise
 from trainer.preparation import (
@@ -207,11 +209,11 @@ def _optimised(
     kind: EditKind,
     perceptual: Perceptual,
     log: RunLog,
-) -> tuple[Trajectory, list[tuple[int, float, float]]]:
+) -> tuple[Trajectory, Losses]:
     """PGS over the training views.
 
     Returns:
-        The trajectory, even in time; (step, loss to the stage, L1 to the finished edit) of its recordings
+        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
     """
     scene, members = stand.scene, stand.region.members
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
@@ -223,16 +225,17 @@ def _optimised(
     extent = 2.0 * scene_sphere(scene[members])[1]
     settings = PgsSettings(
         learning_rates(kind, original.shape[1], extent),
-        PERCEPTUAL_WEIGHT[kind],
-        options.progressive,
+        warmup=options.progressive == "warmup",
         # one target alone is approached slowly: quick steps towards it shine in all colours half way
         ramp=0.0 if kind == "geometry" else 0.9 if len(stages) == 1 else 0.6,
         reach=0.0 if kind == "geometry" else 0.05,
         fall=1.0 if len(stages) == 1 else 0.35,
         seed=options.seed,
     )
+    weights = LossWeights(PERCEPTUAL_WEIGHT[kind], progressive=options.progressive)
+    inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
     snapshots: list[tuple[int, int, bool, Tensor]] = []
-    losses: list[tuple[int, float, float]] = []
+    losses: list[tuple[int, Mapping[str, float]]] = []
     with log.steps("optimise", sum(stage.steps for stage in stages)) as advance:
         try:
             for found in optimise(
@@ -240,19 +243,20 @@ def _optimised(
                 crops,
                 probes(stand),
                 stages,
-                perceptual,
+                Objective(perceptual, weights, inside),
                 settings,
                 lambda step, left: advance(step, f"loss to the edit {left:.4f}"),
             ):
                 snapshots.append((found.step, found.stage, found.ends_stage, found.offsets.half()))
-                losses.append((found.step, round(found.loss, 5), round(found.left, 5)))
+                losses.append((found.step, found.means))
                 end = found.offsets
         except FloatingPointError as error:
             raise ProgdfError(
                 f"training broke down: {error}; check the edited views, or try --kind style"
             ) from error
-    log.say(f"L1 to the finished edit: {losses[0][2]:.4f} at first, {losses[-1][2]:.4f} at the end")
-    return record(snapshots, end, list(edited)), losses
+    left = [means["left"] for _, means in losses]
+    log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
+    return record(snapshots, end, list(edited)), loss_table(losses)
 
 
 def _retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Trajectory:
