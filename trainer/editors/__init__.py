@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.editors.base import ImageEditor
+from trainer.editors.base import EditorSettings, ImageEditor, Painter
 from trainer.editors.folder import folder
 from trainer.editors.procedural import darken, night, recolor, stripes, tint
+from trainer.editors.style import style
 from trainer.views import View
 
-Factory = Callable[[str, Gaussians, Region, Sequence[View]], ImageEditor]
+Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorSettings], ImageEditor]
 
 EDITORS: dict[str, Factory] = {
     "recolor": recolor,
@@ -21,10 +22,20 @@ EDITORS: dict[str, Factory] = {
     "darken": darken,
     "night": night,
     "folder": folder,
+    "style": style,
 }
-"""Kind of editor → its factory, given what stands behind the colon, the scene, the region and the views."""
+"""Kind of editor → its factory, given what stands behind the colon, the scene, the region, the views
+and the settings of learned editors."""
 
-EXAMPLES = ("recolor:#3060d0", "tint:#d4af37", "stripes:#20a040", "darken:0.7", "night", "folder:DIR")
+EXAMPLES = (
+    "recolor:#3060d0",
+    "tint:#d4af37",
+    "stripes:#20a040",
+    "darken:0.7",
+    "night",
+    "folder:DIR",
+    "style:14",
+)
 
 
 def check_editor(spec: str) -> tuple[str, str]:
@@ -35,10 +46,16 @@ def check_editor(spec: str) -> tuple[str, str]:
     return kind, what
 
 
-def make_editor(spec: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ImageEditor:
+def make_editor(
+    spec: str,
+    scene: Gaussians,
+    region: Region,
+    views: Sequence[View],
+    settings: EditorSettings | None = None,
+) -> ImageEditor:
     """The editor that `spec` names, for one region and its views; ProgdfError tells what is wrong with it."""
     kind, what = check_editor(spec)
-    return EDITORS[kind](what, scene, region, views)
+    return EDITORS[kind](what, scene, region, views, settings or EditorSettings())
 
 
-__all__ = ["EDITORS", "ImageEditor", "check_editor", "make_editor"]
+__all__ = ["EDITORS", "EditorSettings", "ImageEditor", "Painter", "check_editor", "make_editor"]

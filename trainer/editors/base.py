@@ -1,8 +1,10 @@
-"""The one thing an image editor must do."""
+"""The one thing an image editor must do, and what a learned one can be told."""
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -10,6 +12,36 @@ from trainer.views import View
 
 EditKind = Literal["colour", "style", "geometry"]
 """What an edit moves, which chooses learning rates and loss weights (method.md 3)."""
+
+Confine = Literal["auto", "yes", "no"]
+"""Whether what changed outside the region is put back; auto: unless the edit moves parts."""
+
+
+@dataclass(frozen=True)
+class EditorSettings:
+    """How a learned editor is asked; what is None or empty is as its model was made for.
+
+    Args:
+        model: id on the Hugging Face hub, or folder of a saved pipeline
+        guidance: how closely the instruction is followed, ≥ 1
+        image_guidance: how closely the picture is followed, ≥ 1; not every model has it
+        steps: denoising steps
+        seed: of the noise, the same in every view
+        size: longer side in pixels at which pictures are painted
+        dial: strengths by rising guidance, or the finished edit alone
+        confine: see `Confine`
+        kept: folder in which painted pictures are kept; None keeps nothing
+    """
+
+    model: str = ""
+    guidance: float | None = None
+    image_guidance: float | None = None
+    steps: int | None = None
+    seed: int = 0
+    size: int | None = None
+    dial: Literal["off", "guidance"] = "off"
+    confine: Confine = "auto"
+    kept: Path | None = None
 
 
 class ImageEditor(Protocol):
@@ -28,6 +60,20 @@ class ImageEditor(Protocol):
         """The strengths that it can picture, ascending, the last 1; empty: any."""
         ...
 
+    @property
+    def confined(self) -> bool:
+        """Whether it leaves alone what is not the region; else its pictures may change anywhere."""
+        ...
+
     def edit(self, view: View, strength: float) -> Tensor:
         """The edited view. Strength 0 gives `view.image` bit for bit. -> [H,W,3] 0..1"""
+        ...
+
+
+@runtime_checkable
+class Painter(Protocol):
+    """An editor that looks at a picture and paints another, and so can look at a render again."""
+
+    def edit_again(self, view: View, strength: float, current: Tensor, step: int) -> Tensor:
+        """The edited view, painted from the render of training step `step`. [H,W,3] -> [H,W,3] 0..1"""
         ...

@@ -18,7 +18,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.editors.base import EditKind
+from trainer.editors.base import EditKind, EditorSettings
 from trainer.pictures import read_picture
 from trainer.views import View
 
@@ -38,6 +38,7 @@ class FolderEditor:
     folders: dict[float, Path]
     stages: tuple[float, ...]
     kind: EditKind = "style"
+    confined: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
@@ -49,7 +50,9 @@ class FolderEditor:
         return read_picture(path, size=(view.camera.width, view.camera.height))
 
 
-def folder(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> FolderEditor:
+def folder(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> FolderEditor:
     """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
     if not what:
         raise ProgdfError("folder: names no folder; write folder:DIR with the edited views in DIR")

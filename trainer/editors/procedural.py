@@ -19,7 +19,7 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import rasterize
 from progdf.region import Region
 from progdf.sh import shade
-from trainer.editors.base import EditKind
+from trainer.editors.base import EditKind, EditorSettings
 from trainer.views import View
 
 _GREY, _COLOURED = 0.5, 1.3  # of the typical chroma: up to here a grey, from here a colour
@@ -34,6 +34,7 @@ class ColourEditor:
     change: Callable[[Tensor, float], Tensor]
     kind: EditKind = "colour"
     stages: tuple[float, ...] = ()
+    confined: bool = True
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
@@ -62,6 +63,7 @@ class StripesEditor:
     reference: Tensor
     kind: EditKind = "colour"
     stages: tuple[float, ...] = ()
+    confined: bool = True
 
     def painted(self, rgb: Tensor, strength: float) -> Tensor:
         """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
@@ -94,31 +96,41 @@ class StripesEditor:
         return view.blended((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
 
 
-def recolor(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+def recolor(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> ColourEditor:
     """`recolor:#rrggbb`: another colour, the shading kept; hue, saturation and lightness move together."""
     target, reference = colour.parse_color(what), reference_color(views)
     return ColourEditor(lambda rgb, strength: recolored(rgb, target, strength, reference))
 
 
-def tint(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+def tint(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> ColourEditor:
     """`tint:#rrggbb`: a wash of colour, lightness kept."""
     target = colour.parse_color(what)
     return ColourEditor(lambda rgb, strength: colour.tint(rgb, target, strength))
 
 
-def darken(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+def darken(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> ColourEditor:
     """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
     stops = _stops(what, "darken")
     return ColourEditor(lambda rgb, strength: colour.darken(rgb, strength, stops))
 
 
-def night(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> ColourEditor:
+def night(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> ColourEditor:
     """`night` or `night:AMOUNT`: as `darken`, with colours fading to the blue of moonlight."""
     stops = _stops(what, "night")
     return ColourEditor(lambda rgb, strength: colour.night(rgb, strength, stops))
 
 
-def stripes(what: str, scene: Gaussians, region: Region, views: Sequence[View]) -> StripesEditor:
+def stripes(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> StripesEditor:
     """`stripes:#rrggbb`: seven stripes across the region's longest side, painted in 3D."""
     target = colour.parse_color(what)
     points = scene.means[region.members]
