@@ -21,9 +21,10 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices
 from trainer.crops import CropScene, render_all
+from trainer.descent import PgsState
 from trainer.editors.base import EditKind
 from trainer.losses import l1, warmup
-from trainer.objective import Moment, Objective, TermMeans, summed
+from trainer.objective import Moment, Objective, summed
 
 Rates = Literal["kind", "3dgs"]
 
@@ -53,7 +54,7 @@ class PgsSettings:
     Args:
         rates: learning rate of each column of a packed row, raw units. [C]
         warmup: start with short steps
-        damped: hold members still that hardly show, see `_Adam`; False is Adam as printed
+        damped: hold members still that hardly show, see `PgsState.descend`; False is Adam as printed
         ramp: share of a stage's steps in which its target moves from the last stage's pictures to its own
         fall: share of a stage's steps, its last, in which the learning rate falls to a tenth; 0: flat
         reach: mean change of the changing pixels in a stage for which the rates are right; a shorter way gets
@@ -139,6 +140,7 @@ def optimise(
     objective: Objective,
     settings: PgsSettings,
     on_step: OnStep | None = None,
+    state: PgsState | None = None,
 ) -> Iterator[Snapshot]:
     """Optimise the member rows towards each stage in turn, and yield recordings.
 
@@ -152,95 +154,68 @@ def optimise(
         stages: strengths ascending
         objective: what each step is charged with
         settings: see PgsSettings
-        on_step: progress
+        on_step: progress; here, and only here, the state is whole and may be saved
+        state: where to go on from, changed in place; None: from the original
 
     Raises:
-        FloatingPointError: the loss is no longer finite.
+        FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
     """
     moving = {
         name
         for name, columns in attribute_slices(original.shape[1]).items()
         if bool((settings.rates[columns] > 0).any())
     }
-    moved = torch.zeros_like(original, requires_grad=True)
-    previous = torch.zeros_like(original)
-    adam = _Adam(settings.rates, original, settings.damped)
-    average = torch.zeros_like(original)
-    means = TermMeans()
-    order = torch.Generator().manual_seed(settings.seed)
-    queue: list[int] = []
-    step = 0
-    running = math.nan
-    last_pictures = render_all(probes, original)
-    before: Sequence[Tensor] = render_all(crops, original)
-    for index, stage in enumerate(stages):
+    if state is None:
+        state = PgsState(original, settings.seed)
+    if not state.step:
+        state.pictures = render_all(probes, original)
+    for index in range(state.stage, len(stages)):
+        stage = stages[index]
+        before = stages[index - 1].targets if index else render_all(crops, original)
         objective.begin_stage()
         change, reach = _way(stage.targets, before)
         spacing = change * len(stages) / settings.snapshots
         size = min(1.5, max(0.25, reach / settings.reach)) if settings.reach > 0 else 1.0
-        for local in range(stage.steps):
-            if not queue:
-                queue = torch.randperm(len(crops), generator=order).tolist()
-            view = queue.pop()
-            image, _ = crops[view].render(original + moved, moving)
-            share = (local + 1) / max(1.0, settings.ramp * stage.steps)
+        while state.local < stage.steps:
+            view = state.view(len(crops))
+            share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
             arrived = share >= 1.0
             target = stage.targets[view] if arrived else torch.lerp(before[view], stage.targets[view], share)
-            terms = objective.terms(Moment(image, target, view, step, local, arrived, moved, previous))
-            loss = summed(terms)
-            if not math.isfinite(float(loss.detach())):
-                raise FloatingPointError(f"the loss is {float(loss.detach())} at step {step}")
-            moved.grad = None
-            loss.backward()  # type: ignore[no-untyped-call]
-            assert moved.grad is not None
-            with torch.no_grad():
-                previous.copy_(moved)
-                moved -= size * _rate_factor(settings, step, local, stage.steps) * adam.step(moved.grad)
-            # starts exactly at the original, and soon averages over the last ten steps
-            decay = min(settings.smoothing, (step + 1) / (step + 10))
-            average.lerp_(moved.detach(), 1.0 - decay)
-            step += 1
+            image, _ = crops[view].render(original + state.moved, moving)
             left = float(l1(image.detach(), stages[-1].targets[view]))
-            running = left if math.isnan(running) else 0.95 * running + 0.05 * left
-            means.add({name: float(term.detach()) for name, term in terms.items()} | {"left": left})
+            terms = objective.terms(
+                Moment(image, target, view, state.step, state.local, arrived, state.moved, state.previous)
+            )
+            gradient = _gradient(terms, state)
+            state.means.add({name: float(term.detach()) for name, term in terms.items()} | {"left": left})
+            state.running = left if math.isnan(state.running) else 0.95 * state.running + 0.05 * left
+            length = size * _rate_factor(settings, state.step, state.local, stage.steps)
+            state.descend(gradient, settings.rates, length, settings.damped, settings.smoothing)
+
+            last = state.local == stage.steps
+            if last or state.local % 2:
+                pictures = render_all(probes, original + state.average, moving)
+                if last or _mean_distance(pictures, state.pictures) >= spacing:
+                    state.pictures = pictures
+                    state.recorded += 1
+                    yield Snapshot(state.step, index, last, state.average.clone(), state.means.read())
             if on_step is not None:
-                on_step(step, running)
-            last = local == stage.steps - 1
-            if not last and local % 2:
-                continue
-            pictures = render_all(probes, original + average, moving)
-            if last or _mean_distance(pictures, last_pictures) >= spacing:
-                last_pictures = pictures
-                yield Snapshot(step, index, last, average.clone(), means.read())
-        before = stage.targets
+                on_step(state.step, state.running)
+        state.stage, state.local = index + 1, 0
 
 
-class _Adam:
-    """Adam (Kingma and Ba 2015) over packed rows, with a rate per column.
-
-    Its step does not know how large a gradient is, so a member that hardly shows would wander as far as one
-    in plain sight. A tenth of the attribute's typical gradient, added below the fraction, keeps it still.
-    (Bear at night, held-out PSNR at the stages: 37.2 dB without, 40.6 with it and steps sized by the way.)
-    """
-
-    def __init__(self, rates: Tensor, rows: Tensor, damped: bool = True) -> None:
-        self._rates = rates
-        self._damping = 0.1 if damped else 0.0
-        self._slices = attribute_slices(rows.shape[1])
-        self._first, self._second = torch.zeros_like(rows), torch.zeros_like(rows)
-        self._steps = 0
-
-    def step(self, gradient: Tensor) -> Tensor:
-        """What to subtract. [M,C] -> [M,C]"""
-        self._steps += 1
-        self._first.lerp_(gradient, 0.1)
-        self._second.lerp_(gradient.square(), 0.001)
-        mean = self._first / (1 - 0.9**self._steps)
-        spread = (self._second / (1 - 0.999**self._steps)).sqrt()
-        floor = torch.empty_like(self._rates)
-        for columns in self._slices.values():
-            floor[columns] = self._damping * spread[:, columns].square().mean().sqrt() + 1e-15
-        return self._rates * mean / (spread + floor)
+def _gradient(terms: Mapping[str, Tensor], state: PgsState) -> Tensor:
+    """Of the terms' sum in the members' offsets. [M,C]"""
+    loss = summed(terms)
+    if not math.isfinite(float(loss.detach())):
+        raise FloatingPointError(f"the loss is {float(loss.detach())} at step {state.step}")
+    state.moved.grad = None
+    loss.backward()  # type: ignore[no-untyped-call]
+    gradient = state.moved.grad
+    assert gradient is not None
+    if not math.isfinite(float(gradient.sum())):
+        raise FloatingPointError(f"the loss has no finite gradient at step {state.step}")
+    return gradient
 
 
 def _way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
