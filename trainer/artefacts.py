@@ -3,6 +3,7 @@
 RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
 RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
 RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
+RUN/views/painted/…                              what a learned editor painted, see editors/kept.py
 """
 
 from __future__ import annotations
@@ -122,6 +123,7 @@ def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
     for path in (folder.root / "views").glob("*/**/*.png"):
         if path.stem not in kept:
             path.unlink()
+            path.with_suffix(".json").unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -31,7 +31,26 @@ class TrainOptions:
     region: str
     """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r; join by + -."""
     editor: str
-    """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views)."""
+    """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
+    style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
+    model: str = ""
+    """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
+    guidance: float | None = None
+    """instruct: how closely the sentence is followed; by default as the model was made for (paper: 7.5)."""
+    image_guidance: float | None = None
+    """instruct: how closely the picture is followed, where the model knows it (paper: 1.5)."""
+    edit_steps: int | None = None
+    """instruct: denoising steps per picture; by default as the model was made for (paper: 20)."""
+    edit_seed: int = 0
+    """instruct: seed of the noise, which is the same in every view."""
+    edit_size: int | None = None
+    """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
+    edit_dial: Literal["off", "guidance"] = "off"
+    """instruct: the finished edit alone, or strengths too, by rising guidance; each costs a pass of edits."""
+    confine: Literal["auto", "yes", "no"] = "auto"
+    """Put back what the editor changed outside the region; auto: unless --kind is geometry."""
+    reedit_every: int = 0
+    """style, instruct: every so many steps, edit the current renders again and go on towards those."""
     name: str = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     cameras: Path | None = None
@@ -100,8 +119,13 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--image-size", options.image_size, 32, 2048),
         ("--stages", options.stages, 1, 16),
         ("--threads", options.threads, 0, 1024),
+        ("--guidance", options.guidance, 1, 100),
+        ("--image-guidance", options.image_guidance, 1, 100),
+        ("--edit-steps", options.edit_steps, 1, 1000),
+        ("--edit-size", options.edit_size, 32, 4096),
+        ("--reedit-every", options.reedit_every, 0, 100_000),
     ):
-        if not low <= value <= high:
+        if value is not None and not low <= value <= high:
             raise ProgdfError(f"{what} is {value}; {low} to {high} would be right")
     if options.steps < 4 * options.stages:
         raise ProgdfError(
@@ -112,4 +136,18 @@ def settled(options: TrainOptions) -> TrainOptions:
         raise ProgdfError(
             f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"
         )
+    _check_editor_options(options)
     return replace(options, name=name)
+
+
+def _check_editor_options(options: TrainOptions) -> None:
+    """No option is passed over in silence: one that the editor does not know is told."""
+    kind = options.editor.partition(":")[0]
+    of_instruct = ("model", "guidance", "image_guidance", "edit_steps", "edit_seed", "edit_dial")
+    of_painters = ("edit_size", "reedit_every")
+    for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
+        for name in names:
+            said = getattr(options, name) != getattr(TrainOptions, name)
+            if said and kind not in kinds:
+                option = "--" + name.replace("_", "-")
+                raise ProgdfError(f"{option} means nothing to {kind}; it is for {' and '.join(kinds)}")

@@ -13,8 +13,10 @@ from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.artefacts import RunFolder, write_views
 from trainer.crops import CropScene, crop_scene
-from trainer.editors import ImageEditor
+from trainer.editors import EditorSettings, ImageEditor
+from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
+from trainer.progress import Advance
 from trainer.views import View, choose_views, fit_size, named, region_rig, split_views
 
 BACKGROUND = (1.0, 1.0, 1.0)
@@ -53,8 +55,34 @@ def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:
     return editor.stages or tuple((i + 1) / stages for i in range(stages))
 
 
+def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
+    """What the options say to a learned editor, and where it keeps its pictures."""
+    return EditorSettings(
+        options.model,
+        options.guidance,
+        options.image_guidance,
+        options.edit_steps,
+        options.edit_seed,
+        options.edit_size,
+        options.edit_dial,
+        options.confine,
+        folder.root / "views" / "painted",
+    )
+
+
+def to_confine(editor: ImageEditor, options: TrainOptions, kind: EditKind) -> bool:
+    """Whether what the editor changed outside the region is to be put back."""
+    wanted = kind != "geometry" if options.confine == "auto" else options.confine == "yes"
+    return wanted and not editor.confined
+
+
 def edited_views(
-    editor: ImageEditor, views: Sequence[View], strengths: Sequence[float], folder: RunFolder, confined: bool
+    editor: ImageEditor,
+    views: Sequence[View],
+    strengths: Sequence[float],
+    folder: RunFolder,
+    confined: bool,
+    advance: Advance,
 ) -> dict[float, list[Tensor]]:
     """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
 
@@ -64,13 +92,15 @@ def edited_views(
         strengths: what the editor is asked for
         folder: where the pictures go
         confined: put back what changed outside the region; members would be pulled over it otherwise
+        advance: progress
     """
     edited: dict[float, list[Tensor]] = {}
     for strength in strengths:
-        made = [editor.edit(view, strength) for view in views]
-        if confined:
-            made = [view.confined(picture) for view, picture in zip(views, made, strict=True)]
-        pictures = [eight_bits(picture) for picture in made]
+        pictures = []
+        for view in views:
+            made = editor.edit(view, strength)
+            pictures.append(eight_bits(view.confined(made) if confined else made))
+            advance(len(edited) * len(views) + len(pictures), f"strength {strength:g}")
         named_pictures = {view.camera.name: p for view, p in zip(views, pictures, strict=True)}
         write_views(folder, "edited", named_pictures, strength)
         edited[strength] = pictures

@@ -24,7 +24,6 @@ from trainer.artefacts import RunFolder, claim, remove_stale_views, signature, w
 from trainer.crops import crop_scene, moving_attributes, render_all
 from trainer.editors import check_editor, make_editor
 from trainer.editors.base import EditKind
-from trainer.editors.folder import FolderEditor
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
 from trainer.losses import Perceptual, eroded, perceptual_loss
@@ -36,10 +35,12 @@ from trainer.preparation import (
     Pictures,
     Stand,
     edited_views,
+    editor_settings,
     eight_bits,
     make_stand,
     probes,
     strengths_to_ask,
+    to_confine,
     widened,
 )
 from trainer.progress import RunLog
@@ -99,11 +100,12 @@ def _trained(
         f"{len(stand.held_out)} to measure with, {views[0].camera.width}x{views[0].camera.height} pixels"
     )
     with log.stage("edit"):
-        editor = make_editor(options.editor, scene, region, views)
+        editor = make_editor(options.editor, scene, region, views, editor_settings(options, folder))
         strengths = strengths_to_ask(editor, options.stages)
         kind: EditKind = editor.kind if options.kind == "auto" else options.kind
-        confined = isinstance(editor, FolderEditor) and kind != "geometry"
-        edited = edited_views(editor, views, strengths, folder, confined)
+        confined = to_confine(editor, options, kind)
+        with log.steps("edit", len(views) * len(strengths)) as advance:
+            edited = edited_views(editor, views, strengths, folder, confined, advance)
         train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
         stand = widened(stand, train_edits)
     if all(

@@ -9,6 +9,7 @@ from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.editors.base import EditorSettings, ImageEditor, Painter
 from trainer.editors.folder import folder
+from trainer.editors.instruct import instruct
 from trainer.editors.procedural import darken, night, recolor, stripes, tint
 from trainer.editors.style import style
 from trainer.views import View
@@ -23,6 +24,7 @@ EDITORS: dict[str, Factory] = {
     "night": night,
     "folder": folder,
     "style": style,
+    "instruct": instruct,
 }
 """Kind of editor → its factory, given what stands behind the colon, the scene, the region, the views
 and the settings of learned editors."""
