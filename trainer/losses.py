@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from progdf.errors import ProgdfError
-from progdf.lpips import Features, Lpips
+from progdf.lpips import Features, Lpips, Net
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
@@ -67,12 +67,18 @@ class Perceptual(Protocol):
 
 
 class LpipsLoss:
-    """LPIPS with AlexNet (Zhang et al. 2018); the targets' features are computed once per key."""
+    """LPIPS (Zhang et al. 2018); the targets' features are computed once per key, while they fit in memory.
 
-    name = "lpips-alex"
+    Args:
+        network: see `Lpips.load`
+        name: as report.json names it
+        room: bytes that may be kept; VGG16 needs 30 MB for a target of 256 pixels, AlexNet 2.5 MB
+    """
 
-    def __init__(self, network: Lpips) -> None:
+    def __init__(self, network: Lpips, name: str = "lpips-alex", room: int = 1 << 30) -> None:
+        self.name = name
         self._network = network
+        self._room, self._free = room, room
         self._kept: dict[Hashable, Features] = {}
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
@@ -81,13 +87,16 @@ class LpipsLoss:
         if seen is None:
             with torch.no_grad():
                 seen = self._network.features(target)
-            if key is not None:
+            size = sum(layer.numel() * layer.element_size() for layer in seen)
+            if key is not None and size <= self._free:
                 self._kept[key] = seen
+                self._free -= size
         return self._network.distance(self._network.features(image), seen)
 
     def forget(self) -> None:
         """See `Perceptual`."""
         self._kept.clear()
+        self._free = self._room
 
 
 class GradientL1:
@@ -109,10 +118,10 @@ class GradientL1:
         """Nothing is kept."""
 
 
-def perceptual_loss() -> tuple[Perceptual, str]:
+def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
     """LPIPS, or its stand-in and one line that says why and how to get the real one; "" where all is well."""
     try:
-        return LpipsLoss(Lpips.load()), ""
+        return LpipsLoss(Lpips.load(net), f"lpips-{net}"), ""
     except ProgdfError as error:
         return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 
