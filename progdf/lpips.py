@@ -235,5 +235,5 @@ def _refuse(reason: str) -> NoReturn:
 
 def _unexpected(reason: str) -> ProgdfError:
     return ProgdfError(
-        f"the file of LPIPS weights is not what was expected ({reason}); {REMEDY} --force-reinstall"
+        f"LPIPS' file of weights is not what was expected ({reason}); {REMEDY} --force-reinstall"
     )
