@@ -12,6 +12,7 @@ import tyro
 
 from progdf.errors import ProgdfError
 from trainer.options import FitOptions, TrainOptions
+from trainer.presets import under_preset
 
 _Options = TypeVar("_Options")
 
@@ -19,6 +20,8 @@ _Options = TypeVar("_Options")
 def train(argv: Sequence[str]) -> int:
     """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
     options = parsed(TrainOptions, argv, "progdf train")
+    if options.preset != "default":  # again, for what argv says goes before what the preset says
+        options = parsed(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
     from trainer.run import train as run  # only now: --help and a mistyped option need no torch
 
     run(options)
@@ -34,8 +37,16 @@ def fit(argv: Sequence[str]) -> int:
     return 0
 
 
-def parsed(kind: type[_Options], argv: Sequence[str], command: str) -> _Options:
+def parsed(
+    kind: type[_Options], argv: Sequence[str], command: str, default: _Options | None = None
+) -> _Options:
     """Options from the command line; `--help` prints and exits.
+
+    Args:
+        kind: a dataclass of options
+        argv: the command line
+        command: what help and errors call it
+        default: where options come from that argv does not give; None: the dataclass
 
     Raises:
         ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
@@ -43,7 +54,9 @@ def parsed(kind: type[_Options], argv: Sequence[str], command: str) -> _Options:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=list(argv), prog=command)
+            if default is None:
+                return tyro.cli(kind, args=list(argv), prog=command)
+            return tyro.cli(kind, args=list(argv), prog=command, default=default)
     except SystemExit as leaving:
         if not leaving.code:
             raise

@@ -11,8 +11,12 @@ import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.choose import Kind
+from progdf.lpips import Net
 from trainer.objective import Progressive
+from trainer.pgs import Rates
 from trainer.trajectory import Slider
+
+Preset = Literal["default", "paper"]
 
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
@@ -51,6 +55,9 @@ class TrainOptions:
     """Put back what the editor changed outside the region; auto: unless --kind is geometry."""
     reedit_every: int = 0
     """style, instruct: every so many steps, edit the current renders again and go on towards those."""
+    preset: Preset = "default"
+    """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
+    printed. In Python: trainer.presets.under_preset."""
     name: str = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     cameras: Path | None = None
@@ -65,9 +72,27 @@ class TrainOptions:
     """What the edit moves; sets learning rates and loss weights. auto: as the editor says (folder: style)."""
     stages: int = 8
     """Strengths that a procedural editor is asked for; 1 is the paper's way, towards the end alone."""
+    rates: Rates = "kind"
+    """Learning rates: as the kind of edit needs, with short steps on the last stretch; or 3DGS's own, flat,
+    for all attributes (paper), which hardly move in 600 steps."""
+    perceptual: Net = "alex"
+    """LPIPS through AlexNet or VGG16, which takes fifteen times as long."""
+    perceptual_weight: float | None = None
+    """Weight of LPIPS beside L1; by default .1 for colour, .3 for style and geometry (paper: 1)."""
+    perceptual_every: int = 2
+    """LPIPS is paid for every so many steps (paper: 1)."""
     progressive: Progressive = "off"
     """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as the loss that it
-    is, which lets go of the steps (decay) or tightens (growth)."""
+    is, which lets go of the steps (decay) or tightens (growth). As a loss it freezes the edit."""
+    progressive_weight: float = 5.0
+    """Weight of the progressive constraint as a loss (paper: 5)."""
+    sharpness: Literal["auto", "hinge", "paper", "off"] = "auto"
+    """Sharpness of the renders: not less than the target's (hinge), or the printed term, which does nothing
+    (paper). auto: hinge for style, off for colour and geometry."""
+    sharpness_weight: float | None = None
+    """Weight of the sharpness; by default .5 for hinge, 1 for paper."""
+    recording: Literal["smooth", "raw"] = "smooth"
+    """Record a running mean of the parameters and drop jitter, or the bare iterates (paper)."""
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
     field: Kind = "auto"
@@ -119,6 +144,7 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--image-size", options.image_size, 32, 2048),
         ("--stages", options.stages, 1, 16),
         ("--threads", options.threads, 0, 1024),
+        ("--perceptual-every", options.perceptual_every, 1, 1000),
         ("--guidance", options.guidance, 1, 100),
         ("--image-guidance", options.image_guidance, 1, 100),
         ("--edit-steps", options.edit_steps, 1, 1000),
@@ -132,6 +158,13 @@ def settled(options: TrainOptions) -> TrainOptions:
             f"--steps is {options.steps}; at least {4 * options.stages} "
             f"would be right for {options.stages} stages"
         )
+    for what, weight in (
+        ("--perceptual-weight", options.perceptual_weight),
+        ("--progressive-weight", options.progressive_weight),
+        ("--sharpness-weight", options.sharpness_weight),
+    ):
+        if weight is not None and not 0 <= weight < math.inf:
+            raise ProgdfError(f"{what} is {weight}; 0 or more would be right")
     if not math.isfinite(options.target_psnr):
         raise ProgdfError(
             f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"

@@ -44,7 +44,6 @@ _MULTIPLES: dict[EditKind, dict[str, float]] = {
     "style": {"means": 2, "log_scales": 2, "quats": 2, "logit_opacities": 0.4, "sh0": 24, "shN": 24},
     "geometry": {"means": 8, "log_scales": 4, "quats": 8, "logit_opacities": 0.4, "sh0": 4, "shN": 4},
 }
-PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"colour": 0.1, "style": 0.3, "geometry": 0.3}
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ from trainer.editors.base import EditKind
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
 from trainer.losses import Perceptual, eroded, perceptual_loss
-from trainer.objective import Losses, LossWeights, Objective, loss_table
+from trainer.objective import Losses, Objective, loss_table
 from trainer.options import FitOptions, TrainOptions, settled
-from trainer.pgs import PERCEPTUAL_WEIGHT, PgsSettings, Stage, learning_rates, optimise
+from trainer.pgs import Stage, optimise
 from trainer.preparation import (
     BACKGROUND,
     Pictures,
@@ -44,6 +44,7 @@ from trainer.preparation import (
     widened,
 )
 from trainer.progress import RunLog
+from trainer.settings import loss_weights, pgs_settings
 from trainer.trajectory import Trajectory, load_trajectory, record, retime, save_trajectory, straightened
 from trainer.views import crop, make_view
 
@@ -82,7 +83,7 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
 def _trained(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> RunResult:
-    perceptual, warning = perceptual_loss()
+    perceptual, warning = perceptual_loss(options.perceptual)
     if warning:
         log.say(warning)
     with log.stage("views"):
@@ -225,16 +226,8 @@ def _optimised(
         for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
     ]
     extent = 2.0 * scene_sphere(scene[members])[1]
-    settings = PgsSettings(
-        learning_rates(kind, original.shape[1], extent),
-        warmup=options.progressive == "warmup",
-        # one target alone is approached slowly: quick steps towards it shine in all colours half way
-        ramp=0.0 if kind == "geometry" else 0.9 if len(stages) == 1 else 0.6,
-        reach=0.0 if kind == "geometry" else 0.05,
-        fall=1.0 if len(stages) == 1 else 0.35,
-        seed=options.seed,
-    )
-    weights = LossWeights(PERCEPTUAL_WEIGHT[kind], progressive=options.progressive)
+    settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
+    weights = loss_weights(options, kind)
     inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
     snapshots: list[tuple[int, int, bool, Tensor]] = []
     losses: list[tuple[int, Mapping[str, float]]] = []
@@ -271,7 +264,9 @@ def _retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Tra
     def seen(offsets: Tensor) -> Tensor:
         return torch.cat([picture.flatten() for picture in render_all(small, rows + offsets, moving)])
 
-    return retime(straightened(trajectory, seen), seen, options.slider)
+    if options.recording == "smooth":
+        trajectory = straightened(trajectory, seen)
+    return retime(trajectory, seen, options.slider)
 
 
 def _shared(steps: int, stages: int) -> list[int]:

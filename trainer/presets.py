@@ -1,0 +1,34 @@
+"""Presets: values of options that belong together. What the command line says itself goes before them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from trainer.options import Preset, TrainOptions
+
+PRESETS: Mapping[Preset, Mapping[str, Any]] = {
+    "default": {},
+    # the trainer of ProGDF (AAAI 2025) as it is printed: λ = 1, 5, 1, one target, the rates of 3DGS, all
+    # attributes free, raw iterates along the optimiser's time; `--progressive growth` is its other schedule
+    "paper": {
+        "steps": 1500,
+        "stages": 1,
+        "views": 96,
+        "rates": "3dgs",
+        "perceptual_weight": 1.0,
+        "perceptual_every": 1,
+        "progressive": "decay",
+        "progressive_weight": 5.0,
+        "sharpness": "paper",
+        "sharpness_weight": 1.0,
+        "recording": "raw",
+        "slider": "time",
+    },
+}
+
+
+def under_preset(options: TrainOptions, preset: Preset) -> TrainOptions:
+    """The options with a preset's values in the fields that it names; `replace` what should differ."""
+    return replace(options, preset=preset, **PRESETS[preset])
