@@ -88,6 +88,7 @@ def finished(
             "stages": list(trajectory.strengths),
             "attribute_worth_db": about["attribute_worth_db"],
         },
+        "objective": about["objective"],
         "losses": about["losses"],
         "time": {**(_earlier_times(folder) if log.appends else {}), **log.rounded_seconds()},
         "memory_mb": _peak_memory_mb(),

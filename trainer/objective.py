@@ -45,6 +45,18 @@ class LossWeights:
     sharpness: Sharpness = "off"
     sharpness_weight: float = 1.0
 
+    def described(self, perceptual: str) -> str:
+        """One line for log and report. `perceptual`: the name of the distance that is really used."""
+        terms = ["L1"]
+        if self.perceptual > 0:
+            often = f" every {self.perceptual_every} steps" if self.perceptual_every > 1 else ""
+            terms.append(f"{self.perceptual:g} {perceptual}{often}")
+        if self.progressive in ("decay", "growth"):
+            terms.append(f"{self.progressive_weight:g} progressive ({self.progressive})")
+        if self.sharpness != "off":
+            terms.append(f"{self.sharpness_weight:g} sharpness ({self.sharpness})")
+        return " + ".join(terms)
+
 
 @dataclass(frozen=True)
 class Moment:

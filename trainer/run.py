@@ -117,6 +117,8 @@ def _trained(
         )
     log.say(f"{options.editor}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
 
+    objective = loss_weights(options, kind).described(perceptual.name)
+    log.say(f"loss: {objective}")
     with log.stage("optimise"):
         trajectory, losses = _optimised(options, stand, train_edits, kind, perceptual, log)
     with log.stage("retime"):
@@ -133,6 +135,7 @@ def _trained(
         "held_out": [view.camera.name for view in stand.held_out],
         "background": list(BACKGROUND),
         "options": plain_options(options),
+        "objective": objective,
         "losses": losses,
         "attribute_worth_db": costs,
     }
@@ -143,7 +146,8 @@ def _trained(
         with torch.no_grad():
             finals = {v.camera.name: render(edited_scene, v.camera, stand.background) for v in views}
         write_views(folder, "final", finals)
-    return finished(folder, stand, trajectory, about, perceptual, log, options.field)
+    measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
+    return finished(folder, stand, trajectory, about, measure, log, options.field)
 
 
 def refit(options: FitOptions, quiet: bool = False) -> RunResult:
