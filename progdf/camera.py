@@ -13,6 +13,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.framing import front, guess_up, is_surrounding, scene_sphere
 from progdf.gaussians import Gaussians
+from progdf.lens import Lens
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +32,7 @@ class Camera:
         width: image width in pixels, ≥ 1
         height: image height in pixels, ≥ 1
         name: where it came from, for messages and file names
+        lens: what bends photographs that this camera took; a render is straight, so nothing that draws asks
 
     Raises:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite.
@@ -41,6 +43,7 @@ class Camera:
     width: int
     height: int
     name: str = ""
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         for name, side in (("viewmat", 4), ("K", 3)):

@@ -1,11 +1,15 @@
-"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, told apart by content."""
+"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, told apart by content; and
+folders: a COLMAP sparse model, or a folder with one of these files in it.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,30 +17,82 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.colmap import find_model, load_model
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
+from progdf.lens import Lens
+
+_log = logging.getLogger(__name__)
 
 _FORMAT = "progdf cameras 1"
 _NOT_A_ROTATION = 1e-2
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
-"""Camera models that are a pinhole once their distortion is zero."""
+_LENS = ("k1", "k2", "p1", "p2", "k3")
+_STRANGE_LENS = ("k4", "k5", "k6")  # a polynomial to some programs, a quotient to others: not guessed
+_PINHOLES = (
+    "",
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "OPENCV",
+    "RADIAL",
+    "SIMPLE_RADIAL",
+    "FULL_OPENCV",
+    "PERSPECTIVE",
+)
+"""Camera models that are a pinhole behind a lens whose numbers we know."""
 
+_FILES = ("cameras.json", "transforms.json")
+_MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
-    """The cameras in a JSON file, in file order.
+    """The cameras in a JSON file, in file order, or of a COLMAP sparse model, in the order of their names.
 
-    Three kinds are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
+    Three kinds of files are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
     `transforms.json` (frames with an OpenGL camera-to-world matrix; intrinsics per file or per frame) and
-    what `save_cameras` writes, also a single such camera.
+    what `save_cameras` writes, also a single such camera. A folder is a sparse model (see `progdf.colmap`)
+    or holds one, or a cameras.json or transforms.json.
+
+    The views are those of pinholes. A lens that bends photographs is kept as `Camera.lens` and logged.
 
     Raises:
-        ProgdfError: no such file, none of these kinds, a broken camera, or lens distortion (which is refused,
-            not ignored: undistort the images first).
+        ProgdfError: nothing of that name, none of these kinds, several of them in one folder, a broken
+            camera, or one that is no pinhole behind a lens with k1, k2, k3, p1, p2 (fisheye, k4 and more).
     """
+    cameras = _from_folder(Path(path)) if Path(path).is_dir() else _from_file(path)
+    if not cameras:
+        raise ProgdfError(f"{os.fspath(path)} holds 0 cameras; at least one would be right")
+    if bent := sum(camera.lens is not None for camera in cameras):
+        _log.info(
+            "%s: %d of %d cameras have a lens that bends photographs; what is drawn is straight",
+            path, bent, len(cameras),
+        )  # fmt: skip
+    return cameras
+
+
+def _from_folder(folder: Path) -> list[Camera]:
+    """The one thing in a folder that holds cameras."""
+    found = [folder / name for name in _FILES if (folder / name).is_file()]
+    model = find_model(folder)
+    if model is not None:
+        found.append(model)
+    if not found:
+        raise ProgdfError(
+            f"{folder} holds no cameras; give a COLMAP model (cameras.bin and images.bin, also in sparse/0), "
+            "a cameras.json or a transforms.json"
+        )
+    if len(found) > 1:
+        raise ProgdfError(
+            f"{folder} holds cameras in {' and in '.join(str(place) for place in found)}; "
+            "name the ones that belong to the scene"
+        )
+    return load_model(found[0]) if found[0] == model else _from_file(found[0])
+
+
+def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     name = os.fspath(path)
+    if Path(path).name in _MODEL_FILES and (model := find_model(Path(path).parent)):
+        return load_model(model)
     try:
         content = json.loads(Path(path).read_bytes())
     except OSError as error:
@@ -47,24 +103,20 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         ) from None
     match content:
         case {"frames": list() as frames}:
-            cameras = [_nerfstudio(name, i, content, frame, Path(path)) for i, frame in enumerate(frames)]
+            return [_nerfstudio(name, i, content, frame, Path(path)) for i, frame in enumerate(frames)]
         case {"cameras": list() as entries}:
-            cameras = [_own(name, i, entry) for i, entry in enumerate(entries)]
+            return [_own(name, i, entry) for i, entry in enumerate(entries)]
         case {"viewmat": _}:
-            cameras = [_own(name, 0, content)]
+            return [_own(name, 0, content)]
         case [{"viewmat": _}, *_]:
-            cameras = [_own(name, i, entry) for i, entry in enumerate(content)]
+            return [_own(name, i, entry) for i, entry in enumerate(content)]
         case [{"rotation": _, "position": _}, *_]:
-            cameras = [_inria(name, i, entry) for i, entry in enumerate(content)]
+            return [_inria(name, i, entry) for i, entry in enumerate(content)]
         case []:
-            cameras = []
-        case _:
-            raise ProgdfError(
-                f"{name} holds no cameras; give a cameras.json, a transforms.json or a file of saved cameras"
-            )
-    if not cameras:
-        raise ProgdfError(f"{name} holds 0 cameras; at least one would be right")
-    return cameras
+            return []
+    raise ProgdfError(
+        f"{name} holds no cameras; give a cameras.json, a transforms.json or a file of saved cameras"
+    )
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> None:
@@ -76,6 +128,7 @@ def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> Non
             "height": camera.height,
             "K": camera.K.double().tolist(),
             "viewmat": camera.viewmat.double().tolist(),
+            **({"lens": asdict(camera.lens)} if camera.lens else {}),
         }
         for camera in cameras
     ]
@@ -93,6 +146,7 @@ def _own(file: str, index: int, entry: object) -> Camera:
         _pixels(where, table, "width"),
         _pixels(where, table, "height"),
         str(table.get("name", "")),
+        _lens(where, _table(where, table.get("lens", {}))),
     )
 
 
@@ -118,12 +172,6 @@ def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object,
         raise ProgdfError(
             f"{where} has the camera model {model}; only pinhole cameras can be used: undistort first"
         )
-    bent = [key for key in _DISTORTION if key in table and _number(where, table, key) != 0]
-    if bent:
-        raise ProgdfError(
-            f"{where} has lens distortion ({', '.join(bent)} not 0), which cannot be drawn; "
-            "undistort the images and give the new transforms.json"
-        )
     width, height = _image_size(where, table, path)
     if "fl_x" in table or "fl_y" in table:
         focal_x = _number(where, table, "fl_x" if "fl_x" in table else "fl_y")
@@ -143,7 +191,20 @@ def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object,
     c2w = torch.cat([c2w[:3], torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)])
     c2w[:, 1:3] *= -1  # OpenGL -> OpenCV
     K = _intrinsics(focal_x, focal_y, cx, cy)
-    return _camera(where, _world_to_camera(where, c2w), K, width, height, str(table.get("file_path", "")))
+    viewmat, name = _world_to_camera(where, c2w), str(table.get("file_path", ""))
+    return _camera(where, viewmat, K, width, height, name, _lens(where, table))
+
+
+def _lens(where: str, table: Mapping[str, Any]) -> Lens | None:
+    """The lens, if it bends anything."""
+    strange = [key for key in _STRANGE_LENS if key in table and _number(where, table, key) != 0]
+    if strange:
+        raise ProgdfError(
+            f"{where} has lens distortion with {', '.join(strange)}, which programs read in different ways; "
+            "undistort the images and give the new file"
+        )
+    lens = Lens(**{key: _number(where, table, key) for key in _LENS if key in table})
+    return lens if lens else None
 
 
 def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, int]:
@@ -176,9 +237,11 @@ def _world_to_camera(where: str, c2w: Tensor) -> Tensor:
     return viewmat
 
 
-def _camera(where: str, viewmat: Tensor, K: Tensor, width: int, height: int, name: str) -> Camera:
+def _camera(
+    where: str, viewmat: Tensor, K: Tensor, width: int, height: int, name: str, lens: Lens | None = None
+) -> Camera:
     try:
-        return Camera(viewmat.float(), K.float(), width, height, name)
+        return Camera(viewmat.float(), K.float(), width, height, name, lens)
     except ValueError as error:
         raise ProgdfError(f"{where} is broken: {error}") from None
 

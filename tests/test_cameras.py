@@ -22,6 +22,7 @@ from progdf.camera_files import load_cameras, save_cameras
 from progdf.errors import ProgdfError
 from progdf.framing import front, guess_up, is_surrounding, normals_of, scene_sphere
 from progdf.gaussians import Gaussians, normalize_quats
+from progdf.lens import Lens
 from progdf.rasterize.reference import rotation_matrices
 from progdf.scenes import bear
 from tests.scenes import random_gaussians
@@ -339,9 +340,20 @@ def refusal(path: Path) -> str:
     return message
 
 
-@pytest.mark.parametrize("key", ["k1", "k4", "p1"])
-def test_distortion_is_refused_and_not_ignored(key: str, tmp_path: Path) -> None:
-    assert "undistort" in refusal(written(tmp_path / "t.json", nerfstudio(some_cameras(), **{key: 0.01})))
+def test_distortion_of_a_kind_that_programs_read_differently_is_refused(tmp_path: Path) -> None:
+    for key in ("k4", "k5", "k6"):
+        assert "undistort" in refusal(written(tmp_path / "t.json", nerfstudio(some_cameras(), **{key: 0.01})))
+
+
+def test_distortion_is_kept_as_the_cameras_lens_and_not_ignored(tmp_path: Path) -> None:
+    content = nerfstudio(some_cameras(), k1=0.1, k2=-0.02, p1=0.003, p2=0.004, k3=0.0)
+    content["frames"][1] |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    cameras = load_cameras(written(tmp_path / "t.json", content))
+    assert cameras[0].lens == Lens(0.1, -0.02, 0.003, 0.004)
+    assert cameras[1].lens is None
+    save_cameras(tmp_path / "kept.json", cameras)
+    assert [camera.lens for camera in load_cameras(tmp_path / "kept.json")] == [c.lens for c in cameras]
+    assert cameras[0].resized(32, 20).lens == cameras[0].lens
 
 
 Change = Callable[[dict[str, Any]], object]

@@ -8,7 +8,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.editors.base import EditorSettings, ImageEditor, Painter
-from trainer.editors.folder import folder
+from trainer.editors.folder import folder, photographs
 from trainer.editors.instruct import instruct
 from trainer.editors.procedural import darken, night, recolor, stripes, tint
 from trainer.editors.style import style
@@ -23,6 +23,7 @@ EDITORS: dict[str, Factory] = {
     "darken": darken,
     "night": night,
     "folder": folder,
+    "photographs": photographs,
     "style": style,
     "instruct": instruct,
 }

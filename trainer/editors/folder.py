@@ -4,12 +4,14 @@
                    DIR/0.25/view_000.png … DIR/0.5/… further strengths, a subfolder each
 
 Files are named as the run names its views (see RUN/views/original); another size is scaled to the view's.
+`photographs:DIR` is the same with edited copies of the photographs that the cameras took, named as these;
+what the lenses bent is straightened first, as the views are straight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.lens import straightened
 from progdf.region import Region
 from trainer.editors.base import EditKind, EditorSettings
 from trainer.pictures import read_picture
@@ -33,12 +36,14 @@ class FolderEditor:
     Args:
         folders: strength → folder
         stages: the strengths, ascending
+        bent: the pictures were taken through the views' lenses and are to be straightened
     """
 
     folders: dict[float, Path]
     stages: tuple[float, ...]
     kind: EditKind = "style"
     confined: bool = False
+    bent: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
@@ -46,8 +51,13 @@ class FolderEditor:
             return view.image
         if strength not in self.folders:
             raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
-        path = _picture(self.folders[strength], view.camera.name)
-        return read_picture(path, size=(view.camera.width, view.camera.height))
+        camera = view.camera
+        path = _picture(self.folders[strength], camera.name)
+        picture = read_picture(path, size=(camera.width, camera.height))
+        if not self.bent or camera.lens is None:
+            return picture
+        straight, shown = straightened(picture, camera.K, camera.lens)
+        return torch.where(shown[..., None], straight, view.image)
 
 
 def folder(
@@ -73,6 +83,13 @@ def folder(
         for view in views:
             _picture(folders[strength], view.camera.name)
     return editor
+
+
+def photographs(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> FolderEditor:
+    """`photographs:DIR`: see the module's head."""
+    return replace(folder(what, scene, region, views, settings), bent=True)
 
 
 def _strength(name: str) -> float | None:

@@ -1,0 +1,81 @@
+"""Lens distortion: photographs are straightened exactly where they show something."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.lens import Lens, straightened
+
+BARREL = Lens(k1=-0.18, k2=0.03, p1=0.004, p2=-0.006, k3=0.002)
+K = torch.tensor([[90.0, 0.0, 63.0], [0.0, 85.0, 49.5], [0.0, 0.0, 1.0]])
+WIDTH, HEIGHT = 128, 96
+
+
+def pattern(rays: Tensor) -> Tensor:
+    """A smooth world on the plane z = 1: what colour each ray has. [...,2] -> [...,3]"""
+    x, y = rays[..., 0], rays[..., 1]
+    return 0.5 + 0.4 * torch.stack([torch.sin(7 * x), torch.sin(6 * y), torch.cos(5 * (x + y))], dim=-1)
+
+
+def pixel_rays() -> Tensor:
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    pixels = torch.stack([columns, rows], dim=-1).double()
+    return (pixels - K[:2, 2].double()) / torch.stack([K[0, 0], K[1, 1]]).double()
+
+
+def photograph(lens: Lens) -> Tensor:
+    """What a camera with this lens sees of `pattern`: the ray of each pixel by fixed-point iteration."""
+    seen = pixel_rays()
+    rays = seen.clone()
+    for _ in range(200):
+        rays = rays - 0.7 * (lens.distorted(rays) - seen)
+    assert float((lens.distorted(rays) - seen).abs().max()) < 1e-9
+    return pattern(rays).float()
+
+
+def test_a_photograph_is_straightened_to_what_a_pinhole_sees() -> None:
+    straight, shown = straightened(photograph(BARREL), K, BARREL)
+    expected = pattern(pixel_rays()).float()
+    assert float(shown.float().mean()) > 0.7
+    inner = shown.clone()
+    inner[:, :] &= torch.nn.functional.avg_pool2d(shown.float()[None], 3, 1, 1)[0] > 0.99
+    error = (straight - expected)[inner].abs().max()
+    assert float(error) < 0.004, "bilinear sampling of a pattern of 80 pixels' wavelength"
+    bent = (photograph(BARREL) - expected)[inner].abs().max()
+    assert float(bent) > 0.05, "the lens bends too little to test anything"
+
+
+def test_what_the_photograph_does_not_show_is_told() -> None:
+    pincushion = Lens(k1=0.4)
+    straight, shown = straightened(photograph(Lens()), K, pincushion)
+    assert not bool(shown[0, 0])
+    assert bool(shown[HEIGHT // 2, WIDTH // 2])
+    assert float(straight[~shown].abs().max()) == 0.0
+
+
+def test_no_lens_changes_no_bit() -> None:
+    image = photograph(Lens())
+    straight, shown = straightened(image, K, Lens())
+    assert bool(shown.all())
+    torch.testing.assert_close(straight, image, atol=2e-5, rtol=0)
+
+
+def test_where_the_formula_folds_back_nothing_is_shown() -> None:
+    folding = Lens(k1=-0.6)  # r (1 - 0.6 r²) turns round at r = sqrt(1 / 1.8)
+    assert abs(folding.valid_radius() - math.sqrt(1 / 1.8)) < 2e-3
+    wide = torch.tensor([[40.0, 0.0, 64.0], [0.0, 40.0, 48.0], [0.0, 0.0, 1.0]])
+    _, shown = straightened(torch.rand(HEIGHT, WIDTH, 3), wide, folding)
+    assert not bool(shown[48, 0])
+    assert bool(shown[48, 64])
+    assert Lens(k1=0.3).valid_radius() == math.inf
+
+
+def test_a_lens_that_bends_nothing_is_false() -> None:
+    assert not Lens()
+    assert Lens(p2=1e-9)
+    with pytest.raises(ValueError, match="finite"):
+        Lens(k1=math.nan)
