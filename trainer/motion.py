@@ -122,7 +122,8 @@ def _turned(vectors: Tensor, turn: Tensor) -> Tensor:
     """Vectors turned by unit quaternions. [M,3], [M,4] -> [M,3]"""
     axis = turn[:, 1:]
     twice = 2.0 * torch.linalg.cross(axis, vectors)
-    return vectors + turn[:, :1] * twice + torch.linalg.cross(axis, twice)
+    spun: Tensor = vectors + turn[:, :1] * twice + torch.linalg.cross(axis, twice)
+    return spun
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:

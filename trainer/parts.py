@@ -97,6 +97,7 @@ def _strays_joined(labels: Tensor, centroids: Tensor, counts: Tensor, least: flo
     number[order] = torch.arange(len(order))
     part = number[part]
     stray, firm = (part >= kept).nonzero()[:, 0], (part < kept).nonzero()[:, 0]
-    for some in stray.split(1024):
+    for first in range(0, len(stray), 1024):
+        some = stray[first : first + 1024]
         part[some] = part[firm[torch.cdist(centroids[some], centroids[firm]).argmin(dim=1)]]
     return part
