@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-import trainer.run
+import trainer.training
 from progdf.checkpoint import load_gdf
 from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
@@ -151,8 +151,8 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer.run, "optimise", interrupt)
-    with pytest.raises(KeyboardInterrupt, match="run the command again"):
+    monkeypatch.setattr(trainer.training, "optimise", interrupt)
+    with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
         train(options, quiet=True)
     assert first.gdf.read_bytes() == kept
     assert not [path for path in first.folder.root.rglob("*") if path.name.startswith(".")]

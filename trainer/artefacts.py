@@ -4,12 +4,17 @@ RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log
 RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
 RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
 RUN/views/painted/…                              what a learned editor painted, see editors/kept.py
+RUN/state/…                                      what a stopped run needs to go on, see state.py
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +25,10 @@ from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.pictures import write_image
 from trainer.pictures import read_picture
+from trainer.state import StateFolder
 
 _SIGNATURE = "progdf train"
+_LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}\.(gdf|json|png|safetensors|txt)")  # of `written_whole`, killed
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,11 @@ class RunFolder:
         """What happened."""
         return self.root / "log.txt"
 
+    @property
+    def state(self) -> StateFolder:
+        """What a stopped run needs to go on."""
+        return StateFolder(self.root / "state")
+
     def gdf(self, name: str) -> Path:
         """The edit."""
         return self.root / f"{name}.gdf"
@@ -78,7 +90,7 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
     if root.exists() and not root.is_dir():
         raise ProgdfError(f"{root} is a file; give --out a folder")
     folder = RunFolder(root)
-    if root.is_dir() and any(root.iterdir()):
+    if root.is_dir() and not all(_LEFTOVER.fullmatch(entry.name) for entry in root.iterdir()):
         first = (
             folder.log.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0]
             if folder.log.is_file()
@@ -97,9 +109,44 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
     return folder
 
 
-def signature(edit: Mapping[str, str]) -> str:
-    """First line of log.txt, by which a folder is known to be a run, and of which edit."""
-    return f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}"
+def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
+    """A new log.txt; its first line tells that the folder is a run, and of which edit."""
+    with written_whole(folder.log) as beside:
+        line = f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n"
+        beside.write_text(line, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def locked(folder: RunFolder) -> Iterator[None]:
+    """Nobody else trains in this folder meanwhile; the system lets go when the process ends, however.
+
+    Raises:
+        ProgdfError: somebody does.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    handle = os.open(folder.root, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ProgdfError(
+                    f"{folder.root} is being trained by another process; wait for it, or stop it first"
+                ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def remove_leftovers(folder: RunFolder) -> None:
+    """Delete what a run that was killed was just about to write."""
+    for path in folder.root.rglob(".*"):
+        if _LEFTOVER.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:

@@ -90,11 +90,12 @@ def finished(
         },
         "objective": about["objective"],
         "losses": about["losses"],
-        "time": {**(_earlier_times(folder) if log.appends else {}), **log.rounded_seconds()},
+        "time": {**(_earlier_times(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": _peak_memory_mb(),
         "options": options,
     }
-    own = {part: value for part, value in report.items() if part != "options"}  # the .gdf has them beside it
+    # the .gdf has the options beside it, and the same training writes the same file
+    own = {part: value for part, value in report.items() if part not in ("options", "time", "memory_mb")}
     save_gdf(folder.gdf(options["name"]), replace(gdf, report=own))
     write_json(folder.report, report)
     write_image(folder.picture, picture)

@@ -105,6 +105,10 @@ class TrainOptions:
     """Order of the views; the same seed gives the same files."""
     threads: int = 0
     """CPU threads; 0 takes all cores but one, at least one. More than there are idle cores is slower."""
+    resume: bool = False
+    """Go on with a run that was stopped in this folder; its result is that of a run that was not."""
+    save_every: float = 10.0
+    """Seconds between saves of the run's state, more where saving takes long; 0: after every step."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +173,8 @@ def settled(options: TrainOptions) -> TrainOptions:
         raise ProgdfError(
             f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"
         )
+    if not 0 <= options.save_every < math.inf:
+        raise ProgdfError(f"--save-every is {options.save_every}; 0 or more seconds would be right")
     _check_editor_options(options)
     return replace(options, name=name)
 

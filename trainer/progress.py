@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rich.console import Console
@@ -17,6 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from trainer.state import Saved
+
 Advance = Callable[[int, str], None]
 """Steps done so far, and a short word about them (the loss)."""
 
@@ -26,28 +28,43 @@ _EVERY_S = 5.0
 class RunLog:
     """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds.
 
+    The seconds are part of a run's saved state (`state.Resumable`): those of all its sessions add up.
+
     Args:
-        path: log.txt
+        path: log.txt; what is in it stays
         quiet: the file only
-        append: keep what is in the file
+        refits: a later command on a finished run, whose own time counts apart
     """
 
-    def __init__(self, path: Path, quiet: bool = False, append: bool = False) -> None:
+    def __init__(self, path: Path, quiet: bool = False, refits: bool = False) -> None:
         self.seconds: dict[str, float] = {}
-        self.appends = append
+        self.refits = refits
+        self._earlier = 0.0
+        self._running: dict[str, float] = {}
         self._start = time.perf_counter()
-        self._file = path.open("a" if append else "w", encoding="utf-8", buffering=1)
+        self._file = path.open("a", encoding="utf-8", buffering=1)
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
         self._bar = self._console.is_terminal and not quiet
 
-    def head(self, text: str) -> None:
-        """A line for the file alone, without a time."""
-        self._file.write(text + "\n")
-
     def rounded_seconds(self) -> dict[str, float]:
-        """Seconds by stage, and since the log was opened: the total, or of a refit its own."""
-        all_of_it = {"refit" if self.appends else "total": time.perf_counter() - self._start}
+        """Seconds by stage, and of all sessions of the run together: the total, or of a refit its own."""
+        all_of_it = {"refit" if self.refits else "total": self._total()}
         return {name: round(seconds, 2) for name, seconds in {**self.seconds, **all_of_it}.items()}
+
+    def saved(self) -> Saved:
+        """Seconds so far; those of the stages that have not ended too."""
+        now = time.perf_counter()
+        running = {name: now - begun for name, begun in self._running.items()}
+        seconds = {
+            name: self.seconds.get(name, 0.0) + running.get(name, 0.0) for name in self.seconds | running
+        }
+        return Saved({}, {"seconds": seconds, "total": self._total()})
+
+    def restore(self, saved: Saved) -> None:
+        """Add the seconds of the sessions before."""
+        for name, seconds in saved.values["seconds"].items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        self._earlier = saved.values["total"]
 
     def say(self, text: str) -> None:
         """One line."""
@@ -60,10 +77,11 @@ class RunLog:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Measure a part of the run under `name`; a name that comes again adds up."""
-        begun = time.perf_counter()
+        begun = self._running[name] = time.perf_counter()
         try:
             yield
         finally:
+            del self._running[name]
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
 
     @contextmanager
@@ -96,7 +114,11 @@ class RunLog:
 
     def close(self) -> None:
         """End the file."""
-        self._file.close()
+        with suppress(OSError):  # a full disk, which whoever could not write to it has told already
+            self._file.close()
+
+    def _total(self) -> float:
+        return self._earlier + time.perf_counter() - self._start
 
 
 def _escaped(text: str) -> str:

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Mapping
-from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from progdf.camera_files import load_cameras, save_cameras
+from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
-from progdf.framing import scene_sphere
-from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
+from progdf.gaussians import Gaussians
 from progdf.ply import load_ply
 from progdf.rasterize import render, set_threads
 from progdf.region import Region
 from progdf.region_spec import parse_region
-from trainer.artefacts import RunFolder, claim, remove_stale_views, signature, write_views
-from trainer.crops import crop_scene, moving_attributes, render_all
+from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
 from trainer.editors import check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
-from trainer.losses import Perceptual, eroded, perceptual_loss
-from trainer.objective import Losses, Objective, loss_table
+from trainer.interrupts import stopping
+from trainer.losses import Perceptual, perceptual_loss
 from trainer.options import FitOptions, TrainOptions, settled
-from trainer.pgs import Stage, optimise
 from trainer.preparation import (
     BACKGROUND,
     Pictures,
@@ -38,15 +33,16 @@ from trainer.preparation import (
     editor_settings,
     eight_bits,
     make_stand,
-    probes,
     strengths_to_ask,
     to_confine,
     widened,
 )
 from trainer.progress import RunLog
-from trainer.settings import loss_weights, pgs_settings
-from trainer.trajectory import Trajectory, load_trajectory, record, retime, save_trajectory, straightened
-from trainer.views import crop, make_view
+from trainer.resume import one_line, open_session, plain_options
+from trainer.settings import loss_weights
+from trainer.training import retimed, trained
+from trainer.trajectory import load_trajectory, save_trajectory
+from trainer.views import make_view
 
 __all__ = ["RunResult", "refit", "train", "use_threads"]
 
@@ -60,55 +56,101 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
 
     Raises:
         ProgdfError: options, scene, region, cameras or edited views that do not work; no .gdf is touched.
-        KeyboardInterrupt: interrupted; the message says what is left. No .gdf is touched.
+        KeyboardInterrupt: interrupted; the message says how to go on. No .gdf is touched.
     """
     options = settled(options)
     check_editor(options.editor)
-    use_threads(options.threads)
     scene = load_ply(options.scene)
     region = parse_region(options.region, scene, options.name)
     edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
     folder = claim(options.out, edit)
-    log = RunLog(folder.log, quiet)
-    log.head(signature(edit))
-    try:
-        return _trained(options, scene, region, folder, log)
-    except KeyboardInterrupt:
-        log.say("interrupted")
-        raise KeyboardInterrupt(f"no edit was written to {folder.root}; run the command again") from None
-    finally:
-        log.close()
+    with stopping(), locked(folder), one_line(folder):
+        session = open_session(folder, options, edit, region, wanted_threads(options.threads))
+        log = RunLog(folder.log, quiet)
+        try:
+            for note in session.notes:
+                log.say(note)
+            if session.does == "nothing":
+                return _found(folder, options, scene, log)
+            use_threads(session.threads)
+            result = _trained(options, scene, region, folder, log)
+            folder.state.end()
+            return result
+        except KeyboardInterrupt:
+            log.say("interrupted")
+            raise
+        finally:
+            log.close()
+
+
+def _found(folder: RunFolder, options: TrainOptions, scene: Gaussians, log: RunLog) -> RunResult:
+    """The result of a run that is finished."""
+    path = folder.gdf(options.name)
+    load_gdf(path, scene)
+    trajectory, _, _ = load_trajectory(folder.trajectory)
+    log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
+    return RunResult(folder, path, json.loads(folder.report.read_text(encoding="utf-8")), trajectory)
 
 
 def _trained(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> RunResult:
+    """Everything; what the saved state says is done is not done again, or is repeated to the same bits."""
     perceptual, warning = perceptual_loss(options.perceptual)
     if warning:
         log.say(warning)
     with log.stage("views"):
-        stand = make_stand(options, scene, region)
-        views = [*stand.train, *stand.held_out]
-        names = [view.camera.name for view in views]
-        remove_stale_views(folder, names)
-        write_views(folder, "original", {view.camera.name: view.image for view in views})
-        write_views(
-            folder, "mask", {view.camera.name: view.mask[..., None].expand(-1, -1, 3) for view in views}
-        )
-        save_cameras(folder.cameras, [view.camera for view in views])
+        stand = _looked_at(options, scene, region, folder)
+    views = [*stand.train, *stand.held_out]
     log.say(
         f"{len(scene)} Gaussians, {len(region)} in the region; {len(stand.train)} views to train on and "
         f"{len(stand.held_out)} to measure with, {views[0].camera.width}x{views[0].camera.height} pixels"
     )
+    for note in stand.notes:
+        log.say(note)
     with log.stage("edit"):
-        editor = make_editor(options.editor, scene, region, views, editor_settings(options, folder))
-        strengths = strengths_to_ask(editor, options.stages)
-        kind: EditKind = editor.kind if options.kind == "auto" else options.kind
-        confined = to_confine(editor, options, kind)
-        with log.steps("edit", len(views) * len(strengths)) as advance:
-            edited = edited_views(editor, views, strengths, folder, confined, advance)
+        edited, kind = _edited(options, stand, folder, log)
         train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
         stand = widened(stand, train_edits)
+    if folder.state.load("recorded") is None:
+        _record(options, stand, train_edits, kind, perceptual, folder, log)
+        folder.state.save("recorded", {}, {})
+    trajectory, _, about = load_trajectory(folder.trajectory)
+    measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
+    return finished(folder, stand, trajectory, about, measure, log, options.field)
+
+
+def _looked_at(options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder) -> Stand:
+    """The views, rendered and on disk."""
+    stand = make_stand(options, scene, region)
+    views = [*stand.train, *stand.held_out]
+    remove_stale_views(folder, [view.camera.name for view in views])
+    write_views(folder, "original", {view.camera.name: view.image for view in views})
+    masks = {view.camera.name: view.mask[..., None].expand(-1, -1, 3) for view in views}
+    write_views(folder, "mask", masks)
+    save_cameras(folder.cameras, [view.camera for view in views])
+    return stand
+
+
+def _edited(
+    options: TrainOptions, stand: Stand, folder: RunFolder, log: RunLog
+) -> tuple[dict[float, list[Tensor]], EditKind]:
+    """What the editor makes of all views, by strength, and what the edit moves; read where it is on disk."""
+    views = [*stand.train, *stand.held_out]
+    names = [view.camera.name for view in views]
+    done = folder.state.load("edited")
+    if done is not None and all(
+        folder.view("edited", name, s).is_file() for s in done.values["strengths"] for name in names
+    ):
+        log.say("the edited views are on disk")
+        pictures = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
+        return pictures, done.values["kind"]
+    editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
+    strengths = strengths_to_ask(editor, options.stages)
+    kind: EditKind = editor.kind if options.kind == "auto" else options.kind
+    confined = to_confine(editor, options, kind)
+    with log.steps("edit", len(views) * len(strengths)) as advance:
+        edited = edited_views(editor, views, strengths, folder, confined, advance)
     if all(
         torch.equal(p, eight_bits(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
     ):
@@ -116,17 +158,30 @@ def _trained(
             f"{options.editor} changes none of the views; check the region and what the editor is asked for"
         )
     log.say(f"{options.editor}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
+    folder.state.save("edited", {}, {"strengths": list(edited), "kind": kind})
+    return edited, kind
 
+
+def _record(
+    options: TrainOptions,
+    stand: Stand,
+    edited: Pictures,
+    kind: EditKind,
+    perceptual: Perceptual,
+    folder: RunFolder,
+    log: RunLog,
+) -> None:
+    """Optimise, and write the trajectory and the finished edit's views."""
     objective = loss_weights(options, kind).described(perceptual.name)
     log.say(f"loss: {objective}")
     with log.stage("optimise"):
-        trajectory, losses = _optimised(options, stand, train_edits, kind, perceptual, log)
+        trajectory, losses = trained(options, stand, edited, kind, perceptual, folder.state, log)
     with log.stage("retime"):
         channels = trajectory.end.shape[1]
         judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
         trajectory, costs = without_idle_attributes(trajectory, judge)
         recorded = len(trajectory)
-        trajectory = _retimed(trajectory, stand, options)
+        trajectory = retimed(trajectory, stand, options)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
@@ -139,15 +194,14 @@ def _trained(
         "losses": losses,
         "attribute_worth_db": costs,
     }
-    extra = {"members": region.members, "score": region.score}
-    save_trajectory(folder.trajectory, trajectory, extra, about)
+    scene, region = stand.scene, stand.region
+    save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(stand, trajectory))
         with torch.no_grad():
+            views = [*stand.train, *stand.held_out]
             finals = {v.camera.name: render(edited_scene, v.camera, stand.background) for v in views}
         write_views(folder, "final", finals)
-    measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
-    return finished(folder, stand, trajectory, about, measure, log, options.field)
 
 
 def refit(options: FitOptions, quiet: bool = False) -> RunResult:
@@ -175,7 +229,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
     trained = about["options"]
     region = Region(trained["name"], extra["members"], score)
     background = torch.tensor(about["background"])
-    log = RunLog(folder.log, quiet, append=True)
+    log = RunLog(folder.log, quiet, refits=True)
     try:
         with log.stage("views"):
             held_out = set(about["held_out"])
@@ -198,82 +252,12 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
 
 def use_threads(wanted: int) -> None:
     """Give torch and the rasteriser `wanted` threads; 0 is all cores but one, at least one."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = wanted or max(1, cores - 1)
+    count = wanted_threads(wanted)
     torch.set_num_threads(count)
     set_threads(count)
 
 
-def plain_options(options: TrainOptions) -> dict[str, Any]:
-    """The options as JSON values."""
-    return {name: str(v) if isinstance(v, Path) else v for name, v in asdict(options).items()}
-
-
-def _optimised(
-    options: TrainOptions,
-    stand: Stand,
-    edited: Pictures,
-    kind: EditKind,
-    perceptual: Perceptual,
-    log: RunLog,
-) -> tuple[Trajectory, Losses]:
-    """PGS over the training views.
-
-    Returns:
-        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
-    """
-    scene, members = stand.scene, stand.region.members
-    original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    crops = [crop_scene(scene, members, v.camera, v.box, stand.background) for v in stand.train]
-    stages = [
-        Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
-        for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
-    ]
-    extent = 2.0 * scene_sphere(scene[members])[1]
-    settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
-    weights = loss_weights(options, kind)
-    inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
-    snapshots: list[tuple[int, int, bool, Tensor]] = []
-    losses: list[tuple[int, Mapping[str, float]]] = []
-    with log.steps("optimise", sum(stage.steps for stage in stages)) as advance:
-        try:
-            for found in optimise(
-                original,
-                crops,
-                probes(stand),
-                stages,
-                Objective(perceptual, weights, inside),
-                settings,
-                lambda step, left: advance(step, f"loss to the edit {left:.4f}"),
-            ):
-                snapshots.append((found.step, found.stage, found.ends_stage, found.offsets.half()))
-                losses.append((found.step, found.means))
-                end = found.offsets
-        except FloatingPointError as error:
-            raise ProgdfError(
-                f"training broke down: {error}; check the edited views, or try --kind style"
-            ) from error
-    left = [means["left"] for _, means in losses]
-    log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
-    return record(snapshots, end, list(edited)), loss_table(losses)
-
-
-def _retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Trajectory:
-    """Without jitter, and at the slider values where its change is due."""
-    small = probes(stand)
-    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
-
-    moving = moving_attributes(trajectory.end)
-
-    def seen(offsets: Tensor) -> Tensor:
-        return torch.cat([picture.flatten() for picture in render_all(small, rows + offsets, moving)])
-
-    if options.recording == "smooth":
-        trajectory = straightened(trajectory, seen)
-    return retime(trajectory, seen, options.slider)
-
-
-def _shared(steps: int, stages: int) -> list[int]:
-    """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
-    marks = [steps * i // (stages + 1) for i in range(stages)]
-    return [b - a for a, b in pairwise([*marks, steps])]
+def wanted_threads(wanted: int) -> int:
+    """How many threads `wanted` means."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return wanted or max(1, cores - 1)

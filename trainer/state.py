@@ -15,8 +15,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -141,35 +140,13 @@ class StateFolder:
         for entry in self.path.iterdir() if self.path.is_dir() else ():
             if entry.is_dir():
                 shutil.rmtree(entry, ignore_errors=True)
-            elif entry.name != _LOCK:
+            else:
                 entry.unlink(missing_ok=True)
 
     def end(self) -> None:
         """The run is finished: remove the folder."""
         self.clear()
         shutil.rmtree(self.path, ignore_errors=True)
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Nobody else trains in this folder meanwhile; the system lets go when the process ends, however.
-
-        Raises:
-            ProgdfError: somebody does.
-        """
-        self.path.mkdir(exist_ok=True)
-        if sys.platform == "win32":
-            yield
-            return
-        import fcntl
-
-        with (self.path / _LOCK).open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ProgdfError(
-                    f"{self.path.parent} is being trained by another process; wait for it, or stop it first"
-                ) from None
-            yield
 
     def _file(self, part: str, index: int | None) -> Path:
         return self.path / (f"{part}.safetensors" if index is None else f"{part}/{index:06d}.safetensors")
@@ -230,9 +207,6 @@ def generator(state: Tensor) -> torch.Generator:
     made = torch.Generator()
     made.set_state(state)
     return made
-
-
-_LOCK = "lock"
 
 
 def _flush(path: Path) -> None:

@@ -1,0 +1,169 @@
+"""What a training command finds in its folder: nothing, a stopped run to go on with, or a finished one."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import SafetensorError
+
+from progdf.errors import ProgdfError
+from progdf.region import Region
+from trainer.artefacts import RunFolder, begin_log, remove_leftovers
+from trainer.options import TrainOptions
+
+_ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
+"""Options that change no bit of the result; `quick` is worked into others."""
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is to be done in a run folder.
+
+    Args:
+        does: "start" from nothing, "go on" from the saved state; "nothing", as the run is finished
+        threads: with how many; a run keeps to those it began with, as sums depend on them
+        notes: lines for the log
+    """
+
+    does: Literal["start", "go on", "nothing"]
+    threads: int
+    notes: tuple[str, ...] = ()
+
+
+def open_session(
+    folder: RunFolder, options: TrainOptions, edit: Mapping[str, str], region: Region, threads: int
+) -> Session:
+    """Find out what is to be done, and make the folder ready for it.
+
+    Args:
+        folder: claimed and locked
+        options: settled
+        edit: see `claim`
+        region: what may change
+        threads: that the options ask for
+
+    Raises:
+        ProgdfError: a stopped run that would be lost without --resume; with it, other options than the run's.
+    """
+    saved = folder.state.identity()
+    if options.resume and saved is None and folder.report.is_file():
+        _check_options(folder, _finished_options(folder), options, "leave --resume away to train anew")
+        return Session("nothing", threads)
+    remove_leftovers(folder)
+    now = _identity(options, region, threads)
+    if options.resume and saved is not None:
+        remedy = "give --resume the run's own options, or train anew in another folder"
+        _check_options(folder, saved["options"], options, remedy)
+        for what in ("scene", "cameras", "region"):
+            if saved[what] != now[what]:
+                raise ProgdfError(
+                    f"the {what} is no longer what {folder.root} was begun with; bring it back and go on "
+                    "with --resume, or train anew in another folder"
+                )
+        notes = []
+        if saved["torch"] != now["torch"]:
+            notes.append(f"torch was {saved['torch']} and is {now['torch']}: the last bits may differ")
+        if saved["threads"] != threads:
+            notes.append(f"{saved['threads']} threads, as the run began with, for the same bits")
+        return Session("go on", saved["threads"], tuple(notes))
+    if saved is not None and (step := _saved_step(folder)):
+        raise ProgdfError(
+            f"{folder.root} holds a run that was stopped at step {step} of {saved['options']['steps']}; "
+            f"add --resume to go on with it, or delete {folder.state.path} to start over"
+        )
+    begin_log(folder, edit)
+    folder.state.begin(now)
+    notes = (
+        ["nothing to resume was saved yet, so the run starts from the beginning"] if options.resume else []
+    )
+    return Session("start", threads, tuple(notes))
+
+
+@contextmanager
+def one_line(folder: RunFolder) -> Iterator[None]:
+    """Whatever stops a run, the person is told in one line what is left and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"what is done is kept in {folder.root}; give the same command with --resume to go on"
+        ) from None
+    except (OSError, SafetensorError, ProgdfError) as error:
+        if not folder.state.path.is_dir():
+            raise ProgdfError(
+                f"{folder.state.path} was removed while the run was in need of it; train again"
+            ) from error
+        if isinstance(error, ProgdfError):
+            raise
+        raise ProgdfError(f"{_trouble(error, folder.root)}, then go on with --resume") from error
+
+
+def plain_options(options: TrainOptions) -> dict[str, Any]:
+    """The options that the result depends on or came from, as JSON values."""
+    return {
+        name: str(v) if isinstance(v, Path) else v
+        for name, v in asdict(options).items()
+        if name not in ("resume", "save_every")
+    }
+
+
+def _identity(options: TrainOptions, region: Region, threads: int) -> dict[str, Any]:
+    """All that decides the bits of a run's result, as JSON values."""
+    return {
+        "options": plain_options(options),
+        "scene": _digest(options.scene),
+        "cameras": _digest(options.cameras) if options.cameras is not None else None,
+        "region": hashlib.sha256(region.members.numpy().tobytes()).hexdigest(),
+        "threads": threads,
+        "torch": torch.__version__,
+    }
+
+
+def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOptions, remedy: str) -> None:
+    for name, now in plain_options(options).items():
+        was = saved.get(name)
+        if name in ("scene", "cameras") and was is not None and now is not None:
+            was, now = (str(Path(path).resolve()) for path in (was, now))
+        if was != now and name not in _ABOUT_THE_COMMAND:
+            option = "--" + name.replace("_", "-")
+            raise ProgdfError(f"{folder.root} was begun with {option} {was}, not {now}; {remedy}")
+
+
+def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
+    try:
+        options = json.loads(folder.report.read_text(encoding="utf-8"))["options"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProgdfError(f"{folder.report} is damaged; leave --resume away to train anew") from error
+    return options if isinstance(options, dict) else {}
+
+
+def _saved_step(folder: RunFolder) -> int:
+    """How far the optimisation was when it was saved; 0: not begun."""
+    saved = folder.state.load("training")
+    return int(saved.values["pgs"]["step"]) if saved is not None else 0
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _trouble(error: OSError | SafetensorError, root: Path) -> str:
+    if isinstance(error, SafetensorError):  # its words for an OSError
+        full = "os error 28" in str(error) or "os error 27" in str(error)
+        reason = str(error)
+    else:
+        full, reason = error.errno in _FULL, error.strerror or str(error)
+    if full:
+        return f"the disk of {root} is full; free some space"
+    return f"{root} cannot be written ({reason}); mend that"

@@ -1,0 +1,176 @@
+"""PGS over a run's training views, saved as it goes: recordings in, a trajectory out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.framing import scene_sphere
+from progdf.gaussians import BASE_CHANNELS, pack
+from trainer.crops import crop_scene, moving_attributes, render_all
+from trainer.descent import PgsState
+from trainer.editors.base import EditKind
+from trainer.interrupts import held
+from trainer.losses import Perceptual, eroded
+from trainer.objective import Losses, Objective, loss_table
+from trainer.options import TrainOptions
+from trainer.pgs import Snapshot, Stage, optimise
+from trainer.preparation import Pictures, Stand, probes
+from trainer.progress import RunLog
+from trainer.settings import loss_weights, pgs_settings
+from trainer.state import Autosave, Saved, StateFolder
+from trainer.trajectory import Trajectory, record, retime, straightened
+from trainer.views import crop
+
+PART = "training"
+"""Of the saved state: all that changes while the members are optimised."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A snapshot as it is kept.
+
+    Args:
+        step, stage, ends_stage, means: see `Snapshot`
+        offsets: of the members, in half precision. [M,C] float16
+    """
+
+    step: int
+    stage: int
+    ends_stage: bool
+    offsets: Tensor
+    means: Mapping[str, float]
+
+
+class Recordings:
+    """All recordings so far, a `state.Resumable`: each is written once, to a file of its own.
+
+    Args:
+        folder: where
+    """
+
+    def __init__(self, folder: StateFolder) -> None:
+        self.made: list[Recording] = []
+        self._folder, self._written = folder, 0
+
+    def add(self, found: Snapshot) -> None:
+        """Keep one."""
+        offsets = found.offsets.half()
+        self.made.append(Recording(found.step, found.stage, found.ends_stage, offsets, found.means))
+
+    def saved(self) -> Saved:
+        """How many there are; those that came since the last time are written first."""
+        for index in range(self._written, len(self.made)):
+            kept = self.made[index]
+            values = {"step": kept.step, "stage": kept.stage, "ends_stage": kept.ends_stage}
+            self._folder.save("recordings", {"offsets": kept.offsets}, values | {"means": kept.means}, index)
+        self._written = len(self.made)
+        return Saved({}, {"count": self._written})
+
+    def restore(self, saved: Saved) -> None:
+        """Read as many as there were; what a killed run wrote beyond them will be written again."""
+        self._written = saved.values["count"]
+        found = [self._folder.load("recordings", index) for index in range(self._written)]
+        if None in found:
+            raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
+        self.made = [Recording(offsets=kept.tensors["offsets"], **kept.values) for kept in found if kept]
+
+
+def trained(
+    options: TrainOptions,
+    stand: Stand,
+    edited: Pictures,
+    kind: EditKind,
+    perceptual: Perceptual,
+    folder: StateFolder,
+    log: RunLog,
+) -> tuple[Trajectory, Losses]:
+    """Optimise the members, from the beginning or from where the saved state stands.
+
+    Args:
+        options: see `TrainOptions`
+        stand: scene, region, views with boxes that hold the edit
+        edited: strength → the edited training views, whole
+        kind: what the edit moves
+        perceptual: distance of pictures
+        folder: where the state is saved
+        log: where progress is told
+
+    Returns:
+        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
+
+    Raises:
+        ProgdfError: the loss is not finite.
+        KeyboardInterrupt: interrupted; the state is saved.
+    """
+    scene, members = stand.scene, stand.region.members
+    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    crops = [crop_scene(scene, members, v.camera, v.box, stand.background) for v in stand.train]
+    stages = [
+        Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
+        for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
+    ]
+    extent = 2.0 * scene_sphere(scene[members])[1]
+    settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
+    inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
+    objective = Objective(perceptual, loss_weights(options, kind), inside)
+
+    state, recordings = PgsState(original, settings.seed), Recordings(folder)
+    kept = Autosave(
+        folder, PART, {"pgs": state, "recordings": recordings, "log": log}, every_s=options.save_every
+    )
+    if kept.restore():
+        log.say(f"going on at step {state.step} of {options.steps}, with {len(recordings.made)} recordings")
+    with log.steps("optimise", options.steps) as advance, held() as stopped:
+
+        def step_done(step: int, left: float) -> None:
+            advance(step, f"loss to the edit {left:.4f}")
+            if stopped():
+                kept.save()
+                raise KeyboardInterrupt
+            kept.step_done()
+
+        try:
+            for found in optimise(
+                original, crops, probes(stand), stages, objective, settings, step_done, state
+            ):
+                recordings.add(found)
+        except FloatingPointError as error:
+            kept.save()
+            raise ProgdfError(
+                f"training broke down: {error}; the state before it is kept: mend the edited views and go on "
+                "with --resume, or try --kind style in another folder"
+            ) from error
+    kept.save()
+    losses = loss_table([(made.step, made.means) for made in recordings.made])
+    left = [made.means["left"] for made in recordings.made]
+    log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
+    log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
+    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
+    return record(snapshots, state.average.clone(), list(edited)), losses
+
+
+def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Trajectory:
+    """Without jitter, and at the slider values where its change is due."""
+    small = probes(stand)
+    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+
+    moving = moving_attributes(trajectory.end)
+
+    def seen(offsets: Tensor) -> Tensor:
+        return torch.cat([picture.flatten() for picture in render_all(small, rows + offsets, moving)])
+
+    if options.recording == "smooth":
+        trajectory = straightened(trajectory, seen)
+    return retime(trajectory, seen, options.slider)
+
+
+def _shared(steps: int, stages: int) -> list[int]:
+    """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
+    marks = [steps * i // (stages + 1) for i in range(stages)]
+    return [b - a for a, b in pairwise([*marks, steps])]
