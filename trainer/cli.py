@@ -19,9 +19,7 @@ _Options = TypeVar("_Options")
 
 def train(argv: Sequence[str]) -> int:
     """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
-    options = parsed(TrainOptions, argv, "progdf train")
-    if options.preset != "default":  # again, for what argv says goes before what the preset says
-        options = parsed(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
+    options = train_options(argv)
     from trainer.run import train as run  # only now: --help and a mistyped option need no torch
 
     run(options)
@@ -35,6 +33,14 @@ def fit(argv: Sequence[str]) -> int:
 
     refit(options)
     return 0
+
+
+def train_options(argv: Sequence[str]) -> TrainOptions:
+    """What a command line asks for: what it says itself, then its preset, then the defaults."""
+    options = parsed(TrainOptions, argv, "progdf train")
+    if options.preset == "default":
+        return options
+    return parsed(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
 
 
 def parsed(
