@@ -90,6 +90,7 @@ def finished(
         },
         "objective": about["objective"],
         "losses": about["losses"],
+        "agreement": about.get("agreement"),
         "time": {**(_earlier_times(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": _peak_memory_mb(),
         "options": options,

@@ -30,6 +30,9 @@ EDITORS: dict[str, Factory] = {
 """Kind of editor → its factory, given what stands behind the colon, the scene, the region, the views
 and the settings of learned editors."""
 
+VIEW_BY_VIEW = ("folder", "style", "instruct")
+"""Kinds whose views are edited one by one, so that nothing makes them agree."""
+
 EXAMPLES = (
     "recolor:#3060d0",
     "tint:#d4af37",
@@ -61,4 +64,12 @@ def make_editor(
     return EDITORS[kind](what, scene, region, views, settings or EditorSettings())
 
 
-__all__ = ["EDITORS", "EditorSettings", "ImageEditor", "Painter", "check_editor", "make_editor"]
+__all__ = [
+    "EDITORS",
+    "VIEW_BY_VIEW",
+    "EditorSettings",
+    "ImageEditor",
+    "Painter",
+    "check_editor",
+    "make_editor",
+]

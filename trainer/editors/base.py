@@ -74,6 +74,10 @@ class ImageEditor(Protocol):
 class Painter(Protocol):
     """An editor that looks at a picture and paints another, and so can look at a render again."""
 
-    def edit_again(self, view: View, strength: float, current: Tensor, step: int) -> Tensor:
-        """The edited view, painted from the render of training step `step`. [H,W,3] -> [H,W,3] 0..1"""
+    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
+        """The edited view, painted from the render of training step `step`. [H,W,3] -> [H,W,3] 0..1
+
+        None for the render stands for the one that was painted from at that step; ProgdfError if that picture
+        is no longer there.
+        """
         ...

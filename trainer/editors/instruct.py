@@ -60,11 +60,11 @@ class InstructEditor:
             return view.image
         return self._painted(view, view.image, strength, "" if strength == 1.0 else f"{strength:g}")
 
-    def edit_again(self, view: View, strength: float, current: Tensor, step: int) -> Tensor:
+    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
         """See `Painter.edit_again`."""
         return self._painted(view, current, strength, f"step_{step:05d}")
 
-    def _painted(self, view: View, source: Tensor, strength: float, place: str) -> Tensor:
+    def _painted(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:
         if self.stages and strength not in self.stages:
             raise ValueError(f"this editor pictures strength {list(self.stages)}, not {strength:g}")
         # guidance 1 is none, and pipelines skip it altogether below

@@ -35,20 +35,32 @@ class KeptPictures:
     folder: Path | None
 
     def picture(
-        self, name: str, source: Tensor, recipe: Recipe, paint: Callable[[Tensor], Tensor], place: str = ""
+        self,
+        name: str,
+        source: Tensor | None,
+        recipe: Recipe,
+        paint: Callable[[Tensor], Tensor],
+        place: str = "",
     ) -> Tensor:
         """What `paint` makes of `source`, in 8 bits: read where the note fits, else painted and kept.
 
         Args:
             name: of the view, a file name
-            source: the picture that is painted from. [H,W,3]
+            source: the picture that is painted from; None takes the kept one as it is. [H,W,3]
             recipe: see `Recipe`
             paint: [H,W,3] -> [H,W,3]
             place: subfolder
+
+        Raises:
+            ProgdfError: nothing is kept where `source` is None.
         """
-        if self.folder is None:
+        path = self.folder / place / f"{name}.png" if self.folder is not None else None
+        if source is None:
+            if path is None or not path.is_file():
+                raise ProgdfError(f"the painted picture {path} is gone; train again without --resume")
+            return read_picture(path)
+        if path is None:
             return _eight_bits(paint(source))
-        path = self.folder / place / f"{name}.png"
         note = path.with_suffix(".json")
         wanted = {"source": digest(source), "editor": dict(recipe)}
         if _note(note) == wanted:

@@ -56,7 +56,7 @@ class StyleEditor:
         painted = self.kept.picture(view.camera.name, view.image, self.recipe, self.paint)
         return self._mixed_in(view, painted, strength)
 
-    def edit_again(self, view: View, strength: float, current: Tensor, step: int) -> Tensor:
+    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
         """See `Painter.edit_again`."""
         place = f"step_{step:05d}"
         painted = self.kept.picture(view.camera.name, current, self.recipe, self.paint, place)
