@@ -88,6 +88,13 @@ class PgsState:
         self.step, self.local = done, self.local + 1
         self._queue.pop()
 
+    def hold_growth(self, most: float) -> None:
+        """Let no member be more than `most` times as large as it was; inf: however large."""
+        if math.isfinite(most):
+            columns = attribute_slices(self.moved.shape[1])["log_scales"]
+            with torch.no_grad():
+                self.moved[:, columns].clamp_(max=math.log(most))
+
     def saved(self) -> Saved:
         """See `state.Resumable`."""
         tensors = {name: getattr(self, name) for name in _ROWS}

@@ -1,140 +1,127 @@
 """The group stage: before anything bends, each connected part is moved as a whole to where the edit shows it.
 
 Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever colour
-it lies on. A part has seven numbers (shift, turn, growth); they are found first, coarse to fine, and the
-members start from there (method.md 3, large moves).
+it lies on. So the parts' motions are found first, and the members' own offsets live in the frames of their
+parts from then on: what is learnt of a hand moves, turns and grows with the hand (method.md 3, large moves).
+The way between two strengths is the parts' way, not the optimiser's: a slider shows the hand in motion.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
+from progdf.gaussians import attribute_slices
 from trainer.crops import CropScene
-from trainer.motion import Motion, Parts, moved
+from trainer.group_search import GroupSearch, OnStep
+from trainer.motion import Motion, Parts, between, carried, carried_back, make_parts
+from trainer.parts import connected_parts
+from trainer.pgs import Stage
 
-_BLURS = (9, 21)  # pixels
-_WIDE_BLURS = (0.4, 0.2, 0.1)  # of the box's longer side: a part feels a place three times its size away
-_WIDE = 0.4  # share of a wide search's steps that see no more than those, shift thrice as fast, never turn
-_RATES = (0.06, 0.03, 0.03)  # a step of shift in part sizes, of log-scale, of turn in radians
-_SETTLED = 0.25  # share of the steps, the last, over which the motion is averaged
-_MISSED = 0.25  # share of the distance that is left where the near search is taken to have lost its way
-_MOVING = ("means", "log_scales", "quats")
-
-OnStep = Callable[[int, float], None]
-"""Called after every step: steps done, loss."""
+GROWTH = 2.0
+"""How many times a Gaussian may grow beyond its part; larger ones are fog that hides an error."""
 
 
 @dataclass(frozen=True)
-class GroupSearch:
-    """What the parts are fitted to, and how long.
+class Groups:
+    """The parts of a region and where each is at the end of every stage.
+
+    Args:
+        parts: the region taken apart
+        motions: of the parts, one per stage
+    """
+
+    parts: Parts
+    motions: tuple[Motion, ...]
+
+    def stage(self, original: Tensor, stage: Stage, index: int) -> Stage:
+        """A stage whose members' offsets are those in their parts' frames. `original`: raw rows [M,C]"""
+        motion = self.motions[index]
+        return replace(stage, place=lambda offsets: carried(original, offsets, self.parts, motion))
+
+    def lines(self) -> list[str]:
+        """What the log says of the finished edit: where each part went, in its own sizes."""
+        motion, sizes = self.motions[-1], self.parts.sizes
+        return [
+            f"part {index}, {int((self.parts.part == index).sum())} Gaussians: moved by "
+            f"{float(motion.shift[index].norm() / sizes[index]):.2f} of its size, turned by "
+            f"{math.degrees(float(motion.turn[index].norm())):.0f} degrees, "
+            f"{math.exp(float(motion.log_scale[index])):.2f} times as large"
+            for index in range(len(sizes))
+        ]
+
+    def saved(self) -> dict[str, Tensor]:
+        """Part of each member [M] and motions [T,P,7]; `restored_groups` takes them."""
+        motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
+        return {"part": self.parts.part, "motions": torch.stack(motions)}
+
+
+def group_stage(
+    original: Tensor,
+    crops: Sequence[CropScene],
+    targets: Sequence[Sequence[Tensor]],
+    steps: int = 120,
+    seed: int = 0,
+    on_step: OnStep | None = None,
+) -> Groups:
+    """Find the parts and their motions; the same inputs give the same bits.
 
     Args:
         original: raw member rows. [M,C]
-        parts: the region taken apart
         crops: the training views
-        steps: of a search, each in one view
+        targets: of each stage, the edited box of each view. [h,w,3] each
+        steps: of a search; a stage takes one or two
         seed: order of the views
+        on_step: progress: steps done in all, loss
+
+    Raises:
+        FloatingPointError: the loss is not finite.
     """
-
-    original: Tensor
-    parts: Parts
-    crops: Sequence[CropScene]
-    steps: int = 120
-    seed: int = 0
-
-    def find(self, targets: Sequence[Tensor], start: Motion, on_step: OnStep | None = None) -> Motion:
-        """The motion of the parts that brings the views closest to their targets.
-
-        A near search starts at full sharpness. Where it leaves a quarter of the distance, a wide one is tried
-        too. On playbot_31k's hands the near one arrives from twice a part's size away (52 dB, 120 steps, 2 s),
-        the wide one from three times (45 dB where the near one has 17), but it can overlook what is close.
-
-        Args:
-            targets: the edited box of each view. [h,w,3] each
-            start: where to look first
-            on_step: progress; called for `steps` steps, or twice as many
-
-        Returns:
-            The best motion found; `start` where none is better in the mean of all views.
-
-        Raises:
-            FloatingPointError: the loss is no longer finite.
-        """
-        best, least = start, self.distance(targets, start)
-        missed = _MISSED * least
-        for wide in (False, True):
-            found = self._search(targets, start, wide, on_step)
-            distance = self.distance(targets, found)
-            if distance < least:
-                best, least = found, distance
-            if least < missed:
-                break
-        return best
-
-    def distance(self, targets: Sequence[Tensor], motion: Motion) -> float:
-        """Mean distance of all views from their targets, at full sharpness and blurred."""
-        with torch.no_grad():
-            rows = moved(self.original, self.parts, motion)
-            pairs = zip(self.crops, targets, strict=True)
-            return sum(float(_distance(crop, rows, target)) for crop, target in pairs) / len(targets)
-
-    def _search(self, targets: Sequence[Tensor], start: Motion, wide: bool, on_step: OnStep | None) -> Motion:
-        values = torch.cat(
-            [start.shift / self.parts.sizes[:, None], start.log_scale[:, None], start.turn], dim=1
-        ).requires_grad_()
-        shift, size, turn = _RATES
-        rates = torch.tensor([shift] * 3 + [size] + [turn] * 3)
-        wide_rates = torch.tensor([3 * shift] * 3 + [size] + [0.0] * 3)
-        first, second = torch.zeros_like(values), torch.zeros_like(values)
-        settled = torch.zeros_like(values)
-        averaged = max(1, round(_SETTLED * self.steps))
-        widening = round(_WIDE * self.steps) if wide else 0
-        order = torch.Generator().manual_seed(self.seed)
-        queue: list[int] = []
-        for step in range(self.steps):
-            if not queue:
-                queue = torch.randperm(len(self.crops), generator=order).tolist()
-            view = queue.pop()
-            rows = moved(self.original, self.parts, _motion(values, self.parts))
-            loss = _distance(self.crops[view], rows, targets[view], wide=step < widening)
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                raise FloatingPointError(f"the loss is {value} at step {step} of the group stage")
-            (gradient,) = torch.autograd.grad(loss, values)
-            with torch.no_grad():
-                # Adam with short memories: there are few steps, and few numbers to find
-                first.lerp_(gradient, 0.2)
-                second.lerp_(gradient.square(), 0.02)
-                mean = first / (1 - 0.8 ** (step + 1))
-                spread = (second / (1 - 0.98 ** (step + 1))).sqrt()
-                fall = 0.5 + 0.5 * math.cos(math.pi * max(0, step - widening) / (self.steps - widening))
-                rate = wide_rates if step < widening else (0.05 + 0.95 * fall) * rates
-                values -= rate * mean / (spread + 1e-12)
-                if self.steps - step <= averaged:
-                    settled += values / averaged
-            if on_step is not None:
-                on_step(step + 1, value)
-        return _motion(settled, self.parts)
+    means = original[:, attribute_slices(original.shape[1])["means"]]
+    parts = make_parts(original, connected_parts(means))
+    search = GroupSearch(original, parts, crops, steps, seed)
+    motions: list[Motion] = []
+    for pictures in targets:
+        start = motions[-1] if motions else parts.still()
+        motions.append(search.find(pictures, start, on_step))
+    return Groups(parts, tuple(motions))
 
 
-def _motion(values: Tensor, parts: Parts) -> Motion:
-    return Motion(values[:, :3] * parts.sizes[:, None], values[:, 3], values[:, 4:])
+def restored_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
+    """What `Groups.saved` gave, of the same members."""
+    motions = tuple(Motion(m[:, :3], m[:, 3], m[:, 4:]) for m in saved["motions"])
+    return Groups(make_parts(original, saved["part"]), motions)
 
 
-def _distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = False) -> Tensor:
-    """L1 at full sharpness and blurred, or blurred widely only: so a part feels where it does not lie yet."""
-    image, _ = scene.render(rows, _MOVING)
-    difference = image - target
-    loss = difference.new_zeros(()) if wide else difference.abs().mean()
-    longer = max(scene.size)
-    planes = difference.permute(2, 0, 1)[None]
-    for blur in [round(longer * share) for share in _WIDE_BLURS] if wide else _BLURS:
-        width = max(1, min(blur, *scene.size))
-        loss = loss + avg_pool2d(planes, width, max(1, width // 3)).abs().mean()
-    return loss
+def way(
+    original: Tensor, groups: Groups, ends: Sequence[Tensor], steps: Sequence[int], count: int
+) -> list[tuple[int, int, bool, Tensor]]:
+    """Recordings through the stages' ends: parts move as wholes, what bends within them bends evenly.
+
+    Args:
+        original: raw member rows. [M,C]
+        groups: see `group_stage`
+        ends: the members' offsets at the end of each stage. [M,C] each
+        steps: optimiser steps done then
+        count: recordings over all stages, about
+
+    Returns:
+        (step, stage, ends_stage, offsets [M,C] float16) in order, as `trajectory.record` takes them
+    """
+    motion, own, begun = groups.parts.still(), torch.zeros_like(original), 0
+    each = max(2, count // len(ends))
+    found = []
+    for stage, (end, step, next_motion) in enumerate(zip(ends, steps, groups.motions, strict=True)):
+        next_own = carried_back(original, end, groups.parts, next_motion)
+        for i in range(1, each):
+            share = i / each
+            halfway = between(motion, next_motion, share)
+            offsets = carried(original, torch.lerp(own, next_own, share), groups.parts, halfway)
+            found.append((begun + round(share * (step - begun)), stage, False, offsets.half()))
+        found.append((step, stage, True, end.half()))
+        motion, own, begun = next_motion, next_own, step
+    return found

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.gaussians import attribute_slices
+from progdf.gaussians import BASE_CHANNELS, attribute_slices
+
+_COLUMNS = attribute_slices(BASE_CHANNELS)
+_MOVING = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row
 
 
 @dataclass(frozen=True)
@@ -58,39 +61,52 @@ class Parts:
 
 def make_parts(rows: Tensor, part: Tensor) -> Parts:
     """Centres and sizes of the parts. `rows`: packed members [M,C]; `part`: [M] int64, each below P used"""
-    means = rows[:, attribute_slices(rows.shape[1])["means"]]
+    means, log_scales, _ = _split(rows)
     counts = torch.bincount(part).to(means)
     nothing = means.new_zeros(len(counts), 3)
     centres = nothing.index_add(0, part, means) / counts[:, None]
     squares = (means - centres[part]).square().sum(dim=1)
     sizes = (nothing[:, 0].index_add(0, part, squares) / counts).sqrt()
-    log_scales = rows[:, attribute_slices(rows.shape[1])["log_scales"]]
     own = log_scales.exp().amax(dim=1).mean()  # a part of one Gaussian has its size
     return Parts(part, centres, torch.maximum(sizes, 1e-3 * own).clamp_min(1e-9))
 
 
 def moved(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """The members' raw rows where the motion takes them; differentiable in both. [M,C] -> [M,C]"""
-    columns = attribute_slices(rows.shape[1])
-    turn = _quaternion(motion.turn)[parts.part]
-    arm = rows[:, columns["means"]] - parts.centres[parts.part]
-    size = motion.log_scale[parts.part, None]
-    means = parts.centres[parts.part] + motion.shift[parts.part] + size.exp() * _turned(arm, turn)
-    log_scales = rows[:, columns["log_scales"]] + size
-    quats = _product(turn, rows[:, columns["quats"]])
-    return torch.cat([means, log_scales, quats, rows[:, columns["logit_opacities"].start :]], dim=1)
+    """Raw rows where the motion takes them; differentiable in both. [M,≥10] -> [M,≥10]"""
+    part = parts.part
+    means, log_scales, quats = _split(rows)
+    turn, size = _quaternion(motion.turn)[part], motion.log_scale[part, None]
+    arm = means - parts.centres[part]
+    means = parts.centres[part] + motion.shift[part] + size.exp() * _turned(arm, turn)
+    return torch.cat([means, log_scales + size, _product(turn, quats), rows[:, _MOVING.stop :]], dim=1)
 
 
-def unmoved(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """The inverse of `moved`. [M,C] -> [M,C]"""
-    columns = attribute_slices(rows.shape[1])
-    back = _quaternion(-motion.turn)[parts.part]
-    size = motion.log_scale[parts.part, None]
-    arm = rows[:, columns["means"]] - parts.centres[parts.part] - motion.shift[parts.part]
-    means = parts.centres[parts.part] + _turned(arm, back) * (-size).exp()
-    log_scales = rows[:, columns["log_scales"]] - size
-    quats = _product(back, rows[:, columns["quats"]])
-    return torch.cat([means, log_scales, quats, rows[:, columns["logit_opacities"].start :]], dim=1)
+def carried(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
+    """Offsets within the parts' own frames -> offsets from the original, once the parts have moved.
+
+    Args:
+        original: raw member rows. [M,C]
+        offsets: what each member does besides going with its part. [M,C]
+        parts, motion: see there
+
+    Returns:
+        Raw-space offsets, differentiable. [M,C]; opacity's and colour's are the given ones
+    """
+    moving = _MOVING
+    rows = original[:, moving]
+    return torch.cat(
+        [moved(rows + offsets[:, moving], parts, motion) - rows, offsets[:, moving.stop :]], dim=1
+    )
+
+
+def carried_back(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
+    """The inverse of `carried`. [M,C] -> [M,C]"""
+    moving, part = _MOVING, parts.part
+    means, log_scales, quats = _split(original[:, moving] + offsets[:, moving])
+    back, size = _quaternion(-motion.turn)[part], motion.log_scale[part, None]
+    arm = means - parts.centres[part] - motion.shift[part]
+    own = [parts.centres[part] + _turned(arm, back) * (-size).exp(), log_scales - size, _product(back, quats)]
+    return torch.cat([torch.cat(own, dim=1) - original[:, moving], offsets[:, moving.stop :]], dim=1)
 
 
 def between(a: Motion, b: Motion, share: float) -> Motion:
@@ -102,6 +118,11 @@ def between(a: Motion, b: Motion, share: float) -> Motion:
         torch.lerp(a.log_scale, b.log_scale, share),
         _rotation_vector(_product(start, _quaternion(share * rest))),
     )
+
+
+def _split(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means [M,3], log-scales [M,3] and quaternions [M,4] of packed rows."""
+    return rows[:, _COLUMNS["means"]], rows[:, _COLUMNS["log_scales"]], rows[:, _COLUMNS["quats"]]
 
 
 def _quaternion(turn: Tensor) -> Tensor:

@@ -70,6 +70,9 @@ class TrainOptions:
     """Optimiser steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
     kind: Literal["auto", "colour", "style", "geometry"] = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor says (folder: style)."""
+    group_steps: int = 120
+    """geometry: first the connected parts of the region are moved as wholes, in so many steps per strength
+    or twice as many; 0: every Gaussian finds its own way, which smears what moves far."""
     stages: int = 8
     """Strengths that a procedural editor is asked for; 1 is the paper's way, towards the end alone."""
     rates: Rates = "kind"
@@ -147,6 +150,7 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--views", options.views, 3, 96),
         ("--image-size", options.image_size, 32, 2048),
         ("--stages", options.stages, 1, 16),
+        ("--group-steps", options.group_steps, 0, 10_000),
         ("--threads", options.threads, 0, 1024),
         ("--perceptual-every", options.perceptual_every, 1, 1000),
         ("--guidance", options.guidance, 1, 100),

@@ -60,6 +60,7 @@ class PgsSettings:
             smaller steps, down to a quarter, a longer one larger, up to 1.5 times; 0: the same for all
         smoothing: share that the recorded running mean keeps of itself at each step; 0 records the bare
             iterates
+        growth: how many times a Gaussian may grow, beyond what its stage places it at
         snapshots: recordings over all stages, about
         seed: order of the views
     """
@@ -71,6 +72,7 @@ class PgsSettings:
     fall: float = 0.35
     reach: float = 0.05
     smoothing: float = 0.9
+    growth: float = math.inf
     snapshots: int = 32
     seed: int = 0
 
@@ -83,11 +85,14 @@ class Stage:
         strength: the slider value it belongs to, 0..1
         targets: the edited box of each training view. [h,w,3] each
         steps: how many steps
+        place: turns the members' own offsets, which are optimised, into those that are seen and recorded: a
+            part that moves as a whole takes them along; differentiable. [M,C] -> [M,C]
     """
 
     strength: float
     targets: Sequence[Tensor]
     steps: int
+    place: Callable[[Tensor], Tensor] = lambda offsets: offsets
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ class Snapshot:
         step: steps done, over all stages
         stage: index of the stage
         ends_stage: whether it is the last of its stage
-        offsets: raw-space offsets of the members. [M,C] float32
+        offsets: raw-space offsets of the members as placed. [M,C] float32
         means: since the last recording: each loss term, weighted, over the steps that paid for it, and
             "left", the L1 distance from the finished edit
     """
@@ -109,6 +114,11 @@ class Snapshot:
     offsets: Tensor
     means: Mapping[str, float]
 
+
+Renewal = Callable[[int, int, float, Tensor], Sequence[Tensor] | None]
+"""Asked before every step for other targets: steps done over all stages, and in this one, the stage's
+strength, the offsets as placed [M,C] -> the edited box of each training view [h,w,3], or None: no change. It
+answers a run that goes on as it did the run that was stopped."""
 
 OnStep = Callable[[int, float], None]
 """Called after every step: steps done, running mean of the L1 distance from the finished edit."""
@@ -140,6 +150,7 @@ def optimise(
     settings: PgsSettings,
     on_step: OnStep | None = None,
     state: PgsState | None = None,
+    renewal: Renewal | None = None,
 ) -> Iterator[Snapshot]:
     """Optimise the member rows towards each stage in turn, and yield recordings.
 
@@ -155,6 +166,7 @@ def optimise(
         settings: see PgsSettings
         on_step: progress; here, and only here, the state is whole and may be saved
         state: where to go on from, changed in place; None: from the original
+        renewal: takes the place of a stage's targets while it runs
 
     Raises:
         FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
@@ -175,12 +187,19 @@ def optimise(
         change, reach = _way(stage.targets, before)
         spacing = change * len(stages) / settings.snapshots
         size = min(1.5, max(0.25, reach / settings.reach)) if settings.reach > 0 else 1.0
+        targets = stage.targets
         while state.local < stage.steps:
+            if renewal is not None:
+                placed = stage.place(state.average).detach()
+                renewed = renewal(state.step, state.local, stage.strength, placed)
+                if renewed is not None:
+                    targets = renewed
+                    objective.begin_stage()
             view = state.view(len(crops))
             share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
             arrived = share >= 1.0
-            target = stage.targets[view] if arrived else torch.lerp(before[view], stage.targets[view], share)
-            image, _ = crops[view].render(original + state.moved, moving)
+            target = targets[view] if arrived else torch.lerp(before[view], targets[view], share)
+            image, _ = crops[view].render(original + stage.place(state.moved), moving)
             left = float(l1(image.detach(), stages[-1].targets[view]))
             terms = objective.terms(
                 Moment(image, target, view, state.step, state.local, arrived, state.moved, state.previous)
@@ -190,14 +209,16 @@ def optimise(
             state.running = left if math.isnan(state.running) else 0.95 * state.running + 0.05 * left
             length = size * _rate_factor(settings, state.step, state.local, stage.steps)
             state.descend(gradient, settings.rates, length, settings.damped, settings.smoothing)
+            state.hold_growth(settings.growth)
 
             last = state.local == stage.steps
             if last or state.local % 2:
-                pictures = render_all(probes, original + state.average, moving)
+                offsets = stage.place(state.average)
+                pictures = render_all(probes, original + offsets, moving)
                 if last or _mean_distance(pictures, state.pictures) >= spacing:
                     state.pictures = pictures
                     state.recorded += 1
-                    yield Snapshot(state.step, index, last, state.average.clone(), state.means.read())
+                    yield Snapshot(state.step, index, last, offsets.clone(), state.means.read())
             if on_step is not None:
                 on_step(state.step, state.running)
         state.stage, state.local = index + 1, 0

@@ -17,6 +17,7 @@ PRESETS: Mapping[Preset, Mapping[str, Any]] = {
         "stages": 1,
         "views": 96,
         "rates": "3dgs",
+        "group_steps": 0,
         "perceptual_weight": 1.0,
         "perceptual_every": 1,
         "progressive": "decay",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,14 +12,15 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.framing import scene_sphere
 from progdf.gaussians import BASE_CHANNELS, pack
-from trainer.crops import crop_scene, moving_attributes, render_all
+from trainer.crops import CropScene, crop_scene, moving_attributes, render_all
 from trainer.descent import PgsState
 from trainer.editors.base import EditKind
+from trainer.groups import Groups, group_stage, restored_groups, way
 from trainer.interrupts import held
 from trainer.losses import Perceptual, eroded
 from trainer.objective import Losses, Objective, loss_table
 from trainer.options import TrainOptions
-from trainer.pgs import Snapshot, Stage, optimise
+from trainer.pgs import Renewal, Snapshot, Stage, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
 from trainer.settings import loss_weights, pgs_settings
@@ -89,6 +90,7 @@ def trained(
     perceptual: Perceptual,
     folder: StateFolder,
     log: RunLog,
+    renewal: Renewal | None = None,
 ) -> tuple[Trajectory, Losses]:
     """Optimise the members, from the beginning or from where the saved state stands.
 
@@ -100,6 +102,7 @@ def trained(
         perceptual: distance of pictures
         folder: where the state is saved
         log: where progress is told
+        renewal: see `pgs.Renewal`
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -115,6 +118,10 @@ def trained(
         Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
         for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
     ]
+    groups = None
+    if kind == "geometry" and options.group_steps:
+        groups = _groups(options, original, crops, [stage.targets for stage in stages], folder, log)
+        stages = [groups.stage(original, stage, index) for index, stage in enumerate(stages)]
     extent = 2.0 * scene_sphere(scene[members])[1]
     settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
     inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
@@ -137,7 +144,7 @@ def trained(
 
         try:
             for found in optimise(
-                original, crops, probes(stand), stages, objective, settings, step_done, state
+                original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
             ):
                 recordings.add(found)
         except FloatingPointError as error:
@@ -152,7 +159,31 @@ def trained(
     log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
     log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
-    return record(snapshots, state.average.clone(), list(edited)), losses
+    end = stages[-1].place(state.average).clone()
+    if groups is not None:
+        ends = [made for made in recordings.made if made.ends_stage]
+        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
+        snapshots = way(original, groups, offsets, [made.step for made in ends], settings.snapshots)
+    return record(snapshots, end, list(edited)), losses
+
+
+def _groups(
+    options: TrainOptions,
+    original: Tensor,
+    crops: Sequence[CropScene],
+    targets: Sequence[Sequence[Tensor]],
+    folder: StateFolder,
+    log: RunLog,
+) -> Groups:
+    """The group stage, or what was saved of it."""
+    done = folder.load("groups")
+    if done is not None:
+        return restored_groups(original, done.tensors)
+    groups = group_stage(original, crops, targets, options.group_steps, options.seed)
+    folder.save("groups", groups.saved(), {})
+    for line in groups.lines():
+        log.say(line)
+    return groups
 
 
 def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Trajectory:

@@ -88,13 +88,21 @@ def darkened(stops: float = 3.0) -> AnalyticEdit:
     return AnalyticEdit("night", change)
 
 
-def grown(factor: float, pivots: Tensor) -> AnalyticEdit:
-    """Scale about the nearest of `pivots` [P,3]: centres move straight, log-scales by log of the size."""
+def grown(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
+    """Scale about the nearest of `pivots` [P,3]: centres move straight, log-scales by log of the size.
+
+    Args:
+        factor: size at strength 1
+        pivots: points that stay where they are, but for the shift. [P,3]
+        shift: what all is moved by besides, world units; None: nothing. [3]
+    """
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         size = 1 + strength * (factor - 1)
         centre = _nearest(part.means, pivots)
         means = centre + size * (part.means - centre)
+        if shift is not None:
+            means = means + strength * shift.to(means)
         return replace(part, means=means, log_scales=part.log_scales + math.log(size))
 
     return AnalyticEdit("grow", change)
