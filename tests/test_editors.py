@@ -17,7 +17,7 @@ from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from tests.trained import WHITE, small
 from trainer.editors import EDITORS, check_editor, make_editor
 from trainer.editors.procedural import StripesEditor, recolored
-from trainer.views import choose_views, make_view, named, split_views
+from trainer.views import make_view
 
 PROCEDURAL = ("recolor:#3060d0", "tint:#d4af37", "stripes:#20a040", "darken:0.7", "night")
 
@@ -93,8 +93,10 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     scene = replace(matt, sh0=matt.sh0.index_copy(0, rows, rgb_to_sh0(painted)))
     for view in views:
         expected = render(scene, view.camera).clamp(0, 1)
+        difference = (editor.edit(view, 1.0) - expected).abs().amax(dim=2)
         # a pixel's colours are cut at 1 before they are edited, the members' are not
-        assert float((editor.edit(view, 1.0) - expected).abs().max()) < 0.02
+        assert float(difference.max()) < 0.05
+        assert float((difference > 0.02).float().mean()) < 0.001
     share = float((editor.pattern > 0.5).float().mean())
     assert 0.3 < share < 0.7, "stripes, with the old colour between them"
 
@@ -172,64 +174,3 @@ def test_an_edit_of_the_whole_picture_is_confined_to_the_region() -> None:
     assert torch.equal(confined[view.mask == 0], view.image[view.mask == 0])
     inside = view.mask > 0.5
     assert torch.allclose(confined[inside], 1.0 - view.image[inside], atol=1e-6)
-
-
-def test_a_box_grows_to_what_an_edit_changes() -> None:
-    view = small().views[0]
-    moved = view.image.clone()
-    moved[0, 0] = 1.0 - moved[0, 0]
-    x0, y0, x1, y1 = view.widened([moved, view.image]).box
-    rows, columns = (view.mask > 0.05).nonzero().unbind(dim=1)
-    assert (x0, y0) == (0, 0)
-    assert x1 > int(columns.max())
-    assert y1 > int(rows.max())
-    assert view.widened([view.image]).box == view.box
-
-
-def test_the_rig_covers_a_small_region_with_pixels() -> None:
-    case = small("scarf", size=1500)
-    for view in case.views:
-        x0, y0, x1, y1 = view.box
-        width, height = view.camera.width, view.camera.height
-        assert max((x1 - x0) / width, (y1 - y0) / height) > 0.4
-
-
-def test_a_camera_that_looks_away_is_left_out() -> None:
-    case = small()
-    camera = case.views[0].camera
-    turned = replace(
-        camera, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.viewmat, name="x"
-    )
-    cameras = [turned, *(view.camera for view in case.views)]
-    chosen = choose_views(case.scene, case.region, cameras, 96, WHITE)
-    assert "x" not in {view.camera.name for view in chosen}
-    with pytest.raises(ProgdfError, match="sees the region"):
-        choose_views(case.scene, case.region, [turned], 96, WHITE)
-
-
-def test_fewer_views_than_there_are_cameras_are_spread_around_the_region() -> None:
-    case = small(count=6)
-    chosen = choose_views(case.scene, case.region, [view.camera for view in case.views], 3, WHITE)
-    centre = case.scene.means[case.region.members].mean(dim=0)
-    directions = torch.nn.functional.normalize(
-        torch.stack([view.camera.position - centre for view in chosen]), dim=1
-    )
-    assert len(chosen) == 3
-    assert float((directions @ directions.T - torch.eye(3)).max()) < 0.8
-
-
-def test_view_names_are_distinct_and_can_be_file_names() -> None:
-    camera = small().views[0].camera
-    names = ["images/a.png", "a.jpg", "", "x/../..", "b c"]
-    found = [c.name for c in named([replace(camera, name=name) for name in names])]
-    assert len(set(found)) == len(found)
-    assert found[0] == "a"
-    assert not any("/" in name or name.startswith(".") for name in found)
-
-
-def test_held_out_views_are_not_trained_on() -> None:
-    case = small(count=6)
-    train, held_out = split_views(case.views, 2)
-    assert len(train) == 4
-    assert len(held_out) == 2
-    assert not {v.camera.name for v in train} & {v.camera.name for v in held_out}

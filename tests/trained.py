@@ -15,7 +15,8 @@ from progdf.ply import save_ply
 from progdf.region import Region, from_mask
 from progdf.scenes import bear
 from trainer.options import TrainOptions
-from trainer.views import View, choose_views, region_rig
+from trainer.view_choice import choose_views
+from trainer.views import View, region_rig
 
 WHITE = torch.ones(3)
 
@@ -37,7 +38,7 @@ def small(part: str = "scarf", size: int = 1500, count: int = 6, image_size: int
     mask[demo.members(part)] = True
     region = from_mask(part, mask)
     cameras = region_rig(demo.gaussians, region, count + count // 2, image_size)
-    return Small(demo.gaussians, region, tuple(choose_views(demo.gaussians, region, cameras, count, WHITE)))
+    return Small(demo.gaussians, region, choose_views(demo.gaussians, region, cameras, count, WHITE).views)
 
 
 def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from progdf.camera_files import load_cameras
+from progdf.errors import ProgdfError
+from progdf.framing import guess_up, is_surrounding
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.artefacts import RunFolder, write_views
@@ -17,7 +19,8 @@ from trainer.editors import EditorSettings, ImageEditor
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.progress import Advance
-from trainer.views import View, choose_views, fit_size, named, region_rig, split_views
+from trainer.view_choice import choose_views, split_views
+from trainer.views import View, fit_size, named, region_rig
 
 BACKGROUND = (1.0, 1.0, 1.0)
 _PROBES = 3
@@ -28,26 +31,42 @@ Pictures = Mapping[float, Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class Stand:
-    """The scene, the region, and the views on it."""
+    """The scene, the region, the views on it, and what is to be said of these."""
 
     scene: Gaussians
     region: Region
     train: Sequence[View]
     held_out: Sequence[View]
     background: Tensor
+    notes: Sequence[str] = ()
 
 
 def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand:
-    """The views: the given cameras, or a rig that looks at the region."""
+    """The views: the best of the given cameras, or of a rig that looks at the region.
+
+    Raises:
+        ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
+    """
     background = torch.tensor(BACKGROUND)
     if options.cameras is not None:
         cameras = [fit_size(camera, options.image_size) for camera in load_cameras(options.cameras)]
+    elif is_surrounding(scene, guess_up(scene)):
+        raise ProgdfError(
+            f"{options.scene} looks like a scene to stand inside, which cameras around it cannot show; "
+            "give its own with --cameras (cameras.json, transforms.json or a COLMAP folder)"
+        )
     else:
         # half as many again, as some will find the region hidden
         cameras = region_rig(scene, region, options.views + options.views // 2, options.image_size)
-    views = choose_views(scene, region, named(cameras), options.views, background)
-    train, held_out = split_views(views, max(1, len(views) // 5))
-    return Stand(scene, region, train, held_out, background)
+    choice = choose_views(scene, region, named(cameras), options.views, background)
+    train, held_out = split_views(choice, max(1, len(choice.views) // 5))
+    notes = [choice.line()] if len(choice.views) < choice.offered else []
+    if any(view.camera.lens for view in choice.views):
+        notes.append(
+            "the cameras have lenses that bend photographs, the views here are straight: "
+            "edited copies of photographs go in with --editor photographs:DIR"
+        )
+    return Stand(scene, region, train, held_out, background, notes)
 
 
 def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:

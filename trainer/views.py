@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at, orbit_rig
-from progdf.errors import ProgdfError
 from progdf.framing import guess_up, scene_sphere
 from progdf.gaussians import Gaussians
 from progdf.rasterize import Crop, rasterize
@@ -20,7 +19,6 @@ from progdf.sh import shade
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
-_LEAST_COVER = 0.25  # of what the median view shows of the region; a view that shows less is dropped
 
 
 @dataclass(frozen=True)
@@ -146,43 +144,6 @@ def region_rig(scene: Gaussians, region: Region, count: int, image_size: int) ->
     return cameras
 
 
-def choose_views(
-    scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int, background: Tensor
-) -> list[View]:
-    """Up to `count` of the cameras that see the region best spread around it.
-
-    A view that shows less than a quarter of what the median view shows of the region is left out (it is
-    hidden there, or outside the picture); of the others the farthest from those already taken comes next.
-
-    Raises:
-        ProgdfError: no camera sees the region.
-    """
-    views = [make_view(scene, region, camera, background) for camera in cameras]
-    cover = torch.tensor([float((view.mask > _SEEN).float().mean()) for view in views])
-    seen = cover[cover > 0]
-    if not len(seen):
-        raise ProgdfError(
-            f"none of the {len(views)} cameras sees the region '{region.name}'; give cameras that look at it"
-        )
-    good = [i for i in range(len(views)) if float(cover[i]) >= _LEAST_COVER * float(seen.median())]
-    if len(good) > count:
-        centre = scene.means[region.members].median(dim=0).values
-        eyes = torch.stack([views[i].camera.position - centre for i in good])
-        good = [good[k] for k in _spread(torch.nn.functional.normalize(eyes, dim=1), count)]
-    return [views[i] for i in good]
-
-
-def split_views(views: Sequence[View], held_out: int) -> tuple[list[View], list[View]]:
-    """Training views and held-out views, the latter evenly spaced through the list."""
-    held_out = min(held_out, len(views) // 3)
-    if held_out <= 0:
-        return list(views), list(views)
-    every = len(views) / held_out
-    chosen = {int((k + 0.5) * every) for k in range(held_out)}
-    train = [view for i, view in enumerate(views) if i not in chosen]
-    return train, [views[i] for i in sorted(chosen)]
-
-
 def fit_size(camera: Camera, image_size: int) -> Camera:
     """The camera with its longer side at `image_size` pixels, never enlarged."""
     scale = image_size / max(camera.width, camera.height)
@@ -203,13 +164,3 @@ def named(cameras: Sequence[Camera]) -> list[Camera]:
         taken.add(name)
         result.append(replace(camera, name=name))
     return result
-
-
-def _spread(directions: Tensor, count: int) -> list[int]:
-    """Farthest-point sampling of unit vectors, in the order of the list. [n,3] -> indices"""
-    taken = [0]
-    nearest = (directions - directions[0]).norm(dim=1)
-    while len(taken) < count:
-        taken.append(int(nearest.argmax()))
-        nearest = torch.minimum(nearest, (directions - directions[taken[-1]]).norm(dim=1))
-    return sorted(taken)
