@@ -17,8 +17,9 @@ from progdf.ply import load_ply
 from progdf.rasterize import render, set_threads
 from progdf.region import Region
 from progdf.region_spec import parse_region
+from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
-from trainer.editors import check_editor, make_editor
+from trainer.editors import VIEW_BY_VIEW, check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
@@ -38,6 +39,7 @@ from trainer.preparation import (
     widened,
 )
 from trainer.progress import RunLog
+from trainer.reedit import reedit
 from trainer.resume import one_line, open_session, plain_options
 from trainer.settings import loss_weights
 from trainer.training import retimed, trained
@@ -113,7 +115,9 @@ def _trained(
         train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
         stand = widened(stand, train_edits)
     if folder.state.load("recorded") is None:
-        _record(options, stand, train_edits, kind, perceptual, folder, log)
+        with log.stage("agree"):
+            agreement = _agreement(options, stand, edited, kind, log)
+        _record(options, stand, train_edits, kind, perceptual, folder, log, agreement)
         folder.state.save("recorded", {}, {})
     trajectory, _, about = load_trajectory(folder.trajectory)
     measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
@@ -162,6 +166,18 @@ def _edited(
     return edited, kind
 
 
+def _agreement(
+    options: TrainOptions, stand: Stand, edited: Pictures, kind: EditKind, log: RunLog
+) -> Agreement | None:
+    """Whether the edited views agree, told in the log; None where an editor cannot but edit all alike."""
+    if kind == "geometry" or check_editor(options.editor)[0] not in VIEW_BY_VIEW:
+        return None
+    count = len(stand.train)
+    found = measured(stand, edited[1.0][:count], edited[1.0][count:])
+    log.say(found.told(check_editor(options.editor)[0]))
+    return found
+
+
 def _record(
     options: TrainOptions,
     stand: Stand,
@@ -170,12 +186,14 @@ def _record(
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
+    agreement: Agreement | None,
 ) -> None:
     """Optimise, and write the trajectory and the finished edit's views."""
     objective = loss_weights(options, kind).described(perceptual.name)
     log.say(f"loss: {objective}")
     with log.stage("optimise"):
-        trajectory, losses = trained(options, stand, edited, kind, perceptual, folder.state, log)
+        renewal = reedit(options, stand, kind, folder, log)
+        trajectory, losses = trained(options, stand, edited, kind, perceptual, folder.state, log, renewal)
     with log.stage("retime"):
         channels = trajectory.end.shape[1]
         judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
@@ -193,6 +211,7 @@ def _record(
         "objective": objective,
         "losses": losses,
         "attribute_worth_db": costs,
+        "agreement": agreement.figures() if agreement is not None else None,
     }
     scene, region = stand.scene, stand.region
     save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)
