@@ -28,6 +28,7 @@ from progdf.files import open_failure, written_whole
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians
 from progdf.region import Region
 from progdf.region_packing import packed_region, unpacked_region
+from progdf.tensor_file import write_tensors
 
 FORMAT = 1
 """Version of the file format that is written; older ones down to 1 are read."""
@@ -146,10 +147,9 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         allow_nan=False,
     )
     metadata = {"progdf": header, "sha256": _checksum(header, tensors)}
-    content = safetensors.torch.save(tensors, metadata)
     try:
         with written_whole(path) as beside:
-            beside.write_bytes(content)
+            write_tensors(beside, tensors, metadata)
     except OSError as error:
         raise ProgdfError(
             f"{path} cannot be written ({error.strerror or error}); choose another place"

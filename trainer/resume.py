@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from safetensors import SafetensorError
 
 from progdf.errors import ProgdfError
 from progdf.region import Region
@@ -98,14 +97,15 @@ def one_line(folder: RunFolder) -> Iterator[None]:
         raise KeyboardInterrupt(
             f"what is done is kept in {folder.root}; give the same command with --resume to go on"
         ) from None
-    except (OSError, SafetensorError, ProgdfError) as error:
+    except (OSError, ProgdfError) as error:
         if not folder.state.path.is_dir():
             raise ProgdfError(
                 f"{folder.state.path} was removed while the run was in need of it; train again"
             ) from error
-        if isinstance(error, ProgdfError):
+        cause = error.__cause__ if isinstance(error, ProgdfError) else error
+        if not isinstance(cause, OSError) or (cause.errno not in _FULL and isinstance(error, ProgdfError)):
             raise
-        raise ProgdfError(f"{_trouble(error, folder.root)}, then go on with --resume") from error
+        raise ProgdfError(f"{_trouble(cause, folder.root)}, then go on with --resume") from error
 
 
 def plain_options(options: TrainOptions) -> dict[str, Any]:
@@ -158,12 +158,7 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _trouble(error: OSError | SafetensorError, root: Path) -> str:
-    if isinstance(error, SafetensorError):  # its words for an OSError
-        full = "os error 28" in str(error) or "os error 27" in str(error)
-        reason = str(error)
-    else:
-        full, reason = error.errno in _FULL, error.strerror or str(error)
-    if full:
+def _trouble(error: OSError, root: Path) -> str:
+    if error.errno in _FULL:
         return f"the disk of {root} is full; free some space"
-    return f"{root} cannot be written ({reason}); mend that"
+    return f"{root} cannot be written ({error.strerror or error}); mend that"

@@ -22,11 +22,11 @@ from typing import Any, Protocol
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
+from progdf.tensor_file import write_tensors
 
 SHARE = 0.01
 """Of the time, at most, that saving the state may take."""
@@ -112,10 +112,7 @@ class StateFolder:
             path.parent.mkdir(exist_ok=True)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
         with written_whole(path) as beside:
-            try:
-                save_file({k: t.detach().contiguous() for k, t in tensors.items()}, beside, metadata=header)
-            except SafetensorError as error:  # its words for an OSError
-                raise OSError(f"{path} cannot be written ({error})") from error
+            write_tensors(beside, tensors, header)
             _flush(beside)
 
     def load(self, part: str, index: int | None = None) -> Saved | None:

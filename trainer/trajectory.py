@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
+from progdf.tensor_file import write_tensors
 
 Slider = Literal["stages", "even", "time"]
 
@@ -192,7 +192,7 @@ def save_trajectory(
     }
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
     with written_whole(path) as beside:
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, beside, metadata=header)
+        write_tensors(beside, tensors, header)
 
 
 def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:

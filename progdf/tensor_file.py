@@ -1,0 +1,54 @@
+"""Writing safetensors files whose bytes depend on what is in them and on nothing else.
+
+The safetensors library writes the metadata in an order that differs from run to run, so the same training
+would give a file with another hash each time. Reading is left to the library.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+_TYPES = {
+    torch.float64: "F64",
+    torch.int64: "I64",
+    torch.float32: "F32",
+    torch.int32: "I32",
+    torch.float16: "F16",
+    torch.int16: "I16",
+    torch.int8: "I8",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write a safetensors file: header size (8 bytes, little endian), JSON header, the tensors' bytes.
+
+    Args:
+        path: where to; see `files.written_whole` for a file that is whole or absent
+        tensors: by name, of the types in the table above; on the CPU
+        metadata: texts by name
+
+    Raises:
+        KeyError: a tensor of another type.
+        OSError: the place cannot be written.
+    """
+    # the widest types first, so that everything is aligned
+    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))
+    header: dict[str, object] = {"__metadata__": dict(sorted(metadata.items()))}
+    end = 0
+    for name, tensor in ordered:
+        start, end = end, end + tensor.numel() * tensor.element_size()
+        shape = list(tensor.shape)
+        header[name] = {"dtype": _TYPES[tensor.dtype], "shape": shape, "data_offsets": [start, end]}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    with path.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for _, tensor in ordered:
+            file.write(tensor.detach().contiguous().reshape(-1).view(torch.uint8).numpy().data)
