@@ -105,7 +105,11 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
                     f"{root} holds a run with another {what} ({earlier.get(what)}); "
                     "give --out another folder, or delete this one"
                 )
-    root.mkdir(parents=True, exist_ok=True)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise ProgdfError(f"{root} cannot be made ({reason}); give --out a place to write to") from error
     return folder
 
 
@@ -161,7 +165,15 @@ def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: flo
     Raises:
         ProgdfError: one is missing or broken.
     """
-    return [read_picture(folder.view(kind, name, strength)) for name in names]
+    pictures = []
+    for name in names:
+        path = folder.view(kind, name, strength)
+        try:
+            pictures.append(read_picture(path))
+        except ProgdfError as error:
+            what = "is damaged" if path.is_file() else "is gone"
+            raise ProgdfError(f"{path} {what}; train again, with --resume if the run was stopped") from error
+    return pictures
 
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:

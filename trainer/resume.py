@@ -98,14 +98,26 @@ def one_line(folder: RunFolder) -> Iterator[None]:
             f"what is done is kept in {folder.root}; give the same command with --resume to go on"
         ) from None
     except (OSError, ProgdfError) as error:
-        if not folder.state.path.is_dir():
-            raise ProgdfError(
-                f"{folder.state.path} was removed while the run was in need of it; train again"
-            ) from error
-        cause = error.__cause__ if isinstance(error, ProgdfError) else error
-        if not isinstance(cause, OSError) or (cause.errno not in _FULL and isinstance(error, ProgdfError)):
+        cause = error if isinstance(error, OSError) else error.__cause__
+        full = isinstance(cause, OSError) and cause.errno in _FULL
+        if full:
+            trouble = f"the disk of {folder.root} is full; free some space"
+        elif isinstance(error, OSError):
+            trouble = f"{folder.root} cannot be written ({error.strerror or error}); make it writable"
+        else:
             raise
-        raise ProgdfError(f"{_trouble(cause, folder.root)}, then go on with --resume") from error
+        raise ProgdfError(f"{trouble}, then go on with --resume") from error
+
+
+@contextmanager
+def still_there(folder: RunFolder) -> Iterator[None]:
+    """If the run's folder is removed meanwhile, that is what the person is told."""
+    try:
+        yield
+    except (OSError, ProgdfError) as error:
+        if folder.state.path.is_dir():
+            raise
+        raise ProgdfError(f"{folder.state.path} was removed during the run; train again") from error
 
 
 def plain_options(options: TrainOptions) -> dict[str, Any]:
@@ -156,9 +168,3 @@ def _saved_step(folder: RunFolder) -> int:
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _trouble(error: OSError, root: Path) -> str:
-    if error.errno in _FULL:
-        return f"the disk of {root} is full; free some space"
-    return f"{root} cannot be written ({error.strerror or error}); mend that"

@@ -40,7 +40,7 @@ from trainer.preparation import (
 )
 from trainer.progress import RunLog
 from trainer.reedit import reedit
-from trainer.resume import one_line, open_session, plain_options
+from trainer.resume import one_line, open_session, plain_options, still_there
 from trainer.settings import loss_weights
 from trainer.training import retimed, trained
 from trainer.trajectory import load_trajectory, save_trajectory
@@ -75,7 +75,8 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
             if session.does == "nothing":
                 return _found(folder, options, scene, log)
             use_threads(session.threads)
-            result = _trained(options, scene, region, folder, log)
+            with still_there(folder):
+                result = _trained(options, scene, region, folder, log)
             folder.state.end()
             return result
         except KeyboardInterrupt:
@@ -143,12 +144,13 @@ def _edited(
     views = [*stand.train, *stand.held_out]
     names = [view.camera.name for view in views]
     done = folder.state.load("edited")
-    if done is not None and all(
-        folder.view("edited", name, s).is_file() for s in done.values["strengths"] for name in names
-    ):
-        log.say("the edited views are on disk")
-        pictures = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
-        return pictures, done.values["kind"]
+    if done is not None:
+        try:
+            edited = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
+            log.say("the edited views are on disk")
+            return edited, done.values["kind"]
+        except ProgdfError as error:
+            log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
     strengths = strengths_to_ask(editor, options.stages)
     kind: EditKind = editor.kind if options.kind == "auto" else options.kind
