@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+_QWEN = [f"<|{name}|>" for name in ("endoftext", "im_start", "im_end")]
 _WORDS = ["<|startoftext|>", "<|endoftext|>", *(chr(c) for c in range(33, 127))]
 
 
@@ -203,7 +204,7 @@ def _qwen_tokenizer(folder: Path) -> Any:
 
     folder.mkdir(parents=True, exist_ok=True)
     letters = [chr(c) for c in range(33, 127)] + ["Ġ", "Ċ"]
-    vocab = {word: i for i, word in enumerate([*letters, "<|endoftext|>", "<|im_start|>", "<|im_end|>"])}
+    vocab = {word: i for i, word in enumerate([*letters, *_QWEN])}
     (folder / "vocab.json").write_text(json.dumps(vocab))
     (folder / "merges.txt").write_text("#version: 0.2\n")
     tokenizer = Qwen2Tokenizer.from_pretrained(folder, model_max_length=77)

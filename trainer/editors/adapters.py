@@ -29,6 +29,7 @@ class Adapter:
         dtype: of its weights on a CPU
         always: further arguments of a call
         loading: further arguments of its from_pretrained
+        needs: packages that it needs besides the extra's
     """
 
     model: str
@@ -40,6 +41,7 @@ class Adapter:
     image_guidance: float | None = None
     always: Mapping[str, object] = field(default_factory=dict)
     loading: Mapping[str, object] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
 
     def arguments(
         self, prompt: str, picture: Image.Image, steps: int, guidance: float, image_guidance: float | None
@@ -99,6 +101,7 @@ ADAPTERS: dict[str, Adapter] = {
         size=1024,
         dtype=torch.bfloat16,
         always={"negative_prompt": " "},  # without one it has no guidance at all
+        needs=("torchvision",),
     ),
 }
 """Class name in diffusers, as a saved pipeline's model_index.json has it → how it is asked."""

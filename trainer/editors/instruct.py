@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,19 @@ from trainer.editors.kept import KeptPictures, Recipe
 from trainer.views import View
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """One sentence for one model, nothing left open."""
+
+    prompt: str
+    adapter: Adapter
+    steps: int
+    guidance: float
+    image_guidance: float | None
+    size: int
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -84,29 +99,29 @@ def instruct(
         raise ProgdfError('instruct: says nothing; write instruct:"turn him into Batman"')
     model = settings.model or DEFAULT_MODEL
     kind = pipeline_class(model)
-    adapter = ADAPTERS[kind]
-    settings = _completed(settings, adapter, model)
+    asked = _asked(prompt, model, kind, settings)
 
     @cache
     def pipeline() -> Any:
         return load_pipeline(model, kind)
 
-    def paint(picture: Tensor, guidance: float) -> Tensor:
-        return _painted(pipeline(), adapter, prompt, picture, settings, guidance)
-
     recipe: Recipe = {
         "instruct": prompt,
         "model": model,
         "pipeline": kind,
-        "image_guidance": settings.image_guidance,
-        "steps": settings.steps,
-        "size": settings.size,
-        "seed": settings.seed,
+        "image_guidance": asked.image_guidance,
+        "steps": asked.steps,
+        "size": asked.size,
+        "seed": asked.seed,
     }
-    assert settings.guidance is not None
-    dial = settings.dial == "guidance" and settings.guidance > 1.0
-    stages = () if dial else (1.0,)
-    return InstructEditor(paint, settings.guidance, recipe, KeptPictures(settings.kept), stages)
+    dial = settings.dial == "guidance" and asked.guidance > 1.0
+    return InstructEditor(
+        lambda picture, guidance: _painted(pipeline(), asked, picture, guidance),
+        asked.guidance,
+        recipe,
+        KeptPictures(settings.kept),
+        stages=() if dial else (1.0,),
+    )
 
 
 def pipeline_class(model: str) -> str:
@@ -127,6 +142,9 @@ def pipeline_class(model: str) -> str:
         raise _missing(model) from error
     if kind not in ADAPTERS:
         raise ProgdfError(f"{model} is a {kind}, which edits no pictures here; use one of {_models()}")
+    for package in ADAPTERS[kind].needs:
+        if find_spec(package) is None:
+            raise ProgdfError(f"{model} needs the package {package}; pip install {package}")
     return str(kind)
 
 
@@ -159,39 +177,38 @@ def load_pipeline(model: str, kind: str) -> Any:
     return pipeline.to("cuda" if gpu else "cpu")
 
 
-def _painted(
-    pipeline: Any, adapter: Adapter, prompt: str, view: Tensor, settings: EditorSettings, guidance: float
-) -> Tensor:
+def _painted(pipeline: Any, asked: _Asked, view: Tensor, guidance: float) -> Tensor:
     """One picture through a pipeline, back at its own size. [H,W,3] -> [H,W,3]"""
     source = to_picture(view)
-    assert settings.size is not None
-    scale = settings.size / max(source.size)
-    size = tuple(max(_MULTIPLE, round(side * scale / _MULTIPLE) * _MULTIPLE) for side in source.size)
-    picture = source.resize((size[0], size[1]), Image.Resampling.LANCZOS)
-    assert settings.steps is not None
-    asked = adapter.arguments(prompt, picture, settings.steps, guidance, settings.image_guidance)
+    scale = asked.size / max(source.size)
+    width, height = (max(_MULTIPLE, round(side * scale / _MULTIPLE) * _MULTIPLE) for side in source.size)
+    picture = source.resize((width, height), Image.Resampling.LANCZOS)
+    arguments = asked.adapter.arguments(asked.prompt, picture, asked.steps, guidance, asked.image_guidance)
     # the same noise in every view: what the picture leaves open is then decided alike
-    noise = torch.Generator().manual_seed(settings.seed)
-    edited = pipeline(**asked, generator=noise).images[0]
+    noise = torch.Generator().manual_seed(asked.seed)
+    edited = pipeline(**arguments, generator=noise).images[0]
     edited = edited.convert("RGB").resize(source.size, Image.Resampling.LANCZOS)
     return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)
 
 
-def _completed(settings: EditorSettings, adapter: Adapter, model: str) -> EditorSettings:
-    """The settings with the adapter's own values where nothing was said."""
+def _asked(prompt: str, model: str, kind: str, settings: EditorSettings) -> _Asked:
+    """The settings, with the model's own values where nothing was said."""
+    adapter = ADAPTERS[kind]
     if settings.image_guidance is not None and "image_guidance" not in adapter.words:
         raise ProgdfError(f"{model} knows no --image-guidance; leave it out, or use --model {DEFAULT_MODEL}")
-    return replace(
-        settings,
+    return _Asked(
+        prompt,
+        adapter,
+        steps=adapter.steps if settings.steps is None else settings.steps,
         guidance=adapter.guidance if settings.guidance is None else settings.guidance,
         image_guidance=adapter.image_guidance if settings.image_guidance is None else settings.image_guidance,
-        steps=adapter.steps if settings.steps is None else settings.steps,
         size=adapter.size if settings.size is None else settings.size,
+        seed=settings.seed,
     )
 
 
 def _missing(model: str) -> ProgdfError:
-    if model.startswith((".", "/", "~")):
+    if model.startswith((".", "/", "~")) or Path(model).is_dir():
         return ProgdfError(
             f"{model} holds no whole diffusers pipeline with safetensors weights; "
             f"give --model such a folder, or one of {_models()}"
