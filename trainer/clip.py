@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pad
 
 from progdf.errors import ProgdfError
+from trainer.options import CLIP_MODEL
 
-MODEL = "openai/clip-vit-large-patch14"
 EXTRA = "pip install progdf-studio[clip]"
 
 _MEAN, _SPREAD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of CLIP's input
@@ -59,7 +59,7 @@ class Clip:
         return normalize(_features(features), dim=-1)
 
 
-def load_clip(model: str = MODEL) -> Clip:
+def load_clip(model: str = CLIP_MODEL) -> Clip:
     """Read CLIP from this machine.
 
     Args:
@@ -78,7 +78,9 @@ def load_clip(model: str = MODEL) -> Clip:
     try:
         config = AutoConfig.from_pretrained(model, local_files_only=True)
         if config.model_type != "clip":
-            raise ProgdfError(f"{model} is a {config.model_type} model, no CLIP; give --clip-model {MODEL}")
+            raise ProgdfError(
+                f"{model} is a {config.model_type} model, no CLIP; give --clip-model {CLIP_MODEL}"
+            )
         network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
         tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,13 +20,16 @@ from trainer.artefacts import RunFolder, read_views, write_json
 from trainer.fit import fit_field, visibility
 from trainer.judge import Judge, make_judge
 from trainer.losses import Perceptual
+from trainer.measures import Texts, clip_course, figures, measure
+from trainer.options import CLIP_MODEL
 from trainer.preparation import Stand
 from trainer.progress import RunLog
-from trainer.report import figures, measure, report_picture
+from trainer.report import report_picture
 from trainer.trajectory import Trajectory
 from trainer.views import View
 
 _RANK_VIEWS = 4
+_REPORT_ALONE = ("options", "time", "memory_mb", "memory_by_stage_mb", "curves")
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,10 @@ def finished(
     if not fitted.met:
         log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
     with log.stage("report"):
-        measured = measure(judge, fitted, perceptual)
+        clip = clip_course(judge, stand.held_out, field, texts(options))
+        if clip.reason and (options.get("text_before") or options.get("text_after")):
+            log.say(f"CLIP directional similarity is not measured: {clip.reason}")
+        measured = measure(judge, trajectory, fitted, perceptual, clip)
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
         endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
         title = f"{options['name']}: {options['editor']}"
@@ -91,12 +96,16 @@ def finished(
         "objective": about["objective"],
         "losses": about["losses"],
         "agreement": about.get("agreement"),
-        "time": {**(_earlier_times(folder) if log.refits else {}), **log.rounded_seconds()},
-        "memory_mb": _peak_memory_mb(),
+        "time": {**(_earlier(folder, "time") if log.refits else {}), **log.rounded_seconds()},
+        "memory_mb": log.memory.peak(),
+        "memory_by_stage_mb": {
+            **(_earlier(folder, "memory_by_stage_mb") if log.refits else {}),
+            **log.memory.by_stage,
+        },
         "options": options,
     }
-    # the .gdf has the options beside it, and the same training writes the same file
-    own = {part: value for part, value in report.items() if part not in ("options", "time", "memory_mb")}
+    # the .gdf has the options beside it, is small, and the same training writes the same file
+    own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}
     save_gdf(folder.gdf(options["name"]), replace(gdf, report=own))
     write_json(folder.report, report)
     write_image(folder.picture, picture)
@@ -143,20 +152,17 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     return endpoint, change
 
 
-def _earlier_times(folder: RunFolder) -> dict[str, float]:
-    """Seconds of the stages that this command did not run again."""
+def texts(options: Mapping[str, Any]) -> Texts:
+    """What CLIP is asked: the options' texts; what a learned editor was told is what one sees after."""
+    kind, _, told = options["editor"].partition(":")
+    after = options.get("text_after") or (told.strip().strip("\"'") if kind == "instruct" else "")
+    return Texts(options.get("text_before", ""), after, options.get("clip_model") or CLIP_MODEL)
+
+
+def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
+    """Figures of the stages that this command did not run again."""
     try:
-        times = json.loads(folder.report.read_text(encoding="utf-8"))["time"]
-        return {str(stage): float(seconds) for stage, seconds in times.items()}
+        stages = json.loads(folder.report.read_text(encoding="utf-8"))[part]
+        return {str(stage): figure for stage, figure in stages.items() if isinstance(figure, int | float)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
-
-
-def _peak_memory_mb() -> int | None:
-    """Peak memory of this process in MB; None on Windows, whose Python cannot tell."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (1 << 20 if sys.platform == "darwin" else 1 << 10))

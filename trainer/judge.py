@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians, pack
+from progdf.metrics import ssim
 from progdf.region import Region
 from trainer.crops import CropScene, crop_scene, moving_attributes, render_all
 from trainer.losses import Perceptual
@@ -52,6 +53,15 @@ class Judge:
             error += float((a[pixels] - b[pixels]).double().square().sum())
             count += 3 * int(pixels.sum())
         return 99.0 if error <= 0 else min(99.0, -10 * math.log10(error / max(count, 1)))
+
+    def ssim(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+        """SSIM over the pixels that count, all views together, at most 1."""
+        total = count = 0.0
+        for a, b, pixels in zip(found, expected, self.pixels, strict=True):
+            if here := int(pixels.sum()):
+                total += here * float(ssim(a, b, pixels))
+                count += here
+        return total / count if count else 1.0
 
     def perceptual(self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual) -> float:
         """Mean perceptual distance of the boxes."""

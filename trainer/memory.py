@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -37,6 +38,12 @@ class PeakMemory:
         """Of the process so far, all stages and what lies between them; None where it cannot be told."""
         self._look()
         return round(self._highest) or None
+
+    def restore(self, by_stage: Mapping[str, int], peak: int | None) -> None:
+        """Take over the peaks of an earlier session of the same run."""
+        for stage, earlier in by_stage.items():
+            self.by_stage[stage] = max(earlier, self.by_stage.get(stage, 0))
+        self._highest = max(self._highest, peak or 0)
 
     def _look(self) -> None:
         now = _peak_mb()

@@ -18,6 +18,7 @@ from trainer.trajectory import Slider
 
 Preset = Literal["default", "paper"]
 
+CLIP_MODEL = "openai/clip-vit-large-patch14"
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
@@ -108,6 +109,13 @@ class TrainOptions:
     """Order of the views; the same seed gives the same files."""
     threads: int = 0
     """CPU threads; 0 takes all cores but one, at least one. More than there are idle cores is slower."""
+    text_before: str = ""
+    """What the views show before the edit, as "a bear"; with --text-after, CLIP directional similarity is
+    measured (ViT-L/14; pip install progdf-studio[clip])."""
+    text_after: str = ""
+    """What they show after it, as "a golden bear"; instruct: its sentence, if nothing is given."""
+    clip_model: str = CLIP_MODEL
+    """Id or folder of the CLIP model, downloaded before."""
     resume: bool = False
     """Go on with a run that was stopped in this folder; its result is that of a run that was not."""
     save_every: float = 10.0
@@ -126,6 +134,12 @@ class FitOptions:
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
     scene: Path | None = None
     """Where the scene is now, if it has moved since the run."""
+    text_before: str = ""
+    """As for progdf train; the run's own, if nothing is given."""
+    text_after: str = ""
+    """As for progdf train; the run's own, if nothing is given."""
+    clip_model: str = ""
+    """As for progdf train; the run's own, if nothing is given."""
     threads: int = 0
     """CPU threads; 0 takes all cores but one, at least one."""
 

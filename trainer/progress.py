@@ -17,6 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from trainer.memory import PeakMemory
 from trainer.state import Saved
 
 Advance = Callable[[int, str], None]
@@ -26,7 +27,8 @@ _EVERY_S = 5.0
 
 
 class RunLog:
-    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds.
+    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds
+    and peak memory.
 
     The seconds are part of a run's saved state (`state.Resumable`): those of all its sessions add up.
 
@@ -41,6 +43,7 @@ class RunLog:
         self.refits = refits
         self._earlier = 0.0
         self._running: dict[str, float] = {}
+        self.memory = PeakMemory()
         self._start = time.perf_counter()
         self._file = path.open("a", encoding="utf-8", buffering=1)
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
@@ -58,13 +61,15 @@ class RunLog:
         seconds = {
             name: self.seconds.get(name, 0.0) + running.get(name, 0.0) for name in self.seconds | running
         }
-        return Saved({}, {"seconds": seconds, "total": self._total()})
+        memory = {"by_stage": self.memory.by_stage, "peak": self.memory.peak()}
+        return Saved({}, {"seconds": seconds, "total": self._total(), "memory": memory})
 
     def restore(self, saved: Saved) -> None:
-        """Add the seconds of the sessions before."""
+        """Add the seconds of the sessions before, and remember their peaks of memory."""
         for name, seconds in saved.values["seconds"].items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
         self._earlier = saved.values["total"]
+        self.memory.restore(**saved.values["memory"])
 
     def say(self, text: str) -> None:
         """One line."""
@@ -78,9 +83,11 @@ class RunLog:
     def stage(self, name: str) -> Iterator[None]:
         """Measure a part of the run under `name`; a name that comes again adds up."""
         begun = self._running[name] = time.perf_counter()
+        self.memory.begin(name)
         try:
             yield
         finally:
+            self.memory.end(name)
             del self._running[name]
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
 

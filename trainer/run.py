@@ -265,7 +265,10 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
-        about = {**about, "options": {**trained, "field": options.field, "target_psnr": options.target_psnr}}
+        said = {"text_before": options.text_before, "text_after": options.text_after}
+        said = {name: text for name, text in {**said, "clip_model": options.clip_model}.items() if text}
+        now = {"field": options.field, "target_psnr": options.target_psnr, **said}
+        about = {**about, "options": {**trained, **now}}
         return finished(folder, stand, trajectory, about, perceptual, log, options.field)
     finally:
         log.close()
