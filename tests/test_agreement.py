@@ -1,0 +1,113 @@
+"""Whether edited views agree is told before training, and told right."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.rasterize import render
+from tests.trained import WHITE, Small, small
+from trainer.agreement import Agreement, measured
+from trainer.editors import make_editor
+from trainer.preparation import Stand
+
+
+@cache
+def stand() -> Stand:
+    case = body()
+    return Stand(case.scene, case.region, case.views[:-3], case.views[-3:], WHITE)
+
+
+def body() -> Small:
+    return small("body", count=12, image_size=96)
+
+
+def judged(pictures: list[Tensor]) -> Agreement:
+    count = len(stand().train)
+    return measured(stand(), pictures[:count], pictures[count:])
+
+
+def edited(spec: str) -> list[Tensor]:
+    case = body()
+    editor = make_editor(spec, case.scene, case.region, case.views)
+    return [editor.edit(view, 1.0) for view in case.views]
+
+
+def stripes_of_its_own(period: float, seed: int) -> list[Tensor]:
+    """Every view with stripes in another direction."""
+    rng = torch.Generator().manual_seed(seed)
+    pictures = []
+    for view in body().views:
+        angle, phase = math.pi * float(torch.rand((), generator=rng)), float(torch.rand((), generator=rng))
+        y, x = torch.meshgrid(
+            torch.arange(view.mask.shape[0]), torch.arange(view.mask.shape[1]), indexing="ij"
+        )
+        striped = ((x * math.cos(angle) + y * math.sin(angle)) / period + phase) % 1 < 0.5
+        pictures.append(
+            view.blended(torch.where(striped[..., None], torch.tensor([0.1, 0.6, 0.2]), view.inside))
+        )
+    return pictures
+
+
+@pytest.mark.parametrize("spec", ["recolor:#3060d0", "stripes:#20a040", "night"])
+def test_edits_that_are_the_same_from_everywhere_agree(spec: str) -> None:
+    found = judged(edited(spec))
+    assert found.agree
+    assert found.unexplained < 0.15
+    assert found.psnr > 22
+
+
+@pytest.mark.parametrize("period", [9, 18, 36])
+def test_stripes_painted_differently_in_every_view_disagree(period: float) -> None:
+    found = judged(stripes_of_its_own(period, seed=1))
+    assert not found.agree
+    assert found.unexplained > 0.45
+
+
+def test_another_hue_in_every_view_disagrees() -> None:
+    rng = torch.Generator().manual_seed(2)
+    pictures = []
+    for view in body().views:
+        hue = torch.rand(3, generator=rng)
+        pictures.append(view.blended(torch.lerp(view.inside, hue.expand_as(view.inside), 0.6)))
+    assert not judged(pictures).agree
+
+
+def test_differences_too_faint_to_see_are_no_disagreement() -> None:
+    rng = torch.Generator().manual_seed(3)
+    pictures = [
+        view.blended((view.inside + 0.02 * torch.randn(3, generator=rng)).clamp(0, 1))
+        for view in body().views
+    ]
+    found = judged(pictures)
+    assert found.psnr > 28
+    assert found.agree
+
+
+def test_colours_that_the_members_can_have_are_found() -> None:
+    case = body()
+    rng = torch.Generator().manual_seed(4)
+    changed = case.scene.sh0.clone()
+    changed[case.region.members] += 0.3 * torch.randn(len(case.region.members), 3, generator=rng)
+    scene = case.scene.__class__(**{**case.scene.__dict__, "sh0": changed})
+    pictures = [render(scene, view.camera, WHITE).clamp(0, 1) for view in case.views]
+    found = judged(pictures)
+    assert found.unexplained < 0.35, "noise in every Gaussian is the hardest that one scene can show"
+    assert found.agree
+
+
+def test_the_line_tells_decibels_share_and_remedy() -> None:
+    line = Agreement(psnr=12.34, unexplained=0.61).told("style")
+    assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
+    assert "61 % of the change; use a calmer style" in line
+    assert "\n" not in line
+    assert Agreement(psnr=25.0, unexplained=0.1).told("style").startswith("the edited views agree")
+
+
+def test_measuring_twice_gives_the_same_figures() -> None:
+    pictures = edited("recolor:#3060d0")
+    assert judged(pictures) == judged(pictures)
