@@ -1,0 +1,125 @@
+"""Neighbours among splats: the nearest ones, and which of them lie on the same surface."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from progdf.framing import normals_of
+from progdf.gaussians import Gaussians
+from progdf.sh import sh0_to_rgb
+
+_LEAF = 64
+_NEIGHBOURS = 48
+_NEAR = 8
+"""The distance to this neighbour is the unit in which the others' distances count."""
+
+_ROUNDS = 100
+
+
+def nearest_rows(points: Tensor, rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The k nearest other points of some of the points, exactly; half a million take seconds.
+
+    Args:
+        points: all points, finite. [N,3]
+        rows: those whose neighbours are wanted. [Q] int64
+        k: how many, 1..N−1; fewer where there are not as many points
+
+    Returns:
+        Their rows, nearest first, [Q,k] int64; their distances [Q,k].
+    """
+    k = min(k, len(points) - 1)
+    leaves = _leaves(points, max(_LEAF, 2 * k))
+    padded = torch.cat([points, torch.full((1, 3), torch.inf)])
+    boxed = padded[leaves]
+    low = boxed.amin(dim=1)
+    high = torch.where(boxed.isfinite(), boxed, -torch.inf).amax(dim=1)
+    wanted = torch.zeros(len(points) + 1, dtype=torch.int64)
+    wanted[rows] = torch.arange(1, len(rows) + 1)
+    found = torch.zeros(len(rows), k, dtype=torch.int64)
+    distances = torch.zeros(len(rows), k)
+    for leaf, held in enumerate(leaves):
+        own = held[wanted[held] > 0]
+        if not len(own):
+            continue
+        # no k-th neighbour is farther than the k-th in the leaf itself
+        reach = _distances(padded[own], boxed[leaf]).kthvalue(min(k + 1, len(held)), dim=1).values.max()
+        gap = torch.maximum(low - padded[own].amax(dim=0), padded[own].amin(dim=0) - high).clamp_min(0.0)
+        candidates = leaves[gap.norm(dim=1) <= reach].flatten()
+        apart = _distances(padded[own], padded[candidates])
+        apart[own[:, None] == candidates] = torch.inf
+        nearest = apart.topk(k, dim=1, largest=False)
+        place = wanted[own] - 1
+        found[place], distances[place] = candidates[nearest.indices], nearest.values
+    return found, distances
+
+
+def surface_share(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
+    """How much of what surrounds each undecided Gaussian, on its own surface, belongs to the members.
+
+    Nearness in space alone would give the lining of a scarf to the neck under it. What counts is nearness
+    along the surface: neighbours in each other's tangent plane that face the same way and have the same
+    colour and size. Undecided neighbours count with what they get themselves (the harmonic extension of the
+    decided ones), so that a decision travels along a surface to where no view looks.
+
+    Args:
+        scene: N Gaussians
+        member: whether each decided Gaussian is a member; ignored for the undecided. [N] bool
+        undecided: rows to decide. [U] int64
+
+    Returns:
+        0..1, a half where no decided Gaussian is in reach. [U]
+    """
+    near, distances = nearest_rows(scene.means, undecided, _NEIGHBOURS)
+    weights = _likeness(scene, undecided, near, distances)
+    share = member.float()
+    share[undecided] = 0.5
+    for _ in range(_ROUNDS):
+        share[undecided] = (weights * share[near]).sum(dim=1)
+    return share[undecided]
+
+
+def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
+    """How likely each neighbour is of the same surface; sums to 1. [Q,k]"""
+    unit = distances[:, min(_NEAR, distances.shape[1]) - 1, None].clamp_min(1e-12)
+    normals, colours = normals_of(scene), sh0_to_rgb(scene.sh0)
+    sizes = scene.log_scales.sort(dim=1).values
+    across = scene.means[near] - scene.means[rows, None]
+    off_plane = torch.maximum(
+        (across * normals[rows, None]).sum(dim=2).abs(), (across * normals[near]).sum(dim=2).abs()
+    )
+    turned = 1 - (normals[rows, None] * normals[near]).sum(dim=2).abs()
+    unlike = (
+        0.5 * (distances / unit) ** 2
+        + 2.0 * (off_plane / unit) ** 2
+        + 16.0 * turned
+        + 0.5 * ((colours[near] - colours[rows, None]).norm(dim=2) / 0.05) ** 2
+        + 4.0 * (sizes[near] - sizes[rows, None]).square().sum(dim=2)
+    )
+    return torch.softmax(-unlike, dim=1)
+
+
+def _distances(a: Tensor, b: Tensor) -> Tensor:
+    """[A,3], [B,3] -> [A,B]; points at infinity are infinitely far"""
+    apart = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.where(b.isfinite().all(dim=1), apart, torch.inf)
+
+
+def _leaves(points: Tensor, size: int) -> Tensor:
+    """Rows in boxes of at most `size`, halved along their longest side; the last row + 1 pads. [L,S]"""
+    count, per_leaf = len(points), len(points)
+    halvings = 0
+    while per_leaf > size:
+        per_leaf, halvings = (per_leaf + 1) // 2, halvings + 1
+    padded = torch.cat([points, torch.full((1, 3), torch.inf)])
+    rows = torch.arange(per_leaf * 2**halvings).clamp_max(count)[None]
+    for _ in range(halvings):
+        held = padded[rows]
+        real = held.isfinite()
+        extent = torch.where(real, held, -torch.inf).amax(dim=1) - torch.where(real, held, torch.inf).amin(
+            dim=1
+        )
+        axis = extent.nan_to_num(neginf=0.0).argmax(dim=1)
+        key = held.gather(2, axis[:, None, None].expand(-1, rows.shape[1], 1))[..., 0]
+        rows = rows.gather(1, key.argsort(dim=1)).reshape(2 * len(rows), -1)
+    return rows
