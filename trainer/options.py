@@ -76,6 +76,9 @@ class TrainOptions:
     or twice as many; 0: every Gaussian finds its own way, which smears what moves far."""
     stages: int = 8
     """Strengths that a procedural editor is asked for; 1 is the paper's way, towards the end alone."""
+    sh: Literal["auto", "off"] = "auto"
+    """Colours that change with the direction one looks from: trained, and kept where leaving them out would
+    cost 0.1 dB (auto), or left as they are."""
     rates: Rates = "kind"
     """Learning rates: as the kind of edit needs, with short steps on the last stretch; or 3DGS's own, flat,
     for all attributes (paper), which hardly move in 600 steps."""
@@ -140,6 +143,25 @@ class FitOptions:
     """As for progdf train; the run's own, if nothing is given."""
     clip_model: str = ""
     """As for progdf train; the run's own, if nothing is given."""
+    threads: int = 0
+    """CPU threads; 0 takes all cores but one, at least one."""
+
+
+@dataclass(frozen=True)
+class AblateOptions:
+    """Train a finished run again without one part of the method, or with another: one table, one picture.
+
+    What is done is kept in RUN/ablation: an interrupted ablation goes on, and --only adds to it.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """Folder that progdf train wrote; its scene, region, edited views and options are taken over."""
+    only: str = ""
+    """Some variants by name, as one-target,no-lpips; all that make sense for the run if empty."""
+    quick: bool = False
+    """A draft: 240 steps in 4 stages, 12 views."""
+    scene: Path | None = None
+    """Where the scene is now, if it has moved since the run."""
     threads: int = 0
     """CPU threads; 0 takes all cores but one, at least one."""
 

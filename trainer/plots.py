@@ -31,6 +31,7 @@ class Plot:
         scale: of the axis at the left; "log" needs values above 0, others are left out
         form: "lines", or "bars" side by side from 0
         low, high: what the axis at the left shows at least; None is as the values are
+        span: what the axis below shows at least
     """
 
     title: str
@@ -40,6 +41,7 @@ class Plot:
     form: Literal["lines", "bars"] = "lines"
     low: float | None = None
     high: float | None = None
+    span: tuple[float, float] | None = None
 
 
 def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
@@ -63,7 +65,9 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     ys = [y for points in lines.values() for _, y in points]
     low, high = _span(ys, plot)
     y_ticks = _decades(low, high) if plot.scale == "log" else ticks(low, high)
-    x_ticks = ticks(min(xs), max(xs)) if plot.form == "lines" else []
+    x_ticks = (
+        ticks(min(*xs, *(plot.span or xs)), max(*xs, *(plot.span or xs))) if plot.form == "lines" else []
+    )
     names = [_number(y) for y in y_ticks]
     left = 22 * zoom + max(draw.textlength(name, small) for name in names)
     right = (width - 16) * zoom

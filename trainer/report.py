@@ -19,6 +19,7 @@ from trainer.plots import PAPER, Plot, Points, draw_plot
 
 SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
 
+_SPAN = (0.0, 1.0)
 _THUMBNAIL, _PLOT_HEIGHT = 240, 270
 _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
@@ -70,14 +71,13 @@ def editor_strip(judge: Judge) -> list[Tensor]:
     return [thumbnail(image) for image in own]
 
 
-def thumbnail(image: Tensor, side: int = _THUMBNAIL) -> Tensor:
-    """Scaled into a white square, so that all views make one grid. [H,W,3] -> [side,side,3]"""
+def thumbnail(image: Tensor, width: int = _THUMBNAIL) -> Tensor:
+    """Scaled to a width, or less where that would make it tall, on paper. [H,W,3] -> [h,width,3]"""
     picture = to_picture(image)
-    scale = side / max(picture.size)
+    scale = min(width / picture.width, 1.25 * width / picture.height)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
-    page = Image.new("RGB", (side, side), "white")
-    place = ((side - size[0]) // 2, (side - size[1]) // 2)
-    page.paste(picture.resize(size, Image.Resampling.LANCZOS), place)
+    page = Image.new("RGB", (width, size[1]), PAPER)
+    page.paste(picture.resize(size, Image.Resampling.LANCZOS), ((width - size[0]) // 2, 0))
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
 
 
@@ -89,13 +89,20 @@ def _against_trajectory(measured: Measured) -> list[Plot]:
         for name, found in fields.items()
     }
     return [
-        Plot("PSNR to the recorded trajectory, dB", curves, "slider"),
-        Plot("SSIM to the trajectory", _lines(measured.trajectory, lambda c: c.ssim), "slider", high=1.0),
+        Plot("PSNR to the recorded trajectory, dB", curves, "slider", span=_SPAN),
+        Plot(
+            "SSIM to the trajectory",
+            _lines(measured.trajectory, lambda c: c.ssim),
+            "slider",
+            high=1.0,
+            span=_SPAN,
+        ),
         Plot(
             f"{_distance(measured)} to the trajectory",
             _lines(measured.trajectory, lambda c: c.lpips),
             "slider",
             low=0.0,
+            span=_SPAN,
         ),
     ]
 
@@ -103,13 +110,18 @@ def _against_trajectory(measured: Measured) -> list[Plot]:
 def _against_editor(measured: Measured) -> list[Plot]:
     courses = measured.editor
     return [
-        Plot("PSNR to the editor's own pictures, dB", _lines(courses, lambda c: c.psnr), "slider"),
-        Plot("SSIM to the editor's pictures", _lines(courses, lambda c: c.ssim), "slider", high=1.0),
+        Plot(
+            "PSNR to the editor's own pictures, dB", _lines(courses, lambda c: c.psnr), "slider", span=_SPAN
+        ),
+        Plot(
+            "SSIM to the editor's pictures", _lines(courses, lambda c: c.ssim), "slider", high=1.0, span=_SPAN
+        ),
         Plot(
             f"{_distance(measured)} to the editor's pictures",
             _lines(courses, lambda c: c.lpips),
             "slider",
             low=0.0,
+            span=_SPAN,
         ),
     ]
 
@@ -121,6 +133,7 @@ def _feel(measured: Measured, losses: Losses) -> list[Plot]:
             "visible change from the original",
             {"change": (_even(len(slider.distances)), slider.distances)},
             "slider",
+            span=_SPAN,
         ),
         Plot(
             f"visible change of each 1/{len(slider.steps)} of the slider",
@@ -148,7 +161,7 @@ def _training(losses: Losses, perceptual: str) -> Plot:
 def _clip(found: Direction) -> Plot:
     defined = [(s, v) for s, v in zip(found.s, found.similarity, strict=True) if v is not None]
     line = ([s for s, _ in defined], [v for _, v in defined])
-    return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0)
+    return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0, span=_SPAN)
 
 
 def _lines(courses: Mapping[str, Course], value: Callable[[Course], Sequence[float]]) -> dict[str, Points]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from progdf.camera_files import load_cameras, save_cameras
+from progdf.camera_files import save_cameras
 from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -40,11 +39,11 @@ from trainer.preparation import (
 )
 from trainer.progress import RunLog
 from trainer.reedit import reedit
+from trainer.reopen import its_views, reopened
 from trainer.resume import one_line, open_session, plain_options, still_there
 from trainer.settings import loss_weights
 from trainer.training import retimed, trained
 from trainer.trajectory import load_trajectory, save_trajectory
-from trainer.views import make_view
 
 __all__ = ["RunResult", "refit", "train", "use_threads"]
 
@@ -210,6 +209,7 @@ def _record(
         "held_out": [view.camera.name for view in stand.held_out],
         "background": list(BACKGROUND),
         "options": plain_options(options),
+        "kind": kind,
         "objective": objective,
         "losses": losses,
         "attribute_worth_db": costs,
@@ -232,44 +232,19 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         ProgdfError: the folder is no finished run, or its scene is gone or another.
     """
     use_threads(options.threads)
-    folder = RunFolder(options.run)
-    if not folder.trajectory.is_file():
-        raise ProgdfError(
-            f"{options.run} holds no trajectory.safetensors; give a folder that progdf train finished"
-        )
-    trajectory, extra, about = load_trajectory(folder.trajectory)
-    path = options.scene or Path(about["scene"])
-    if not path.is_file():
-        raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
-    scene = load_ply(path)
-    score = extra["score"]
-    if len(score) != len(scene):
-        raise ProgdfError(
-            f"{path} has {len(scene)} Gaussians, the run's scene had {len(score)}; give that one with --scene"
-        )
-    trained = about["options"]
-    region = Region(trained["name"], extra["members"], score)
-    background = torch.tensor(about["background"])
-    log = RunLog(folder.log, quiet, refits=True)
+    run = reopened(options.run, options.scene)
+    log = RunLog(run.folder.log, quiet, refits=True)
     try:
         with log.stage("views"):
-            held_out = set(about["held_out"])
-            views = [make_view(scene, region, camera, background) for camera in load_cameras(folder.cameras)]
-            stand = Stand(
-                scene,
-                region,
-                [view for view in views if view.camera.name not in held_out],
-                [view for view in views if view.camera.name in held_out],
-                background,
-            )
+            stand = its_views(run)
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
         said = {"text_before": options.text_before, "text_after": options.text_after}
         said = {name: text for name, text in {**said, "clip_model": options.clip_model}.items() if text}
         now = {"field": options.field, "target_psnr": options.target_psnr, **said}
-        about = {**about, "options": {**trained, **now}}
-        return finished(folder, stand, trajectory, about, perceptual, log, options.field)
+        about = {**run.about, "options": {**run.about["options"], **now}}
+        return finished(run.folder, stand, run.trajectory, about, perceptual, log, options.field)
     finally:
         log.close()
 

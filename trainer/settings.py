@@ -5,6 +5,7 @@ PERCEPTUAL_WEIGHT and the rest are measured, see the tables in the docstrings.
 
 from __future__ import annotations
 
+from progdf.gaussians import BASE_CHANNELS
 from trainer.editors.base import EditKind
 from trainer.objective import LossWeights, Sharpness
 from trainer.options import TrainOptions
@@ -41,6 +42,8 @@ def pgs_settings(
         stages: how many strengths there are to optimise towards
     """
     rates = learning_rates(kind, channels, extent, options.rates)
+    if options.sh == "off":
+        rates[BASE_CHANNELS:] = 0.0
     warmup = options.progressive == "warmup"
     smoothing = 0.9 if options.recording == "smooth" else 0.0
     if options.rates == "3dgs":  # a plain descent: the target at once, the same steps throughout

@@ -1,0 +1,82 @@
+"""A finished run, opened again: its scene, region and views as they were, and what was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from progdf.camera_files import load_cameras
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.ply import load_ply
+from progdf.region import Region
+from trainer.artefacts import RunFolder
+from trainer.preparation import Stand
+from trainer.trajectory import Trajectory, load_trajectory
+from trainer.views import make_view
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What a finished run left.
+
+    Args:
+        folder: its folder
+        scene: the original
+        region: what was edited
+        trajectory: what was recorded
+        about: what the trajectory's file tells of the run: options, losses, …
+    """
+
+    folder: RunFolder
+    scene: Gaussians
+    region: Region
+    trajectory: Trajectory
+    about: Mapping[str, Any]
+
+
+def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
+    """Open a run folder.
+
+    Args:
+        root: the folder
+        scene: where the scene is now, if it has moved
+
+    Raises:
+        ProgdfError: the folder is no finished run, or its scene is gone or another.
+    """
+    folder = RunFolder(root)
+    if not folder.trajectory.is_file():
+        raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
+    trajectory, extra, about = load_trajectory(folder.trajectory)
+    path = scene or Path(about["scene"])
+    if not path.is_file():
+        raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
+    gaussians = load_ply(path)
+    score = extra["score"]
+    if len(score) != len(gaussians):
+        raise ProgdfError(
+            f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
+            "give that one with --scene"
+        )
+    region = Region(about["options"]["name"], extra["members"], score)
+    return FinishedRun(folder, gaussians, region, trajectory, about)
+
+
+def its_views(run: FinishedRun) -> Stand:
+    """The run's views, rendered; their boxes hold the region, not what an edit may show beside it."""
+    background = torch.tensor(run.about["background"])
+    held_out = set(run.about["held_out"])
+    cameras = load_cameras(run.folder.cameras)
+    views = [make_view(run.scene, run.region, camera, background) for camera in cameras]
+    return Stand(
+        run.scene,
+        run.region,
+        [view for view in views if view.camera.name not in held_out],
+        [view for view in views if view.camera.name in held_out],
+        background,
+    )
