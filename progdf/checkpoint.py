@@ -12,7 +12,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
 from typing import Any
@@ -23,20 +23,21 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.bake import rows_hash
+from progdf.field.baked import BakedField
+from progdf.field_packing import packed_field, unpacked_field
 from progdf.files import open_failure, written_whole
-from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians
+from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.region import Region
 from progdf.region_packing import packed_region, unpacked_region
 from progdf.tensor_file import write_tensors
 
-FORMAT = 1
-"""Version of the file format that is written; older ones down to 1 are read."""
+FORMAT = 2
+"""Newest version of the file format; those down to 1 are read. A file states the oldest that can hold it: 1,
+or 2 where it keeps a network."""
 
 MOST_GAUSSIANS = 1 << 28
 """A header that claims a larger scene is not believed: the score would take gigabytes."""
-
-_PARTS = ("full", "rest", "step", "coefficients")
 
 
 @dataclass(frozen=True)
@@ -119,27 +120,20 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ProgdfError: the place cannot be written.
         ValueError: a number of the field is not finite, or options or report hold something JSON cannot.
     """
-    tensors = {"nodes": gdf.field.nodes, **packed_region(gdf.region)}
-    for name, bases in gdf.field.attributes.items():
-        for part in _PARTS:
-            tensors[f"{name}.{part}"] = getattr(bases, part)
+    tensors, described = packed_field(gdf.field)
+    tensors |= packed_region(gdf.region)
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} of {gdf.name} has a number that is not finite")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = json.dumps(
         {
-            "format": FORMAT,
+            "format": 1 if gdf.field.origin is None else 2,
             "name": gdf.name,
             "instruction": gdf.instruction,
             "scene": {"count": gdf.scene.count, "means_sha256": gdf.scene.means_sha256},
             "region": gdf.region.name,
-            "field": {
-                "kind": gdf.field.kind,
-                "channels": gdf.field.channels,
-                "attributes": list(gdf.field.attributes),
-                "recorded": list(gdf.field.recorded),
-            },
+            "field": described,
             "options": _plain(gdf.options),
             "report": _plain(gdf.report),
         },
@@ -159,7 +153,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
 def load_gdf(
     path: str | os.PathLike[str], scene: Gaussians | None = None, scene_name: str = "the scene"
 ) -> Gdf:
-    """Read an edit.
+    """Read an edit. A network is baked here, for which the scene is needed.
 
     Args:
         path: a .gdf file
@@ -167,7 +161,33 @@ def load_gdf(
         scene_name: what to call the scene in the message
 
     Raises:
-        ProgdfError: it is no .gdf, from a newer version, damaged, or made for another scene.
+        ProgdfError: it is no .gdf, from a newer version, damaged, or made for another scene; or it keeps a
+            network and no scene is given.
+    """
+    name = Path(path).name
+    gdf = peek_gdf(path)
+    if scene is not None:
+        verify(gdf, scene, name, scene_name)
+    if gdf.field.origin is None:
+        return gdf
+    if scene is None:
+        raise ProgdfError(f"{name} keeps a neural field, which is baked on its scene; load it with the scene")
+    rows = pack(scene[gdf.region.members])
+    if gdf.field.origin.rows_sha256 not in ("", rows_hash(rows)):
+        raise ProgdfError(
+            f"{name} was made for another scene: {scene_name} has its Gaussians, but they look different"
+        )
+    try:
+        return replace(gdf, field=gdf.field.origin.baked(rows))
+    except (ValueError, RuntimeError) as error:
+        raise _contradiction(name, error) from error
+
+
+def peek_gdf(path: str | os.PathLike[str]) -> Gdf:
+    """What a file holds, to be told and not to be run: a network stays as it is and moves nothing.
+
+    Raises:
+        ProgdfError: see `load_gdf`.
     """
     name = Path(path).name
     try:
@@ -176,15 +196,14 @@ def load_gdf(
         raise open_failure(path, error) from error
     header, tensors = _parsed(name, content)
     try:
-        gdf = _assembled(json.loads(header), tensors)
+        return _assembled(json.loads(header), tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ProgdfError(
-            f"{name} does not hold together ({reason}); make it again with progdf train"
-        ) from error
-    if scene is not None:
-        verify(gdf, scene, name, scene_name)
-    return gdf
+        raise _contradiction(name, error) from error
+
+
+def _contradiction(name: str, error: Exception) -> ProgdfError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return ProgdfError(f"{name} does not hold together ({reason}); make it again with progdf train")
 
 
 def _parsed(name: str, content: bytes) -> tuple[str, dict[str, Tensor]]:
@@ -235,28 +254,19 @@ def _version(header: str) -> int | None:
 
 
 def _assembled(header: dict[str, Any], tensors: dict[str, Tensor]) -> Gdf:
-    described = header["field"]
-    attributes = {}
-    for name in described["attributes"]:
-        if name not in ATTRIBUTES:
-            raise ValueError(f"there is no attribute {name}")
-        attributes[name] = AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS})
     scene = SceneFingerprint(int(header["scene"]["count"]), str(header["scene"]["means_sha256"]))
     if not 0 <= scene.count <= MOST_GAUSSIANS:
         raise ValueError(f"a scene of {scene.count} Gaussians")
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} has a number that is not finite")
-    field = BakedField(
-        kind=str(described["kind"]),
-        nodes=tensors["nodes"],
-        attributes=attributes,
-        channels=int(described["channels"]),
-        recorded=tuple(float(s) for s in described["recorded"]),
-    )
+    field, form = unpacked_field(header["field"], tensors)
+    region = unpacked_region(str(header["region"]), tensors, scene.count)
+    if form is not None and form.network.members != len(region):
+        raise ValueError(f"the network has {form.network.members} members, the region {len(region)}")
     return Gdf(
         name=str(header["name"]),
-        region=unpacked_region(str(header["region"]), tensors, scene.count),
+        region=region,
         field=field,
         scene=scene,
         instruction=str(header["instruction"]),

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import tyro
 
 from progdf.camera_files import load_cameras
-from progdf.checkpoint import load_gdf
+from progdf.checkpoint import peek_gdf
 from progdf.errors import ProgdfError
+from progdf.field import BakedField
 from progdf.files import open_failure
 from progdf.load_report import counted, file_size, grouped
 from progdf.ply import load_ply_with_report
@@ -68,23 +69,33 @@ def _scene_lines(path: Path) -> Iterator[str]:
 
 
 def _edit_lines(path: Path) -> Iterator[str]:
-    gdf = load_gdf(path)
+    gdf = peek_gdf(path)
     members, count = len(gdf.region), gdf.scene.count
     yield f"{path.name}: the edit '{gdf.name}', {file_size(path.stat().st_size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
     yield f"scene: {counted(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
     yield f"region: {gdf.region.name}, {counted(members)} ({members / count:.1%})"
-    bases = ", ".join(f"{name} {1 + part.rest.shape[0]}" for name, part in gdf.field.attributes.items())
-    yield (
-        f"field: {gdf.field.kind}, {gdf.field.bytes_per_member:.4g} bytes per Gaussian, "
-        f"{len(gdf.field.nodes)} nodes; bases: {bases or 'none, nothing moves'}"
-    )
+    yield f"field: {gdf.field.kind}, {gdf.field.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf.field)}"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
         for name, value in _flat(content):
             yield f"{head}: {name} {value}"
+
+
+def _form(field: BakedField) -> str:
+    """What a field is made of."""
+    if field.origin is None:
+        bases = ", ".join(f"{name} {1 + part.rest.shape[0]}" for name, part in field.attributes.items())
+        return f"{len(field.nodes)} nodes; bases: {bases or 'none, nothing moves'}"
+    network, plan = field.origin.network, field.origin.plan
+    bases = ", ".join(f"{name} {1 + rank}" for name, rank in plan.ranks.items())
+    error = ", ".join(f"{name} {value:.4g}" for name, value in (field.origin.error or {}).items())
+    return (
+        f"{grouped(network.parameters)} numbers in {network.shape.layers} layers of {network.shape.width}; "
+        f"baked at {len(plan.nodes)} nodes with bases: {bases}; baking costs: {error}"
+    )
 
 
 def _camera_lines(path: Path) -> Iterator[str]:

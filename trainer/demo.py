@@ -140,7 +140,7 @@ def main(argv: Sequence[str]) -> int:
     gdfs = {}
     for edit in show.edits:
         print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
-        gdfs[edit.name] = load_gdf(_train(options, show, scene, edit))
+        gdfs[edit.name] = load_gdf(_train(options, show, scene, edit), scene.gaussians)
     print()
     for picture in write_pictures(options.out, scene, gdfs, show.view):
         print(f"look at {picture}")

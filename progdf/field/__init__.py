@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from progdf.field.bake import NeuralForm, baked_neural
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.field.choose import Choice, choose_field
 from progdf.field.judge import Candidate, FieldJudge
 from progdf.field.keyframes import fit_keyframes
+from progdf.field.neural import NeuralField
+from progdf.field.neural_fit import NeuralSettings, fit_neural
 from progdf.field.separable import fit_separable
 
 __all__ = [
@@ -14,7 +17,12 @@ __all__ = [
     "Candidate",
     "Choice",
     "FieldJudge",
+    "NeuralField",
+    "NeuralForm",
+    "NeuralSettings",
+    "baked_neural",
     "choose_field",
     "fit_keyframes",
+    "fit_neural",
     "fit_separable",
 ]

@@ -1,121 +1,214 @@
-"""Baking: any field becomes the separable one that the viewer runs (method.md 5).
+"""Baking: a network becomes the separable field that the viewer runs (method.md 5).
 
-The field is asked at nodes, both ends are pinned to what they must be, and the course is factored. What the
-nodes and the factoring cost is measured against the field itself.
+The field is asked at nodes, both ends are pinned to what they must be, and the course between is factored.
+Nodes and factors are chosen when the edit is made and kept in its file, with the error that they cost.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import hashlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from progdf.field.baked import BakedField
+from progdf.field.judge import Field, sample_strengths
 from progdf.field.neural import NeuralField
+from progdf.field.ranks import decibels
+from progdf.field.rendered import Render
 from progdf.field.separable import fit_separable, follow, leading_modes, moving_attributes
+from progdf.gaussians import BASE_CHANNELS
 
 TOLERANCE = 0.01
 """Root mean square error of the factoring, as a share of the course's own root mean square."""
 
-MOST_RANK = 12
-_JUMP = 1e-5  # width of a hard bin's edge
+MOST_NODES, MOST_RANK = 257, 16
 
-
-class Field(Protocol):
-    """Offsets of the members it was made for, at any strength."""
-
-    @property
-    def attributes(self) -> Collection[str]:
-        """Names of the attributes that move."""
-        ...
-
-    def offsets(self, s: float) -> Tensor:
-        """Packed raw-space offsets. [M,C] float32"""
-        ...
+_PER_BIN = 4
+_JUMP = 1e-5  # width of the edge between two hard bins
 
 
 @dataclass(frozen=True)
 class BakePlan:
-    """How a field is baked, kept in the file so that every load gives the same.
+    """How a field is baked, so that every load gives the same.
 
     Args:
         nodes: strengths at which the field is asked, ascending from 0 to 1. [S] float32
         ranks: bases beside the full offset, by attribute
+        pull: share of what the field misses of the recorded end that is added at each node, by attribute, 0
+            first and 1 last; no entry: nothing is missed. [S] float32
     """
 
     nodes: Tensor
     ranks: Mapping[str, int]
+    pull: Mapping[str, Tensor]
+
+    def __post_init__(self) -> None:
+        if self.nodes.ndim != 1 or not 2 <= len(self.nodes) <= MOST_NODES:
+            raise ValueError(f"a bake at nodes {list(self.nodes.shape)}, expected 2 to {MOST_NODES}")
+        for name, rank in self.ranks.items():
+            if not 0 <= rank <= MOST_RANK:
+                raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MOST_RANK}")
+        for name, share in self.pull.items():
+            if share.shape != self.nodes.shape or share.dtype != torch.float32:
+                raise ValueError(
+                    f"the pull of {name} is {list(share.shape)}, expected {len(self.nodes)} nodes"
+                )
 
 
-def bake_nodes(bins: int, hard: bool, per_bin: int = 4) -> Tensor:
-    """Strengths to bake at: `per_bin` to a smooth bin; both sides of every edge of hard ones. [S] float32"""
+@dataclass(frozen=True)
+class NeuralForm:
+    """What a file keeps of a neural field.
+
+    Args:
+        network: the trained network
+        plan: how it is baked
+        rows_sha256: of the members' raw values that the network looks at; "" where it sees places alone
+        error: what baking costs: "rms", relative, and where pictures were at hand "psnr_mean", "psnr_worst",
+            dB, between the network, pinned, and what was baked of it
+    """
+
+    network: NeuralField
+    plan: BakePlan
+    rows_sha256: str = ""
+    error: Mapping[str, float] | None = None
+
+    def baked(self, rows: Tensor) -> BakedField:
+        """The field that runs. `rows`: raw values of the members before the edit, packed. [M,≥14]
+
+        Raises:
+            ValueError: not as many Gaussians, or a number of the network is not usable.
+        """
+        network = self.network
+        course = pinned_course(network.bound(rows), full_end(network), self.plan)
+        baked = fit_separable(self.plan.nodes, course, self.plan.ranks, recorded=network.recorded)
+        return replace(baked, kind="neural", origin=self)
+
+
+def rows_hash(rows: Tensor) -> str:
+    """SHA-256 of what a network sees of its members (float32 bytes). [M,≥14]"""
+    seen = rows[:, :BASE_CHANNELS].detach().to("cpu", torch.float32).contiguous()
+    return hashlib.sha256(seen.numpy().tobytes()).hexdigest()
+
+
+def full_end(network: NeuralField) -> Tensor:
+    """The recorded end, packed. [M,C]"""
+    end = torch.zeros(network.members, network.shape.channels)
+    end[:, network.shape.columns] = network.end
+    return end
+
+
+def baked_neural(
+    network: NeuralField,
+    rows: Tensor,
+    truth: Callable[[float], Tensor] | None = None,
+    render: Render | None = None,
+    tolerance: float = TOLERANCE,
+) -> BakedField:
+    """Choose how a network is baked, bake it, and measure what that costs.
+
+    Args:
+        network: trained
+        rows: raw values of the members before the edit, packed. [M,≥14]
+        truth: the recorded offsets at any strength; tells how the network's error at the end goes with that
+            on the way. None: as its course goes
+        render: of some views; None leaves the error in decibels out
+        tolerance: see `TOLERANCE`
+    """
+    field, end = network.bound(rows), full_end(network)
+    nodes = bake_nodes(network.shape.bins, network.shape.hard)
+    plan = BakePlan(nodes, {}, _pull(field, end, nodes, truth))
+    course = pinned_course(field, end, plan)
+    plan = replace(plan, ranks=_ranks(course, tolerance))
+    own = network.shape.inputs == "own"
+    form = NeuralForm(network, plan, rows_hash(rows) if own else "")
+    baked = form.baked(rows)
+    return replace(baked, origin=replace(form, error=bake_error(field, baked, plan, render)))
+
+
+def bake_nodes(bins: int, hard: bool) -> Tensor:
+    """Strengths to bake at: four to a smooth bin; both sides of every edge of hard ones. [S] float32"""
     if not hard:
-        return torch.linspace(0, 1, per_bin * bins + 1)
+        return torch.linspace(0, 1, _PER_BIN * bins + 1)
     edges = torch.arange(1, bins) / bins
     inner = torch.stack([edges - _JUMP, edges], dim=1).flatten()
     return torch.cat([torch.tensor([0.0, _JUMP]), inner, torch.tensor([1.0 - _JUMP, 1.0])])
 
 
-def pinned_course(field: Field, end: Tensor, nodes: Tensor) -> Tensor:
+def pinned_course(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
     """The field at the nodes, zero at the first and the recorded end at the last. [S,M,C] float32
 
-    What the field misses of the end is spread over the way as its own course goes, so that the slider does
-    not jump as it arrives: Δ(s) + a(s) (end − Δ(1)), a(s) the share of Δ(1) that Δ(s) has covered.
-
-    Args:
-        field: any
-        end: the recorded offset at s = 1. [M,C]
-        nodes: ascending from 0 to 1. [S]
+    What the field misses of the end is spread over the way, so that nothing jumps where the slider arrives.
     """
-    asked = torch.stack([field.offsets(float(s)) for s in nodes])
+    asked = torch.stack([field.offsets(float(s)) for s in plan.nodes])
     asked[0] = 0.0
     missing = end - asked[-1]
-    for columns in moving_attributes(asked).values():
-        lead = follow(asked[:, :, columns], torch.ones_like(end[:, columns])).lead
-        asked[:, :, columns] += lead[:, None, None] * missing[:, columns]
+    for name, columns in moving_attributes(asked).items():
+        if name in plan.pull:
+            asked[:, :, columns] += plan.pull[name][:, None, None] * missing[:, columns]
     asked[-1] = end
     return asked
 
 
-def bake(
-    field: Field,
-    end: Tensor,
-    plan: BakePlan,
-    kind: str,
-    recorded: tuple[float, ...] = (),
-) -> BakedField:
-    """The separable form of a field; s = 0 is exactly zero, s = 1 exactly `end`.
+def bake_error(field: Field, baked: BakedField, plan: BakePlan, render: Render | None) -> dict[str, float]:
+    """What the nodes and the factoring cost, at strengths between the nodes too; see `NeuralForm`."""
+    end = baked.offsets(1.0)
+    missing = end - field.offsets(1.0)
+    wrong = whole = 0.0
+    heard = []
+    for s in sample_strengths():
+        pinned = field.offsets(s)
+        right = int(torch.searchsorted(plan.nodes, torch.tensor(s)).clamp(1, len(plan.nodes) - 1))
+        share = (s - float(plan.nodes[right - 1])) / float(plan.nodes[right] - plan.nodes[right - 1])
+        for name, columns in moving_attributes(end[None]).items():
+            if name in plan.pull:
+                pull = torch.lerp(plan.pull[name][right - 1], plan.pull[name][right], share)
+                pinned[:, columns] += pull * missing[:, columns]
+        found = baked.offsets(s)
+        wrong += float((found - pinned).double().square().sum())
+        whole += float(pinned.double().square().sum())
+        if render is not None:
+            with torch.no_grad():
+                difference = render(found) - render(pinned)
+            heard.append(decibels(float(difference.double().square().mean()) if len(difference) else 0.0))
+    error = {"rms": (wrong / whole) ** 0.5 if whole > 0 else 0.0}
+    if heard:
+        error |= {"psnr_mean": sum(heard) / len(heard), "psnr_worst": min(heard)}
+    return {name: float(f"{value:.4g}") for name, value in error.items()}
 
-    Args:
-        field: any
-        end: the recorded offset at s = 1. [M,C] float32
-        plan: nodes and ranks
-        kind: what the field was made as
-        recorded: strengths for the slider's ticks
-    """
-    baked = fit_separable(plan.nodes, pinned_course(field, end, plan.nodes), plan.ranks, recorded=recorded)
-    return replace(baked, kind=kind)
+
+def _pull(
+    field: Field, end: Tensor, nodes: Tensor, truth: Callable[[float], Tensor] | None
+) -> dict[str, Tensor]:
+    """How much of what is missing at the end is missing at each node, by attribute; see `BakePlan`."""
+    asked = torch.stack([field.offsets(float(s)) for s in nodes])
+    missing = end - asked[-1]
+    found = {}
+    for name, columns in moving_attributes(torch.stack([end, asked[-1]])).items():
+        least = missing[:, columns].double()
+        power = float(least.square().sum())
+        if power == 0.0:
+            continue
+        if truth is None:
+            share = follow(asked[:, :, columns], torch.ones_like(end[:, columns])).lead
+        else:
+            errors = [truth(float(s))[:, columns] - a[:, columns] for s, a in zip(nodes, asked, strict=True)]
+            share = torch.tensor([float((e.double() * least).sum()) / power for e in errors])
+        share[0], share[-1] = 0.0, 1.0
+        found[name] = share.float()
+    return found
 
 
-def planned(field: Field, end: Tensor, nodes: Tensor, tolerance: float = TOLERANCE) -> BakePlan:
-    """The fewest bases with which each attribute's course is met to `tolerance` (relative, RMS)."""
-    asked = pinned_course(field, end, nodes)
+def _ranks(course: Tensor, tolerance: float) -> dict[str, int]:
+    """The fewest bases with which each attribute's course is met to `tolerance`. [S,M,C]"""
     ranks = {}
-    for name, columns in moving_attributes(asked).items():
-        course = follow(asked[:, :, columns], torch.ones_like(end[:, columns]))
-        allowed = tolerance**2 * float(course.offsets.double().square().sum())
-        power = torch.linalg.eigvalsh(course.gram).flip(0).clamp(min=0)
+    for name, columns in moving_attributes(course).items():
+        own = follow(course[:, :, columns], torch.ones_like(course[0, :, columns]))
+        allowed = tolerance**2 * float(own.offsets.double().square().sum())
+        power = torch.linalg.eigvalsh(own.gram).flip(0).clamp(min=0)
         left = float(power.sum()) - power.cumsum(0)
         needed = 0 if float(power.sum()) <= allowed else 1 + int((left > allowed).sum())
-        ranks[name] = min(needed, MOST_RANK, leading_modes(course.gram)[0].shape[1])
-    return BakePlan(nodes, ranks)
-
-
-def bake_neural(field: NeuralField, rows: Tensor, plan: BakePlan) -> BakedField:
-    """A neural field on its Gaussians, baked. `rows`: raw values of the members, packed. [M,≥14]"""
-    end = torch.zeros(field.members, field.shape.channels)
-    end[:, field.shape.columns] = field.end
-    return bake(field.bound(rows), end, plan, "neural", field.recorded)
+        ranks[name] = min(needed, MOST_RANK, leading_modes(own.gram)[0].shape[1])
+    return ranks

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
+
+if TYPE_CHECKING:
+    from progdf.field.bake import NeuralForm
 
 REST_TYPES = (torch.int8, torch.float16, torch.float32)
 """How bases 1..R may be stored."""
@@ -76,6 +80,7 @@ class BakedField:
         attributes: bases by attribute name (see gaussians.ATTRIBUTES); one that does not move is absent
         channels: width of a packed row, 14, or 14 + 3K when shN moves
         recorded: strengths of the recorded snapshots, for the slider's ticks
+        origin: the network that it was baked from and that a file keeps in its place; None: it is kept itself
     """
 
     kind: str
@@ -83,6 +88,7 @@ class BakedField:
     attributes: Mapping[str, AttributeBases]
     channels: int
     recorded: tuple[float, ...] = ()
+    origin: NeuralForm | None = None
 
     def __post_init__(self) -> None:
         if self.nodes.ndim != 1 or self.nodes.dtype != torch.float32:
@@ -110,7 +116,14 @@ class BakedField:
 
     @property
     def bytes_per_member(self) -> float:
-        """Stored bytes for one member of the region."""
+        """Bytes on disk for one member of the region, of a network its share."""
+        if self.origin is not None:
+            return self.origin.network.bytes_per_member
+        return self.baked_bytes_per_member
+
+    @property
+    def baked_bytes_per_member(self) -> float:
+        """Bytes in memory for one member, which a slider step has to read."""
         return sum(bases.bytes_per_member for bases in self.attributes.values())
 
     def coefficients(self, name: str, s: float) -> Tensor:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +14,19 @@ from progdf.field.ranks import decibels
 from progdf.field.rendered import Render
 
 SAMPLES = 25
+
+
+class Field(Protocol):
+    """Anything that tells the offsets of its members at any strength, baked or not."""
+
+    @property
+    def attributes(self) -> Collection[str]:
+        """Names of the attributes that move."""
+        ...
+
+    def offsets(self, s: float) -> Tensor:
+        """Packed raw-space offsets. [M,C] float32"""
+        ...
 
 
 @dataclass(frozen=True)
@@ -68,7 +82,7 @@ class FieldJudge:
         with torch.no_grad():
             self._expected = [render(course(s)) for s in sample_strengths()]
 
-    def curve(self, field: BakedField) -> tuple[float, ...]:
+    def curve(self, field: Field) -> tuple[float, ...]:
         """PSNR at `sample_strengths()`, dB."""
         with torch.no_grad():
             return tuple(
@@ -76,7 +90,7 @@ class FieldJudge:
                 for s, expected in zip(sample_strengths(), self._expected, strict=True)
             )
 
-    def _offsets(self, field: BakedField, s: float) -> Tensor:
+    def _offsets(self, field: Field, s: float) -> Tensor:
         # a field that moves nothing does not know how many members it has
         return field.offsets(s) if field.attributes else self._nothing
 
