@@ -86,9 +86,9 @@ class StateFolder:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:
-            raise _damaged(self._run, error) from error
+            raise self._damaged(self._run, error) from error
         if not isinstance(content, dict):
-            raise _damaged(self._run, "it holds no table")
+            raise self._damaged(self._run, "it holds no table")
         return content
 
     def begin(self, identity: Mapping[str, Any]) -> None:
@@ -129,7 +129,7 @@ class StateFolder:
                 values = json.loads((opened.metadata() or {})["values"])
                 return Saved({name: opened.get_tensor(name) for name in opened.keys()}, values)  # noqa: SIM118
         except (OSError, SafetensorError, KeyError, ValueError) as error:
-            raise _damaged(path, error) from error
+            raise self._damaged(path, error) from error
 
     def clear(self) -> None:
         """Remove everything, run.json first: a rest of it is no run."""
@@ -144,6 +144,9 @@ class StateFolder:
         """The run is finished: remove the folder."""
         self.clear()
         shutil.rmtree(self.path, ignore_errors=True)
+
+    def _damaged(self, path: Path, reason: object) -> ProgdfError:
+        return ProgdfError(f"{path} is damaged ({reason}); delete {self.path} and train again")
 
     def _file(self, part: str, index: int | None) -> Path:
         return self.path / (f"{part}.safetensors" if index is None else f"{part}/{index:06d}.safetensors")
@@ -213,7 +216,3 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _damaged(path: Path, reason: object) -> ProgdfError:
-    return ProgdfError(f"{path} is damaged ({reason}); delete {path.parent} and train again")
