@@ -5,6 +5,7 @@ from __future__ import annotations
 from progdf.field.bake import NeuralForm, baked_neural
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.field.choose import Choice, choose_field
+from progdf.field.floor import PositionFloor, position_floor
 from progdf.field.judge import Candidate, FieldJudge
 from progdf.field.keyframes import fit_keyframes
 from progdf.field.neural import NeuralField
@@ -20,9 +21,11 @@ __all__ = [
     "NeuralField",
     "NeuralForm",
     "NeuralSettings",
+    "PositionFloor",
     "baked_neural",
     "choose_field",
     "fit_keyframes",
     "fit_neural",
     "fit_separable",
+    "position_floor",
 ]

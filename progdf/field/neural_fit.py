@@ -214,6 +214,46 @@ class NeuralFit:
         answer = beyond_first(self.shape, {**self._learned, "spread": self._frame["spread"]}, hidden)
         return course(self.shape, s, answer, self._end[rows])
 
+    def saved(self) -> dict[str, Tensor]:
+        """Everything that the next steps depend on, by name; the snapshots aside."""
+        kept = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
+        kept |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
+        kept |= {"end": self._end, "importance": self._importance, "steps": torch.tensor(self.steps)}
+        for name, tensor in self._learned.items():
+            for what, moment in self._adam.state[tensor].items():
+                kept[f"adam.{name}.{what}"] = moment
+        return kept | {"draws": self._draws.get_state()}
+
+    def restore(self, saved: Mapping[str, Tensor]) -> None:
+        """Take over what `saved` gave, of a fit made with the same arguments."""
+        for name, tensor in self._learned.items():
+            tensor.data.copy_(saved[f"learned.{name}"])
+            begin = f"adam.{name}."
+            state = {key.removeprefix(begin): t.clone() for key, t in saved.items() if key.startswith(begin)}
+            if state:
+                self._adam.state[tensor] = state
+        self._frame = {name: saved[f"frame.{name}"].clone() for name in self._frame}
+        self._end, self._importance = saved["end"].clone(), saved["importance"].clone()
+        self.steps = int(saved["steps"])
+        self._draws.set_state(saved["draws"])
+        self._told = encoded(self.shape, self._frame, self._rows, self._end)
+
+    def adopt(self, shape: NeuralShape, saved: Mapping[str, Tensor]) -> None:
+        """Begin with the weights of another fit of the same members, whose outputs may be more than ours.
+
+        Args:
+            shape: of the other
+            saved: what its `saved` gave
+        """
+        rows = torch.cat(
+            [torch.arange(p.start, p.stop) for n, p in shape.outputs.items() if n in self.shape.outputs]
+        )
+        for name, tensor in self._learned.items():
+            found = saved[f"learned.{name}"]
+            tensor.data.copy_(found[rows] if name.startswith("heads.") else found)
+        self._frame["spread"] = saved["frame.spread"][rows].clone()
+        self.steps = 1  # from here on, `scale_to` keeps what the network answers
+
     def field(self, recorded: tuple[float, ...] = ()) -> NeuralField:
         """The network as it is stored: weights in float16, codes in int8."""
         learned = {name: tensor.detach().half() for name, tensor in self._learned.items() if name != "codes"}
