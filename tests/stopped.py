@@ -45,7 +45,7 @@ def bits(root: Path) -> dict[str, str]:
 
 
 def _timeless(report: Mapping[str, object]) -> dict[str, object]:
-    return {name: value for name, value in report.items() if name not in ("time", "memory_mb")}
+    return {name: value for name, value in report.items() if not name.startswith(("time", "memory"))}
 
 
 def _killed_at_file(number: int) -> None:

@@ -114,11 +114,15 @@ def _trained(
         edited, kind = _edited(options, stand, folder, log)
         train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
         stand = widened(stand, train_edits)
-    if folder.state.load("recorded") is None:
+    recorded = folder.state.load("recorded")
+    if recorded is None:
         with log.stage("agree"):
             agreement = _agreement(options, stand, edited, kind, log)
         _record(options, stand, train_edits, kind, perceptual, folder, log, agreement)
-        folder.state.save("recorded", {}, {})
+        folder.state.save("recorded", {}, log.saved().values)
+    else:
+        log.restore(recorded)
+        log.say("the trajectory is recorded")
     trajectory, _, about = load_trajectory(folder.trajectory)
     measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
     return finished(folder, stand, trajectory, about, measure, log, options.field)
