@@ -13,6 +13,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.demo:main", "make a scene, train its region edits, write previews, open the window"),
     "train": ("trainer.cli:train", "edit a region of a scene and write its .gdf file"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
+    "ablate": ("trainer.cli:ablate", "train a run again without each part of the method: one table"),
     "view": ("viewer.cli:view", "open the window: splats, layers, sliders"),
     "render": ("viewer.cli:render", "write a picture, a sweep or a contact sheet without a window"),
     "export": ("viewer.cli:export", "write the edited scene as a 3DGS .ply file"),

@@ -28,7 +28,7 @@ def contact_sheet(
 
     Args:
         rows: the pictures, row by row, all of one size; rows may have different lengths. [H,W,3] in 0..1 each
-        row_labels: a word to the left of each row, or none
+        row_labels: a word to the left of each row, or none; further lines are smaller and paler
         column_labels: a word above each column, or none
         title: a line at the top
         caption: a smaller line at the bottom
@@ -52,7 +52,9 @@ def contact_sheet(
     text = max(12, round(height / 18))
     gap, font = max(4, round(text / 3)), _font(text)
     large, small = _font(round(1.4 * text)), _font(max(11, round(0.85 * text)))
-    left = gap + (2 * gap + max(_width(label, font) for label in row_labels) if row_labels else 0)
+    left = gap
+    if row_labels:
+        left += 4 * gap + max(_label_width(label, font, small) for label in row_labels)
     top = gap + (round(2.2 * text) if title else 0)
     grid_top = top + (round(1.6 * text) if column_labels else 0)
     full_width = max(
@@ -71,7 +73,11 @@ def contact_sheet(
     for i, row in enumerate(rows):
         y = grid_top + i * (height + gap)
         if i < len(row_labels):
-            draw.text((left - 2 * gap, y + height / 2), row_labels[i], _INK, font, anchor="rm")
+            lines = row_labels[i].split("\n")
+            for k, line in enumerate(lines):
+                middle = y + height / 2 + (k - (len(lines) - 1) / 2) * 1.35 * text
+                ink, letters = (_PALE_INK, small) if k else (_INK, font)
+                draw.text((left - 2 * gap, middle), line, ink, letters, anchor="rm")
         for j, image in enumerate(row):
             page.paste(to_picture(image), (left + j * (width + gap), y))
     if caption:
@@ -93,6 +99,10 @@ def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
 
 def _font(size: int) -> _Font:
     return ImageFont.load_default(size=size)
+
+
+def _label_width(label: str, font: _Font, small: _Font) -> int:
+    return max(_width(line, small if k else font) for k, line in enumerate(label.split("\n")))
 
 
 def _width(line: str, font: _Font) -> int:

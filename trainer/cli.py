@@ -1,4 +1,4 @@
-"""`progdf train` and `progdf fit`: the command line, made from the options' dataclasses."""
+"""`progdf train`, `progdf fit` and `progdf ablate`: the command line, made from the options' dataclasses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypeVar
 import tyro
 
 from progdf.errors import ProgdfError
-from trainer.options import FitOptions, TrainOptions
+from trainer.options import AblateOptions, FitOptions, TrainOptions
 from trainer.presets import under_preset
 
 _Options = TypeVar("_Options")
@@ -41,6 +41,16 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
     if options.preset == "default":
         return options
     return parsed(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
+
+
+def ablate(argv: Sequence[str]) -> int:
+    """Run `progdf ablate`; 0 when the table is written. Raises ProgdfError for what the user can mend."""
+    options = parsed(AblateOptions, argv, "progdf ablate")
+    from trainer.ablate import ablate as run
+    from trainer.ablation_table import print_table
+
+    print_table(run(options).table)
+    return 0
 
 
 def parsed(

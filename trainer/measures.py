@@ -110,9 +110,9 @@ def measure(
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
     slider = slider_statistics(lambda s: judge.pictures(field.offsets(s)), masks=judge.pixels)
     samples = sample_strengths()[::_EVERY]
-    recorded = _courses(judge, fields, samples, lambda s: judge.pictures(trajectory.at(s)), perceptual)
+    recorded = courses(judge, fields, samples, lambda s: judge.pictures(trajectory.at(s)), perceptual)
     asked = tuple(sorted(judge.edited))
-    drawn = _courses(judge, fields, asked, lambda s: judge.edited[s], perceptual)
+    drawn = courses(judge, fields, asked, lambda s: judge.edited[s], perceptual)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
         (judge.psnr(judge.pictures(field.offsets(s)), judge.pictures(trajectory.at(s))) for s in nodes),
@@ -202,14 +202,22 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
     }
 
 
-def _courses(
+def courses(
     judge: Judge,
     fields: Mapping[str, BakedField],
     strengths: Sequence[float],
     truth: Callable[[float], Sequence[Tensor]],
     perceptual: Perceptual,
 ) -> dict[str, Course]:
-    """Each field's errors against what is true at each strength."""
+    """Each field's errors on held-out views, over the slider.
+
+    Args:
+        judge: the views
+        fields: by name
+        strengths: slider values, ascending
+        truth: what the pictures should be at one of them. -> [h,w,3] each
+        perceptual: LPIPS, or its stand-in
+    """
     rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in fields}
     for s in strengths:
         expected = truth(s)

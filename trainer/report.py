@@ -56,22 +56,22 @@ def best_view(judge: Judge) -> int:
     return max(range(len(judge.pixels)), key=lambda i: int(judge.pixels[i].sum()))
 
 
-def strip(judge: Judge, field: BakedField) -> list[Tensor]:
+def strip(judge: Judge, field: BakedField, width: int = _THUMBNAIL) -> list[Tensor]:
     """The best view at five strengths, as thumbnails of one size."""
     best = best_view(judge)
-    return [thumbnail(judge.pictures(field.offsets(s))[best]) for s in SHOWN]
+    return [thumbnail(judge.pictures(field.offsets(s))[best], width) for s in SHOWN]
 
 
-def editor_strip(judge: Judge) -> list[Tensor]:
+def editor_strip(judge: Judge, width: int = _THUMBNAIL) -> list[Tensor]:
     """What the editor makes of the best view; grey where it was not asked."""
     best = best_view(judge)
     blank = torch.full((*judge.crops[best].size, 3), 0.94)
     original = judge.crops[best].original().clamp(0, 1)
     own = [original if s == 0 else judge.edited[s][best] if s in judge.edited else blank for s in SHOWN]
-    return [thumbnail(image) for image in own]
+    return [thumbnail(image, width) for image in own]
 
 
-def thumbnail(image: Tensor, width: int = _THUMBNAIL) -> Tensor:
+def thumbnail(image: Tensor, width: int) -> Tensor:
     """Scaled to a width, or less where that would make it tall, on paper. [H,W,3] -> [h,width,3]"""
     picture = to_picture(image)
     scale = min(width / picture.width, 1.25 * width / picture.height)
