@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+import trainer.resume
 import trainer.run
 from progdf import scenes
 from progdf.camera_files import load_cameras
@@ -133,3 +134,29 @@ def test_a_demo_with_too_few_gaussians_writes_nothing(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="too few for a bear"):
         demo.main(["--size", "10", "--out", str(tmp_path / "demo")])
     assert not (tmp_path / "demo").exists()
+
+
+def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
+    tmp_path: Path, bear: scenes.DemoScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, bool]] = []
+
+    def train(options: TrainOptions) -> None:
+        asked.append((options.out.name, options.resume))
+        if len(asked) == 2:
+            raise KeyboardInterrupt("--resume")
+
+    here = {"scarf": "finished", "gold": "stopped", "frost": "nothing"}
+    monkeypatch.setattr(trainer.run, "train", train)
+    monkeypatch.setattr(trainer.resume, "found", lambda options: here[options.out.name])
+    arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
+    with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
+        demo.main(arguments)
+    assert asked == [("scarf", True), ("gold", True)]
+    here["gold"] = "nothing"
+    monkeypatch.setattr(
+        trainer.run, "train", lambda options: asked.append((options.out.name, options.resume))
+    )
+    with pytest.raises(ProgdfError):  # this training writes nothing
+        demo.main(arguments)
+    assert asked[2:] == [("scarf", False), ("gold", False), ("frost", False)]

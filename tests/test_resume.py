@@ -31,6 +31,7 @@ from tests.trained import small, write_bear
 from trainer.artefacts import RunFolder, locked
 from trainer.descent import PgsState
 from trainer.pgs import optimise
+from trainer.resume import found
 from trainer.run import train
 from trainer.state import Autosave, Saved, StateFolder
 
@@ -283,6 +284,39 @@ def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_
     gone_on(scene, uninterrupted)
 
 
+def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = small_run(scene, kind="geometry", group_steps=8, steps=16)
+    monkeypatch.setattr(trainer.run, "finished", lambda *_: None)
+    train(options, quiet=True)
+    expected = (OUT / "trajectory.safetensors").read_bytes()
+    shutil.rmtree(OUT)
+    with monkeypatch.context() as patch:
+        at_step(patch, 11, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(options, quiet=True)
+
+    def group_stage(*_: object) -> None:
+        raise AssertionError("parts looked for again")
+
+    monkeypatch.setattr(trainer.training, "group_stage", group_stage)
+    train(replace(options, resume=True), quiet=True)
+    assert (OUT / "trajectory.safetensors").read_bytes() == expected
+
+
+def test_what_is_found_in_a_folder_depends_on_the_options(
+    scene: Path, uninterrupted: Path, interrupted: Path
+) -> None:
+    assert found(small_run(scene)) == "nothing"
+    shutil.copytree(interrupted, OUT)
+    assert found(small_run(scene)) == "stopped"
+    assert found(small_run(scene, seed=1)) == "nothing"
+    shutil.rmtree(OUT)
+    shutil.copytree(uninterrupted, OUT)
+    assert found(small_run(scene)) == "finished"
+
+
 @pytest.mark.usefixtures("stopped")
 def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
     scene: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
@@ -369,14 +403,14 @@ def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
     class Stop(Exception):  # noqa: N818
         pass
 
-    state, found = PgsState(original), []
+    state, made = PgsState(original), []
     for _ in range(20):  # stopped after every step, every time restored into another state
 
         def on_step(step: int, left: float) -> None:
             raise Stop
 
         try:
-            found.extend(snapshot for snapshot in optimise(*wanted, on_step, state))
+            made.extend(snapshot for snapshot in optimise(*wanted, on_step, state))
             break
         except Stop:
             saved = state.saved()
@@ -385,8 +419,8 @@ def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
             restored = folder.load("pgs")
             assert restored is not None
             state.restore(restored)
-    assert len(found) == len(straight)
-    for one, other in zip(found, straight, strict=True):
+    assert len(made) == len(straight)
+    for one, other in zip(made, straight, strict=True):
         assert torch.equal(one.offsets, other.offsets)
         assert (one.step, one.stage, one.ends_stage, one.means) == (
             other.step,

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,6 +26,7 @@ from progdf.ply import load_ply, save_ply
 from progdf.rasterize import render
 from progdf.scenes import DemoScene, bear, room
 from trainer.options import TrainOptions
+from trainer.state import StateFolder
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _HERO_HEIGHT = 400
@@ -137,10 +138,7 @@ def main(argv: Sequence[str]) -> int:
     scene = show.make(show.size if options.size is None else options.size, options.seed)
     write_scene(options.out, scene)
     print(f"{options.scene}: {len(scene.gaussians)} Gaussians in {options.out / 'scene.ply'}")
-    gdfs = {}
-    for edit in show.edits:
-        print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
-        gdfs[edit.name] = load_gdf(_train(options, show, scene, edit), scene.gaussians)
+    gdfs = {name: load_gdf(path, scene.gaussians) for name, path in _train(options, show, scene).items()}
     print()
     for picture in write_pictures(options.out, scene, gdfs, show.view):
         print(f"look at {picture}")
@@ -210,28 +208,45 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
     return written
 
 
-def _train(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> Path:
-    """Train one edit and return its .gdf file."""
-    from trainer.run import train  # only now: `--help` and the pictures need none of it
+def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path]:
+    """Train the edits; their .gdf files by name. A demo that was stopped goes on where it was."""
+    from trainer.resume import found  # only now: `--help` and the pictures need none of it
+    from trainer.run import train
 
+    runs = {edit.name: _run(options, show, scene, edit) for edit in show.edits}
+    here = {name: found(run) for name, run in runs.items()}
+    for edit in show.edits:
+        print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
+        run = runs[edit.name]
+        goes_on = "stopped" in here.values() and here[edit.name] != "nothing"
+        if not goes_on:
+            StateFolder(run.out / "state").clear()  # of a demo with other options
+        try:
+            train(replace(run, resume=goes_on))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"what is done is kept in {options.out}; give the same command again to go on"
+            ) from None
+    return {edit.name: _gdf(options.out, edit) for edit in show.edits}
+
+
+def _run(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
+    """How one edit is trained."""
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
     effort = show.draft if options.quick else show.full
-    train(
-        TrainOptions(
-            scene=folder / "scene.ply",
-            out=folder / edit.name,
-            region=f"labels:{folder / 'labels.npy'}:{ids}",
-            editor=edit.editor,
-            cameras=folder / "cameras.json" if show.inside else None,
-            views=effort.views,
-            image_size=effort.image_size,
-            steps=effort.steps,
-            seed=options.seed,
-            threads=options.threads,
-        )
+    return TrainOptions(
+        scene=folder / "scene.ply",
+        out=folder / edit.name,
+        region=f"labels:{folder / 'labels.npy'}:{ids}",
+        editor=edit.editor,
+        cameras=folder / "cameras.json" if show.inside else None,
+        views=effort.views,
+        image_size=effort.image_size,
+        steps=effort.steps,
+        seed=options.seed,
+        threads=options.threads,
     )
-    return _gdf(folder, edit)
 
 
 def _gdf(folder: Path, edit: DemoEdit) -> Path:

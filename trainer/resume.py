@@ -16,7 +16,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.region import Region
 from trainer.artefacts import RunFolder, begin_log, remove_leftovers
-from trainer.options import TrainOptions
+from trainer.options import TrainOptions, settled
 
 _ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
 """Options that change no bit of the result; `quick` is worked into others."""
@@ -86,6 +86,19 @@ def open_session(
         ["nothing to resume was saved yet, so the run starts from the beginning"] if options.resume else []
     )
     return Session("start", threads, tuple(notes))
+
+
+def found(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
+    """What --resume would find in the folder, of a run with these very options."""
+    folder, options = RunFolder(options.out), settled(options)
+    saved = folder.state.identity()
+    if saved is None and not folder.report.is_file():
+        return "nothing"
+    try:
+        _check_options(folder, saved["options"] if saved else _finished_options(folder), options, "")
+    except ProgdfError:
+        return "nothing"
+    return "stopped" if saved else "finished"
 
 
 @contextmanager
