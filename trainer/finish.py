@@ -13,18 +13,19 @@ from torch import Tensor
 
 from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.compose import Layer, compose
-from progdf.field.choose import Kind
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.pictures import write_image
 from trainer.artefacts import RunFolder, read_views, write_json
-from trainer.fit import fit_field, visibility
+from trainer.fit import fit_field, judged_field, visibility
 from trainer.judge import Judge, make_judge
 from trainer.losses import Perceptual
 from trainer.measures import Texts, clip_course, figures, measure
-from trainer.options import CLIP_MODEL
+from trainer.network import fit_network
+from trainer.options import CLIP_MODEL, FieldKind
 from trainer.preparation import Stand
 from trainer.progress import RunLog
 from trainer.report import report_picture
+from trainer.state import Saved
 from trainer.trajectory import Trajectory
 from trainer.views import View
 
@@ -56,9 +57,10 @@ def finished(
     about: Mapping[str, Any],
     perceptual: Perceptual,
     log: RunLog,
-    choice: Kind,
+    choice: FieldKind,
+    begun: Saved | None = None,
 ) -> RunResult:
-    """Fit, measure, and write NAME.gdf, report.json and report.png."""
+    """Fit, measure, and write NAME.gdf, report.json and report.png. `begun`: see `network.fit_network`."""
     options = about["options"]
     scene, region = stand.scene, stand.region
     with log.stage("fit"):
@@ -67,10 +69,16 @@ def finished(
         few = stand.train[:: max(1, len(stand.train) // _RANK_VIEWS)][:_RANK_VIEWS]
         seen = kept_judge(folder, stand, few, trajectory.strengths, channels)
         weights = visibility(scene, region.members, stand.train)
-        fitted = fit_field(trajectory, seen, judge, weights, choice, options["target_psnr"])
+        if choice == "neural":
+            network = fit_network(trajectory, stand, seen, judge, weights, options, perceptual, log, begun)
+            fitted = judged_field(trajectory, judge, network.field, options["target_psnr"])
+        else:
+            network = None
+            fitted = fit_field(trajectory, seen, judge, weights, choice, options["target_psnr"])
     field = fitted.chosen.field
+    why = f", the smallest of {fitted.tried} fields that serves" if network is None else ""
     log.say(
-        f"{fitted.chosen.label}, the smallest of {fitted.tried} fields that serves: "
+        f"{fitted.chosen.label}{why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
         f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
     )
@@ -85,8 +93,11 @@ def finished(
         endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
         title = f"{options['name']}: {options['editor']}"
         picture = report_picture(judge, measured, about["losses"], title)
+    measures = figures(measured, endpoint, outside)
+    if network is not None:
+        measures["field"] |= network.figures()
     report = {
-        **figures(measured, endpoint, outside),
+        **measures,
         "trajectory": {
             "recordings": len(trajectory),
             "s": [round(float(s), 4) for s in trajectory.s],

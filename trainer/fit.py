@@ -39,7 +39,12 @@ class Fitted:
 
 
 def fit_field(
-    trajectory: Trajectory, seen: Judge, judge: Judge, weights: Tensor, kind: Kind, target_psnr: float
+    trajectory: Trajectory,
+    seen: Judge,
+    judge: Judge,
+    weights: Tensor,
+    kind: Kind,
+    target_psnr: float,
 ) -> Fitted:
     """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target.
 
@@ -57,13 +62,25 @@ def fit_field(
     choice = choose_field(
         trajectory.s, offsets, seen.counted, weights, kind, target_psnr, judge=errors, recorded=ticks
     )
-    baselines = {
+    return Fitted(choice.best, choice.met, len(choice.tried), _baselines(trajectory, offsets, errors))
+
+
+def judged_field(trajectory: Trajectory, judge: Judge, field: BakedField, target_psnr: float) -> Fitted:
+    """A field that is there already, a network's, beside the same baselines."""
+    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    errors = FieldJudge(trajectory.s, offsets, judge.counted)
+    judged = errors.candidate(field, field.kind)
+    return Fitted(judged, judged.worst >= target_psnr, 1, _baselines(trajectory, offsets, errors))
+
+
+def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldJudge) -> dict[str, Candidate]:
+    return {
         f"keyframes{count}": errors.candidate(
-            fit_keyframes(trajectory.s, offsets, count, ticks), f"{count} keyframes"
+            fit_keyframes(trajectory.s, offsets, count, [float(s) for s in trajectory.s]),
+            f"{count} keyframes",
         )
         for count in BASELINES
     }
-    return Fitted(choice.best, choice.met, len(choice.tried), baselines)
 
 
 def field_figures(candidate: Candidate) -> dict[str, Any]:
@@ -118,7 +135,11 @@ def without_idle_attributes(trajectory: Trajectory, judge: Judge) -> tuple[Traje
 
 
 def stored_numbers(field: BakedField) -> int:
-    """How many numbers the field holds for all members together, coefficients included."""
+    """How many numbers the field holds for all members together, coefficients included; of a network, those
+    that are learned and the recorded end."""
+    if field.origin is not None:
+        network = field.origin.network
+        return network.parameters + network.end.numel()
     return sum(
         bases.full.numel() + bases.rest.numel() + bases.step.numel() + bases.coefficients.numel()
         for bases in field.attributes.values()

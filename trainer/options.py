@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
 from progdf.errors import ProgdfError
-from progdf.field.choose import Kind
+from progdf.field.neural import Bins, Inputs, Size
 from progdf.lpips import Net
 from trainer.objective import Progressive
 from trainer.pgs import Rates
@@ -19,6 +20,18 @@ from trainer.trajectory import Slider
 Preset = Literal["default", "paper"]
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
+FieldKind = Literal["auto", "separable", "keyframes", "neural"]
+
+NETWORK_OPTIONS: Mapping[str, Any] = {
+    "fit": "after",
+    "size": "tiny",
+    "inputs": "own",
+    "bins": "smooth",
+    "code": 8,
+    "picture_loss": 0.0,
+}
+"""Options of a neural field, and what they are where nothing is said."""
+
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
@@ -102,8 +115,22 @@ class TrainOptions:
     """Record a running mean of the parameters and drop jitter, or the bare iterates (paper)."""
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
-    field: Kind = "auto"
-    """Kind of field; auto keeps the smallest that meets --target-psnr."""
+    field: FieldKind = "auto"
+    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr."""
+    fit: Literal["after", "alongside"] = NETWORK_OPTIONS["fit"]
+    """neural: trained on the finished recording, or step by step while it is made (paper); what it sees is
+    then --inputs position."""
+    size: Size = NETWORK_OPTIONS["size"]
+    """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
+    inputs: Inputs = NETWORK_OPTIONS["inputs"]
+    """neural: what the network sees, the position alone (paper), or also what the Gaussian looks like and
+    where it ends: 38 dB instead of 34 at no cost."""
+    bins: Bins = NETWORK_OPTIONS["bins"]
+    """neural: the slider's ten bins, interpolated, or hard (paper), between which the edit jumps."""
+    code: int = NETWORK_OPTIONS["code"]
+    """neural: a byte each for so many learned numbers per Gaussian, which tell what its place does not."""
+    picture_loss: float = NETWORK_OPTIONS["picture_loss"]
+    """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
     quick: bool = False
@@ -131,8 +158,19 @@ class FitOptions:
 
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
-    field: Kind = "auto"
-    """Kind of field; auto keeps the smallest that meets --target-psnr."""
+    field: FieldKind = "auto"
+    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr."""
+    size: Size = NETWORK_OPTIONS["size"]
+    """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
+    inputs: Inputs = NETWORK_OPTIONS["inputs"]
+    """neural: what the network sees, the position alone (paper), or also what the Gaussian looks like and
+    where it ends: 38 dB instead of 34 at no cost."""
+    bins: Bins = NETWORK_OPTIONS["bins"]
+    """neural: the slider's ten bins, interpolated, or hard (paper), between which the edit jumps."""
+    code: int = NETWORK_OPTIONS["code"]
+    """neural: a byte each for so many learned numbers per Gaussian, which tell what its place does not."""
+    picture_loss: float = NETWORK_OPTIONS["picture_loss"]
+    """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
     scene: Path | None = None
@@ -216,6 +254,7 @@ def settled(options: TrainOptions) -> TrainOptions:
     if not 0 <= options.save_every < math.inf:
         raise ProgdfError(f"--save-every is {options.save_every}; 0 or more seconds would be right")
     _check_editor_options(options)
+    check_network_options(options)
     return replace(options, name=name)
 
 
@@ -230,3 +269,19 @@ def _check_editor_options(options: TrainOptions) -> None:
             if said and kind not in kinds:
                 option = "--" + name.replace("_", "-")
                 raise ProgdfError(f"{option} means nothing to {kind}; it is for {' and '.join(kinds)}")
+
+
+def check_network_options(options: TrainOptions | FitOptions) -> None:
+    """Options of the neural field that make sense, and only where there is one.
+
+    Raises:
+        ProgdfError: one does not.
+    """
+    for name, default in NETWORK_OPTIONS.items():
+        option = "--" + name.replace("_", "-")
+        if options.field != "neural" and getattr(options, name, default) != default:
+            raise ProgdfError(f"{option} means nothing to --field {options.field}; add --field neural")
+    if not 0 <= options.code <= 64:
+        raise ProgdfError(f"--code is {options.code}; 0 to 64 would be right")
+    if not 0 <= options.picture_loss < math.inf:
+        raise ProgdfError(f"--picture-loss is {options.picture_loss}; 0 or more would be right")

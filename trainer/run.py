@@ -24,7 +24,8 @@ from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
 from trainer.interrupts import stopping
 from trainer.losses import Perceptual, perceptual_loss
-from trainer.options import FitOptions, TrainOptions, settled
+from trainer.network import PART as NETWORK
+from trainer.options import NETWORK_OPTIONS, FitOptions, TrainOptions, check_network_options, settled
 from trainer.preparation import (
     BACKGROUND,
     Pictures,
@@ -125,7 +126,8 @@ def _trained(
         log.say("the trajectory is recorded")
     trajectory, _, about = load_trajectory(folder.trajectory)
     measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
-    return finished(folder, stand, trajectory, about, measure, log, options.field)
+    begun = folder.state.load(NETWORK)
+    return finished(folder, stand, trajectory, about, measure, log, options.field, begun)
 
 
 def _looked_at(options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder) -> Stand:
@@ -235,6 +237,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
     Raises:
         ProgdfError: the folder is no finished run, or its scene is gone or another.
     """
+    check_network_options(options)
     use_threads(options.threads)
     run = reopened(options.run, options.scene)
     log = RunLog(run.folder.log, quiet, refits=True)
@@ -246,7 +249,8 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
             log.say(warning)
         said = {"text_before": options.text_before, "text_after": options.text_after}
         said = {name: text for name, text in {**said, "clip_model": options.clip_model}.items() if text}
-        now = {"field": options.field, "target_psnr": options.target_psnr, **said}
+        network = {name: getattr(options, name) for name in NETWORK_OPTIONS if name != "fit"}
+        now = {"field": options.field, "target_psnr": options.target_psnr, "fit": "after", **network, **said}
         about = {**run.about, "options": {**run.about["options"], **now}}
         return finished(run.folder, stand, run.trajectory, about, perceptual, log, options.field)
     finally:

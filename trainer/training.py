@@ -18,13 +18,14 @@ from trainer.editors.base import EditKind
 from trainer.groups import Groups, group_stage, restored_groups, way
 from trainer.interrupts import held
 from trainer.losses import Perceptual, eroded
+from trainer.network import begin_alongside, keep
 from trainer.objective import Losses, Objective, loss_table
 from trainer.options import TrainOptions
 from trainer.pgs import Renewal, Snapshot, Stage, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
 from trainer.settings import loss_weights, pgs_settings
-from trainer.state import Autosave, Saved, StateFolder
+from trainer.state import Autosave, Resumable, Saved, StateFolder
 from trainer.trajectory import Trajectory, record, retime, straightened
 from trainer.views import crop
 
@@ -128,14 +129,18 @@ def trained(
     objective = Objective(perceptual, loss_weights(options, kind), inside)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder)
-    kept = Autosave(
-        folder, PART, {"pgs": state, "recordings": recordings, "log": log}, every_s=options.save_every
-    )
+    beside = begin_alongside(options, stand, settings.rates, stages)
+    parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
+    kept = Autosave(folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every)
     if kept.restore():
+        if beside is not None:
+            beside.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"going on at step {state.step} of {options.steps}, with {len(recordings.made)} recordings")
     with log.steps("optimise", options.steps) as advance, held() as stopped:
 
         def step_done(step: int, left: float) -> None:
+            if beside is not None:
+                beside.step()
             advance(step, f"loss to the edit {left:.4f}")
             if stopped():
                 kept.save()
@@ -147,6 +152,8 @@ def trained(
                 original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
             ):
                 recordings.add(found)
+                if beside is not None:
+                    beside.add(found.step, found.offsets)
         except FloatingPointError as error:
             kept.save()
             raise ProgdfError(
@@ -154,6 +161,8 @@ def trained(
                 "with --resume, or try --kind style in another folder"
             ) from error
     kept.save()
+    if beside is not None:
+        keep(beside, folder)
     losses = loss_table([(made.step, made.means) for made in recordings.made])
     left = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
@@ -179,7 +188,12 @@ def _groups(
     done = folder.load("groups")
     if done is not None:
         return restored_groups(original, done.tensors)
-    groups = group_stage(original, crops, targets, options.group_steps, options.seed)
+    try:
+        groups = group_stage(original, crops, targets, options.group_steps, options.seed)
+    except FloatingPointError as error:
+        raise ProgdfError(
+            f"training broke down: {error}; mend the edited views and go on with --resume"
+        ) from error
     folder.save("groups", groups.saved(), {})
     for line in groups.lines():
         log.say(line)

@@ -34,12 +34,12 @@ from progdf.field.separable import LEVELS, channel_weights, check_trajectory, mo
 PictureLoss = Callable[[Tensor, Tensor], Tensor]
 """Packed offsets of the field, packed offsets recorded at the same strength -> loss. [M,C], [M,C] -> []"""
 
-_EFFORT: Mapping[Size, tuple[int, int, float]] = {
+EFFORT: Mapping[Size, tuple[int, int, float]] = {
     "tiny": (6000, 2048, 5e-3),
     "small": (1200, 2048, 2e-3),
     "paper": (2000, 1024, 5e-4),
 }
-"""Steps, members drawn in each, learning rate."""
+"""Steps, members drawn in each, largest learning rate."""
 
 _WARMUP = 50  # steps
 
@@ -72,7 +72,7 @@ class NeuralSettings:
 
     def settled(self) -> NeuralSettings:
         """The same with every 0 replaced by the size's own value."""
-        steps, batch, rate = _EFFORT[self.size]
+        steps, batch, rate = EFFORT[self.size]
         return replace(self, steps=self.steps or steps, batch=self.batch or batch, rate=self.rate or rate)
 
 
@@ -115,6 +115,11 @@ class NeuralFit:
         self._importance = torch.full((len(self.shape.columns),), 1.0 / len(self.shape.columns))
         self._end = torch.zeros(len(rows), len(self.shape.columns))
         self._told = torch.zeros(0)
+
+    @property
+    def members(self) -> int:
+        """Number of members M."""
+        return len(self._rows)
 
     def scale_to(self, offsets: Tensor, importance: Mapping[str, float] | None = None) -> None:
         """Learn of the trajectory's size, or of how it has grown; what the network answers stays the same.
