@@ -39,7 +39,7 @@ from trainer.views import View, crop
 _MOST_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
 _HARMLESS_DB = 28.0  # what differs by less is not seen, whatever its share of a faint change
 _REMEDIES = {
-    "style": "use a calmer style (14, 20, 23, 7), or --reedit-every 200",
+    "style": "use a calmer style (14, 23, 20, 7), or --reedit-every 200",
     "instruct": "use less --guidance or --reedit-every 200, or --kind geometry if parts move",
     "folder": "edit the views more alike, or say --kind geometry if parts move",
 }
