@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -25,7 +24,7 @@ THRESHOLDS: dict[Rule, float] = {"share": 0.7, "count": 0.8, "paper": 0.8}
 _HIDDEN = 0.06
 """Below this clearness a Gaussian counts as never seen: what shines through tells of what covers it."""
 
-_HALF_HIDDEN, _DOUBTFUL = 0.2, (0.3, 0.7)
+_HALF_HIDDEN, _DOUBTFUL = 0.3, (0.3, 0.7)
 """Below this clearness and with a share between these, what was seen decides nothing either."""
 
 
@@ -118,7 +117,7 @@ def lift_masks(
 
 
 def undecided(evidence: Evidence) -> Tensor:
-    """Which Gaussians the views tell nothing sure of: hidden ones, and half hidden ones of mixed share. [N]"""
+    """Which Gaussians the views tell nothing sure of: hidden, or half hidden and of mixed share. [N] bool"""
     share = score(evidence, "share")
     mixed = (share > _DOUBTFUL[0]) & (share < _DOUBTFUL[1])
     return (evidence.clearness < _HIDDEN) | (mixed & (evidence.clearness < _HALF_HIDDEN))
