@@ -13,7 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, PositionFloor, baked_neural, position_floor
 from progdf.field.judge import FieldJudge
 from progdf.field.neural import Inputs, NeuralShape
-from progdf.field.neural_fit import NeuralFit, PictureLoss, rendered_importance, trained
+from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
 from trainer.bank import Alongside
@@ -25,6 +25,7 @@ from trainer.options import NETWORK_OPTIONS, TrainOptions
 from trainer.pgs import Stage
 from trainer.preparation import Stand, probes
 from trainer.progress import RunLog
+from trainer.resume import plain_options
 from trainer.state import Saved, StateFolder
 from trainer.trajectory import Trajectory
 
@@ -69,7 +70,9 @@ def network_settings(options: Mapping[str, Any]) -> NeuralSettings:
     """What the options, JSON values of this or an older run, say of the network."""
     said = {name: options.get(name, default) for name, default in NETWORK_OPTIONS.items()}
     inputs: Inputs = "position" if said["fit"] == "alongside" else said["inputs"]
-    return NeuralSettings(said["size"], inputs, said["code"], said["bins"], seed=int(options.get("seed", 0)))
+    steps = EFFORT[said["size"]][0] // 3 if options.get("quick") else 0
+    seed = int(options.get("seed", 0))
+    return NeuralSettings(said["size"], inputs, said["code"], said["bins"], steps, seed=seed)
 
 
 def begin_alongside(
@@ -89,7 +92,7 @@ def begin_alongside(
     slices = attribute_slices(channels)
     attributes = tuple(name for name, columns in slices.items() if bool((rates[columns] > 0).any()))
     rows = pack(stand.scene[stand.region.members], with_shN=channels > BASE_CHANNELS)
-    settings = network_settings({name: getattr(options, name) for name in (*NETWORK_OPTIONS, "seed")})
+    settings = network_settings(plain_options(options))
     seen = visibility(stand.scene, stand.region.members, stand.train)
     small = probes(stand)
 
