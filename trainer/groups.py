@@ -16,14 +16,13 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
-from trainer.crops import CropScene
+from trainer.crops import CropScene, render_all
 from trainer.group_search import GroupSearch, OnStep
 from trainer.motion import Motion, Parts, between, carried, carried_back, make_parts
 from trainer.parts import connected_parts
 from trainer.pgs import Stage
 
-GROWTH = 2.0
-"""How many times a Gaussian may grow beyond its part; larger ones are fog that hides an error."""
+_EXTENT = 7.0  # part sizes; see the table in settings.py
 
 
 @dataclass(frozen=True)
@@ -38,10 +37,24 @@ class Groups:
     parts: Parts
     motions: tuple[Motion, ...]
 
-    def stage(self, original: Tensor, stage: Stage, index: int) -> Stage:
-        """A stage whose members' offsets are those in their parts' frames. `original`: raw rows [M,C]"""
-        motion = self.motions[index]
-        return replace(stage, place=lambda offsets: carried(original, offsets, self.parts, motion))
+    @property
+    def extent(self) -> float:
+        """Size of what the members still have to move within their parts, world units."""
+        return _EXTENT * float(self.parts.sizes.mean())
+
+    def staged(self, original: Tensor, crops: Sequence[CropScene], stages: Sequence[Stage]) -> list[Stage]:
+        """The stages, their members' offsets now in the parts' frames. `original`: raw member rows [M,C]"""
+        return [
+            self._staged(original, crops, stage, motion)
+            for stage, motion in zip(stages, self.motions, strict=True)
+        ]
+
+    def _staged(self, original: Tensor, crops: Sequence[CropScene], stage: Stage, motion: Motion) -> Stage:
+        def place(offsets: Tensor) -> Tensor:
+            return carried(original, offsets, self.parts, motion)
+
+        found = render_all(crops, original + place(torch.zeros_like(original)))
+        return replace(stage, place=place, start=found)
 
     def lines(self) -> list[str]:
         """What the log says of the finished edit: where each part went, in its own sizes."""

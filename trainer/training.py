@@ -122,8 +122,8 @@ def trained(
     groups = None
     if kind == "geometry" and options.group_steps:
         groups = _groups(options, original, crops, [stage.targets for stage in stages], folder, log)
-        stages = [groups.stage(original, stage, index) for index, stage in enumerate(stages)]
-    extent = 2.0 * scene_sphere(scene[members])[1]
+        stages = groups.staged(original, crops, stages)
+    extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
     inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
     objective = Objective(perceptual, loss_weights(options, kind), inside)
