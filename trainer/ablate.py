@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.bench import Table, machine
+from progdf.bench import machine
 from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
@@ -24,7 +24,7 @@ from progdf.files import written_whole
 from progdf.pictures import write_image
 from progdf.slider_statistics import slider_statistics
 from trainer.ablation_ground import Ground, digest_of, make_ground, plain, run_options
-from trainer.ablation_table import Outcome, sheet_of, table_of
+from trainer.ablation_table import Outcome, sheet_of, table_of, told
 from trainer.artefacts import RunFolder, locked, write_json
 from trainer.editors.base import EditKind
 from trainer.fit import fit_field, without_idle_attributes
@@ -49,10 +49,17 @@ _WIDTH = 176  # of a picture in the sheet, pixels
 
 @dataclass(frozen=True)
 class Ablation:
-    """All variants that are done, and the table of them."""
+    """All variants that are done.
 
+    Args:
+        title: one line
+        outcomes: in order
+        perceptual: name of the distance, LPIPS or what stands in for it
+    """
+
+    title: str
     outcomes: Sequence[Outcome]
-    table: Table
+    perceptual: str
 
 
 def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
@@ -92,7 +99,9 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
                         f"{i} of {len(wanted)} variants are done and kept in {root}; "
                         "give the same command to go on"
                     ) from None
-                _publish(root, variants, ground)
+                done = _publish(root, variants, ground)
+                found = next(outcome for outcome in done.outcomes if outcome.name == variant.name)
+                log.say(f"{variant.name}: {found.failed or told(found)}")
             for variant in variants:
                 StateFolder(root / variant.name / "state").end()
             return _publish(root, variants, ground)
@@ -144,7 +153,7 @@ def _recorded(
     begun = {"digest": digest_of(ground, variant, optimisation=True)}
     if state.identity() != begun:
         state.begin(begun)
-    edited = ground.edited if options.stages > 1 else {1.0: ground.edited[1.0]}
+    edited = ground.edited if options.stages != 1 else {1.0: ground.edited[1.0]}
     with log.stage("optimise"):
         trajectory, _ = trained(options, ground.stand, edited, ground.kind, perceptual, state, log)
     trajectory, _ = without_idle_attributes(trajectory, ground.judge)
@@ -211,7 +220,8 @@ def _publish(root: Path, variants: Sequence[Variant], ground: Ground) -> Ablatio
         f"with, {size.width}x{size.height} pixels, {len(ground.run.region)} members."
     )
     measure = perceptual_loss()[0].name
-    table = table_of(outcomes, title, "LPIPS" if measure.startswith("lpips") else measure, note)
+    distance = "LPIPS" if measure.startswith("lpips") else measure
+    table = table_of(outcomes, title, distance, note)
     strips = {}
     for outcome in outcomes:
         if not outcome.failed:
@@ -224,4 +234,4 @@ def _publish(root: Path, variants: Sequence[Variant], ground: Ground) -> Ablatio
     rows: list[Mapping[str, Any]] = [asdict(outcome) for outcome in outcomes]
     about = {"machine": machine(), "note": note, "perceptual": measure, "options": plain(options)}
     write_json(root / "ablation.json", {**about, "variants": rows})
-    return Ablation(outcomes, table)
+    return Ablation(title, outcomes, distance)

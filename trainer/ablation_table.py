@@ -64,15 +64,30 @@ def table_of(outcomes: Sequence[Outcome], title: str, perceptual: str, note: str
     return Table("ablation", title, columns, rows, " ".join(text for text in notes if text))
 
 
-def print_table(table: Table) -> None:
-    """On the terminal."""
-    drawn = RichTable(title=table.title, title_justify="left", box=None, pad_edge=False)
-    for i, column in enumerate(table.columns):
-        drawn.add_column(column, justify="left" if i < 2 else "right", no_wrap=i != 1)
-    for row in table.rows:
-        drawn.add_row(*row)
+def print_table(outcomes: Sequence[Outcome], title: str, perceptual: str) -> None:
+    """The figures on the terminal, within 80 columns."""
+    drawn = RichTable(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0))
+    columns = (
+        "variant",
+        "PSNR",
+        perceptual,
+        *(f"{s:g}"[1:] for s in BETWEEN),
+        "even",
+        "t50",
+        "t90",
+        "bytes",
+        "s",
+    )
+    for i, column in enumerate(columns):
+        drawn.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
+    for outcome in outcomes:
+        name, _, *figures = _row(outcome)
+        drawn.add_row(name, *figures)
     console = Console(highlight=False)
     console.print(drawn)
+    for outcome in outcomes:
+        if outcome.failed:
+            console.print(f"{outcome.name}: {outcome.failed}", soft_wrap=True)
 
 
 def sheet_of(
@@ -93,7 +108,7 @@ def sheet_of(
     shown = [outcome for outcome in outcomes if outcome.name in strips]
     return contact_sheet(
         [editor, *(strips[outcome.name] for outcome in shown)],
-        ["the editor", *(f"{outcome.name}\n{_short(outcome)}" for outcome in shown)],
+        ["the editor", *(f"{outcome.name}\n{told(outcome)}" for outcome in shown)],
         [f"s = {s:g}" for s in SHOWN],
         title,
         caption,
@@ -118,8 +133,8 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
     )
 
 
-def _short(outcome: Outcome) -> str:
-    """The two figures that say most: how good the end is, how good the way."""
+def told(outcome: Outcome) -> str:
+    """In short: the two figures that say most: how good the end is, how good the way."""
     between = list((outcome.between or {}).values())
     way = f", between {sum(between) / len(between):.1f}" if between else ""
     return f"end {outcome.psnr:.1f}{way} dB"

@@ -49,7 +49,8 @@ def ablate(argv: Sequence[str]) -> int:
     from trainer.ablate import ablate as run
     from trainer.ablation_table import print_table
 
-    print_table(run(options).table)
+    done = run(options)
+    print_table(done.outcomes, done.title, done.perceptual)
     return 0
 
 

@@ -14,7 +14,7 @@ LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158,
 
 _ZOOM = 2  # drawn at twice the size and scaled down, for smooth edges
 _MARKED = 20  # lines of at most so many points show them
-_DECADES = 3  # a logarithmic axis shows no more below its highest value
+_DECADES = 3  # a logarithmic axis shows no more, the least values lie on its floor
 
 Points = tuple[Sequence[float], Sequence[float]]
 """xs and ys; what is not finite leaves a gap."""
@@ -127,12 +127,13 @@ def _span(ys: Sequence[float], plot: Plot) -> tuple[float, float]:
     high = max(ys) if plot.high is None else max(plot.high, *ys)
     if plot.form == "bars":
         low = min(0.0, low)
-    return (max(low, high * 10.0**-_DECADES), high) if plot.scale == "log" else (low, high)
+    return low, high
 
 
 def _decades(low: float, high: float) -> list[float]:
     """1, 2, 5 in every decade, or the decades alone where there are many; they enclose the range."""
-    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    last = math.ceil(math.log10(high))
+    first = max(math.floor(math.log10(low)), last - _DECADES)
     steps = (1, 2, 5) if last - first <= 2 else (1,)
     marks = [m * 10.0**power for power in range(first, last + 1) for m in steps]
     start = max((m for m in marks if m <= low * (1 + 1e-9)), default=marks[0])
