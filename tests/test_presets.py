@@ -13,7 +13,7 @@ from trainer.cli import train_options
 from trainer.objective import LossWeights
 from trainer.options import Preset, TrainOptions, settled
 from trainer.presets import PRESETS, under_preset
-from trainer.settings import loss_weights, pgs_settings
+from trainer.settings import loss_weights, pgs_settings, stages_to_ask
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
 
@@ -53,7 +53,7 @@ def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() 
 
 
 def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too() -> None:
-    assert asked("--preset", "paper", "--stages", "8").stages == asked().stages == 8
+    assert asked("--preset", "paper", "--stages", "0").stages == asked().stages == 0
 
 
 def test_the_papers_trainer_is_as_printed() -> None:
@@ -77,6 +77,14 @@ def test_by_default_a_colour_edit_is_paid_in_l1_mostly_and_a_style_for_its_textu
     colour, style, geometry = (loss_weights(asked(), kind) for kind in ("colour", "style", "geometry"))
     assert (colour.perceptual, style.perceptual, geometry.perceptual) == (0.1, 0.3, 0.3)
     assert (colour.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
+
+
+def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
+    asks = {kind: stages_to_ask(settled(asked()), kind) for kind in ("colour", "style", "geometry")}
+    assert asks == {"colour": 8, "style": 1, "geometry": 8}
+    assert stages_to_ask(settled(asked("--stages", "4")), "style") == 4
+    assert stages_to_ask(settled(asked("--quick")), "colour") == 4
+    assert stages_to_ask(settled(asked("--quick", "--stages", "2")), "colour") == 2
 
 
 def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() -> None:

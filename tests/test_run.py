@@ -216,7 +216,7 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     )
     options = settled(cli.parsed(trainer.options.TrainOptions, words, "progdf train"))
     assert (options.seed, options.slider, options.name) == (7, "even", "r")
-    assert (options.steps, options.views, options.stages) == (240, 12, 4)
+    assert (options.steps, options.views) == (240, 12)
 
 
 def test_one_member_in_one_view_is_enough(folder: Path) -> None:

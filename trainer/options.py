@@ -32,6 +32,8 @@ NETWORK_OPTIONS: Mapping[str, Any] = {
 }
 """Options of a neural field, and what they are where nothing is said."""
 
+MOST_STAGES = 8
+"""Strengths that an editor with a dial is asked for if nobody says how many, at most."""
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
@@ -87,8 +89,9 @@ class TrainOptions:
     group_steps: int = 120
     """geometry: first the connected parts of the region are moved as wholes, in so many steps per strength
     or twice as many; 0: every Gaussian finds its own way, which smears what moves far."""
-    stages: int = 8
-    """Strengths that a procedural editor is asked for; 1 is the paper's way, towards the end alone."""
+    stages: int = 0
+    """Strengths that an editor with a dial is asked for; 0: 8, but 1 for a style, which is the paper's way,
+    towards the end alone."""
     sh: Literal["auto", "off"] = "auto"
     """Colours that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (auto), or left as they are."""
@@ -96,7 +99,7 @@ class TrainOptions:
     """Learning rates: as the kind of edit needs, with short steps on the last stretch; or 3DGS's own, flat,
     for all attributes (paper), which hardly move in 600 steps."""
     perceptual: Net = "alex"
-    """LPIPS through AlexNet or VGG16, which takes fifteen times as long."""
+    """LPIPS through AlexNet, or VGG16, with which a run takes more than twice as long and is no better."""
     perceptual_weight: float | None = None
     """Weight of LPIPS beside L1; by default .1 for colour, .3 for style and geometry (paper: 1)."""
     perceptual_every: int = 2
@@ -107,12 +110,13 @@ class TrainOptions:
     progressive_weight: float = 5.0
     """Weight of the progressive constraint as a loss (paper: 5)."""
     sharpness: Literal["auto", "hinge", "paper", "off"] = "auto"
-    """Sharpness of the renders: not less than the target's (hinge), or the printed term, which does nothing
-    (paper). auto: hinge for style, off for colour and geometry."""
+    """Sharpness of the renders: not less than the target's (hinge), or the printed term, which pulls at no
+    pixel but the rim's (paper). auto: hinge for style, off for colour and geometry."""
     sharpness_weight: float | None = None
-    """Weight of the sharpness; by default .5 for hinge, 1 for paper."""
+    """Weight of the sharpness; by default .3 for hinge, 1 for paper."""
     recording: Literal["smooth", "raw"] = "smooth"
-    """Record a running mean of the parameters and drop jitter, or the bare iterates (paper)."""
+    """Record a running mean of the parameters and drop jitter, or the bare iterates (paper), between which
+    the slider's steps differ five times as much."""
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
     field: FieldKind = "auto"
@@ -223,7 +227,7 @@ def settled(options: TrainOptions) -> TrainOptions:
     for what, value, low, high in (
         ("--views", options.views, 3, 96),
         ("--image-size", options.image_size, 32, 2048),
-        ("--stages", options.stages, 1, 16),
+        ("--stages", options.stages, 0, 16),
         ("--group-steps", options.group_steps, 0, 10_000),
         ("--threads", options.threads, 0, 1024),
         ("--perceptual-every", options.perceptual_every, 1, 1000),
@@ -235,10 +239,10 @@ def settled(options: TrainOptions) -> TrainOptions:
     ):
         if value is not None and not low <= value <= high:
             raise ProgdfError(f"{what} is {value}; {low} to {high} would be right")
-    if options.steps < 4 * options.stages:
+    stages = options.stages or MOST_STAGES
+    if options.steps < 4 * stages:
         raise ProgdfError(
-            f"--steps is {options.steps}; at least {4 * options.stages} "
-            f"would be right for {options.stages} stages"
+            f"--steps is {options.steps}; at least {4 * stages} would be right for {stages} stages"
         )
     for what, weight in (
         ("--perceptual-weight", options.perceptual_weight),

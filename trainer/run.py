@@ -42,7 +42,7 @@ from trainer.progress import RunLog
 from trainer.reedit import reedit
 from trainer.reopen import its_views, reopened
 from trainer.resume import one_line, open_session, plain_options, still_there
-from trainer.settings import loss_weights
+from trainer.settings import loss_weights, stages_to_ask
 from trainer.training import retimed, trained
 from trainer.trajectory import load_trajectory, save_trajectory
 
@@ -157,8 +157,8 @@ def _edited(
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
-    strengths = strengths_to_ask(editor, options.stages)
     kind: EditKind = editor.kind if options.kind == "auto" else options.kind
+    strengths = strengths_to_ask(editor, stages_to_ask(options, kind))
     confined = to_confine(editor, options, kind)
     with log.steps("edit", len(views) * len(strengths)) as advance:
         edited = edited_views(editor, views, strengths, folder, confined, advance)
