@@ -4,6 +4,7 @@ RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log
 RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
 RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
 RUN/views/painted/…                              what a learned editor painted, see editors/kept.py
+RUN/segmented/PROMPT/VIEW.png                    where text:"…" found it; a folder for masks:DIR
 RUN/state/…                                      what a stopped run needs to go on, see state.py
 """
 
@@ -58,6 +59,11 @@ class RunFolder:
         return self.root / "report.png"
 
     @property
+    def segmented(self) -> Path:
+        """Masks of text:"…", a folder a prompt; they are made before the run begins."""
+        return self.root / "segmented"
+
+    @property
     def log(self) -> Path:
         """What happened."""
         return self.root / "log.txt"
@@ -90,7 +96,9 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
     if root.exists() and not root.is_dir():
         raise ProgdfError(f"{root} is a file; give --out a folder")
     folder = RunFolder(root)
-    if root.is_dir() and not all(_LEFTOVER.fullmatch(entry.name) for entry in root.iterdir()):
+    if root.is_dir() and not all(
+        _LEFTOVER.fullmatch(entry.name) or entry == folder.segmented for entry in root.iterdir()
+    ):
         first = (
             folder.log.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0]
             if folder.log.is_file()

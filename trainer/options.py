@@ -20,6 +20,7 @@ from trainer.trajectory import Slider
 Preset = Literal["default", "paper"]
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
+DETECTOR, OUTLINER = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "keyframes", "neural"]
 
 NETWORK_OPTIONS: Mapping[str, Any] = {
@@ -49,10 +50,22 @@ class TrainOptions:
     out: Path
     """Folder of the run; made if need be."""
     region: str
-    """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r; join by + -."""
+    """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r, masks:DIR (one a
+    camera), photomasks:DIR (of photographs), text:"the man's shirt"; join by + -."""
     editor: str
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
+    lift: Literal["share", "count", "paper"] = "share"
+    """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
+    its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
+    lift_threshold: float | None = None
+    """masks, text: least score of a member; by default .7 for share, .8 for count and paper."""
+    detector: str = DETECTOR
+    """text: id or folder of the GroundingDINO that finds things, downloaded before."""
+    outliner: str = OUTLINER
+    """text: id or folder of the SAM that outlines them, downloaded before."""
+    detect_least: float = 0.3
+    """text: confidence that a find needs, 0 to 1; lower finds more, also what is not meant."""
     model: str = ""
     """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
     guidance: float | None = None
@@ -235,6 +248,8 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--image-guidance", options.image_guidance, 1, 100),
         ("--edit-steps", options.edit_steps, 1, 1000),
         ("--edit-size", options.edit_size, 32, 4096),
+        ("--lift-threshold", options.lift_threshold, 0, 1),
+        ("--detect-least", options.detect_least, 0, 1),
         ("--reedit-every", options.reedit_every, 0, 100_000),
     ):
         if value is not None and not low <= value <= high:

@@ -40,6 +40,7 @@ from trainer.preparation import (
 )
 from trainer.progress import RunLog
 from trainer.reedit import reedit
+from trainer.regions import region_kinds, region_settings
 from trainer.reopen import its_views, reopened
 from trainer.resume import one_line, open_session, plain_options, still_there
 from trainer.settings import loss_weights, stages_to_ask
@@ -63,8 +64,9 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
     options = settled(options)
     check_editor(options.editor)
     scene = load_ply(options.scene)
-    region = parse_region(options.region, scene, options.name)
     edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
+    kinds = region_kinds(region_settings(options, edit, quiet))
+    region = parse_region(options.region, scene, options.name, kinds)
     folder = claim(options.out, edit)
     with stopping(), locked(folder), one_line(folder):
         session = open_session(folder, options, edit, region, wanted_threads(options.threads))

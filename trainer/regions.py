@@ -1,0 +1,195 @@
+"""Regions that pictures tell of: masks:DIR, photomasks:DIR and text:"…", lifted from 2D to Gaussians."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import torch
+from rich.progress import track
+from torch import Tensor
+
+from progdf.camera import Camera, orbit_rig
+from progdf.camera_files import load_cameras, save_cameras
+from progdf.errors import ProgdfError
+from progdf.framing import guess_up, is_surrounding
+from progdf.gaussians import Gaussians
+from progdf.rasterize import render
+from progdf.region import Region
+from progdf.region_spec import Kind
+from trainer.artefacts import claim
+from trainer.editors.kept import KeptPictures, Recipe
+from trainer.lift import Rule, lift_masks
+from trainer.options import TrainOptions
+from trainer.preparation import BACKGROUND
+from trainer.segmenters import SEGMENTERS, Segmenter, SegmenterSettings
+from trainer.segmenters.folder import read_masks
+from trainer.views import fit_size, named
+
+LIFTED_AT = 512
+"""Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
+
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """How masks become a region.
+
+    Args:
+        cameras: file of cameras, as --cameras; None: a rig around the scene, for masks that are made here
+        views: how many pictures are segmented, at most
+        rule: see `lift.score`
+        threshold: least score of a member, 0..1; None is the rule's own
+        segmenter: which networks, how sure
+        kept: makes, and names, the folder in which segmented pictures are kept
+        quiet: no progress on the screen
+    """
+
+    cameras: Path | None
+    views: int
+    kept: Callable[[], Path]
+    rule: Rule = "share"
+    threshold: float | None = None
+    segmenter: SegmenterSettings = SegmenterSettings()
+    quiet: bool = False
+
+
+def region_settings(options: TrainOptions, edit: Mapping[str, str], quiet: bool) -> RegionSettings:
+    """What the options of a run say; pictures that are segmented are kept in its folder.
+
+    Args:
+        options: settled
+        edit: see `claim`
+        quiet: see `RegionSettings`
+    """
+
+    def kept() -> Path:
+        return claim(options.out, edit).segmented  # nothing is written into a folder that is no run of ours
+
+    return RegionSettings(
+        options.cameras,
+        options.views,
+        kept,
+        options.lift,
+        options.lift_threshold,
+        SegmenterSettings(options.detector, options.outliner, options.detect_least),
+        quiet,
+    )
+
+
+def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
+    """The kinds of region that pictures tell of, for `parse_region`.
+
+    masks:DIR are drawn over straight pictures, as RUN/views/original are; photomasks:DIR over photographs,
+    which are straightened where the cameras have lenses.
+    """
+
+    def from_folder(rest: str, scene: Gaussians, bent: bool) -> Region:
+        kind = "photomasks" if bent else "masks"
+        if not rest:
+            raise ProgdfError(f"{kind}: names no folder; write {kind}:DIR with a mask for each camera in DIR")
+        folder = Path(rest).expanduser()
+        own = folder / "cameras.json"
+        if not own.is_file() and settings.cameras is None and folder.is_dir():
+            raise ProgdfError(
+                f"the masks in {folder} have no cameras; give --cameras, or put a cameras.json beside them"
+            )
+        cameras = _cameras(own if own.is_file() or settings.cameras is None else settings.cameras)
+        masks = read_masks(folder, cameras, bent)
+        return _lifted(scene, cameras, masks, f"{kind}:{rest}", settings)
+
+    def from_text(rest: str, scene: Gaussians) -> Region:
+        prompt = rest.strip().strip("\"'“”").strip()
+        if not prompt:
+            raise ProgdfError('text: names nothing; write text:"the man\'s shirt"')
+        cameras = _segmented_cameras(scene, settings)
+        folder = settings.kept() / _slug(prompt)
+        masks = _segmented(scene, cameras, prompt, folder, settings)
+        found = [i for i, mask in enumerate(masks) if bool(mask.any())]
+        if not found:
+            raise ProgdfError(
+                f"'{prompt}' is found in none of {len(masks)} views; say it otherwise, or lower "
+                f"--detect-least (now {settings.segmenter.least:g})"
+            )
+        # a view in which it is not found is not one in which it is not
+        seen, shown = [cameras[i] for i in found], [masks[i] for i in found]
+        return _lifted(scene, seen, shown, f"text:{prompt}", settings)
+
+    return {
+        "masks": lambda rest, scene: from_folder(rest, scene, bent=False),
+        "photomasks": lambda rest, scene: from_folder(rest, scene, bent=True),
+        "text": from_text,
+    }
+
+
+def _lifted(
+    scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor], name: str, settings: RegionSettings
+) -> Region:
+    small = [fit_size(camera, LIFTED_AT) for camera in cameras]
+    scaled = [_scaled(mask, camera) for mask, camera in zip(masks, small, strict=True)]
+    region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold)
+    if not len(region):
+        raise ProgdfError(
+            f"{name} selects no Gaussian by the rule {settings.rule}; its highest score is "
+            f"{float(region.score.max()):.2g}, so a lower --lift-threshold would be right"
+        )
+    return region
+
+
+def _scaled(mask: Tensor, camera: Camera) -> Tensor:
+    """The mask in the camera's size, averaged. [H,W] -> [h,w]"""
+    size = (camera.height, camera.width)
+    if tuple(mask.shape) == size:
+        return mask.float()
+    return torch.nn.functional.interpolate(mask.float()[None, None], size=size, mode="area")[0, 0]
+
+
+def _segmented(
+    scene: Gaussians, cameras: Sequence[Camera], prompt: str, folder: Path, settings: RegionSettings
+) -> list[Tensor]:
+    """The prompt's mask in every view; read where it is kept, of the same picture by the same networks."""
+    chosen = settings.segmenter
+    recipe: Recipe = {
+        "prompt": prompt,
+        "detector": chosen.detector,
+        "outliner": chosen.outliner,
+        "least": chosen.least,
+    }
+    loaded: Callable[[], Segmenter] = cache(lambda: SEGMENTERS["text"](chosen))
+
+    def paint(image: Tensor) -> Tensor:
+        return loaded()(image, prompt).float()[..., None].expand(-1, -1, 3)
+
+    kept = KeptPictures(folder)
+    masks = []
+    for camera in track(cameras, description=f"segment '{prompt}'", disable=settings.quiet, transient=True):
+        with torch.no_grad():
+            picture = render(scene, camera, BACKGROUND).clamp(0.0, 1.0)
+        masks.append(kept.picture(camera.name, picture, recipe, paint)[..., 0])
+    save_cameras(folder / "cameras.json", cameras)  # so that the folder is one for masks:DIR
+    return masks
+
+
+def _segmented_cameras(scene: Gaussians, settings: RegionSettings) -> list[Camera]:
+    """The given cameras, evenly thinned out, or a rig around the scene."""
+    if settings.cameras is not None:
+        offered = _cameras(settings.cameras)
+        count = min(settings.views, len(offered))
+        taken = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
+        return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
+    if is_surrounding(scene, guess_up(scene)):
+        raise ProgdfError(
+            "the scene looks like one to stand inside, which cameras around it cannot show; "
+            "give its own with --cameras"
+        )
+    return named(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT))
+
+
+def _cameras(path: Path) -> list[Camera]:
+    return named(load_cameras(path))
+
+
+def _slug(prompt: str) -> str:
+    return re.sub(r"[^\w]+", "-", prompt.lower()).strip("-")[:60] or "text"

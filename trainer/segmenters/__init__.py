@@ -1,0 +1,13 @@
+"""Segmenters: a picture and a prompt in, a mask out. One file, one line in `SEGMENTERS`, one test each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from trainer.segmenters.base import Segmenter, SegmenterSettings
+from trainer.segmenters.grounded_sam import grounded_sam
+
+SEGMENTERS: Mapping[str, Callable[[SegmenterSettings], Segmenter]] = {"text": grounded_sam}
+"""Kind of region → the segmenter behind it, loaded when it is made."""
+
+__all__ = ["SEGMENTERS", "Segmenter", "SegmenterSettings"]

@@ -1,0 +1,70 @@
+"""Masks made elsewhere, one picture a camera: white is the region, black is not, grey is in between.
+
+    DIR/NAME.png        named as the run names the camera's view (see RUN/views/original)
+    DIR/cameras.json    the cameras, where the masks bring their own; else those of --cameras
+
+Any size with the camera's proportions will do. Transparent pixels lie outside the region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.lens import straightened
+from trainer.editors.folder import SUFFIXES
+
+
+def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor]:
+    """The mask of every camera, scaled to its size. [H,W] float32 0..1 each
+
+    Args:
+        folder: see the module's head
+        cameras: with the names of their views
+        bent: the masks were drawn over photographs, which the cameras' lenses have bent: straighten them
+
+    Raises:
+        ProgdfError: the folder or a mask is missing, broken, or of other proportions.
+    """
+    if not folder.is_dir():
+        raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
+    return [_mask(_file(folder, camera, len(cameras)), camera, bent) for camera in cameras]
+
+
+def _file(folder: Path, camera: Camera, count: int) -> Path:
+    for suffix in SUFFIXES:
+        path = folder / f"{camera.name}{suffix}"
+        if path.is_file():
+            return path
+    raise ProgdfError(
+        f"{folder} has no mask {camera.name}.png; put one there for each of the {count} cameras, "
+        "black where a view does not show the region"
+    )
+
+
+def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
+    try:
+        with Image.open(path) as opened:
+            picture = opened.convert("RGBA")
+    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
+        raise ProgdfError(f"{path} cannot be read as a picture; save the mask as PNG") from error
+    if abs(picture.width * camera.height / (picture.height * camera.width) - 1.0) > 0.02:
+        raise ProgdfError(
+            f"{path} is {picture.width}x{picture.height} pixels, its camera "
+            f"{camera.width}x{camera.height}; a mask with the camera's proportions would be right"
+        )
+    black = Image.new("RGBA", picture.size, "black")
+    grey = Image.alpha_composite(black, picture).convert("L")
+    if grey.size != (camera.width, camera.height):
+        grey = grey.resize((camera.width, camera.height), Image.Resampling.BOX)
+    mask = torch.from_numpy(np.asarray(grey, dtype=np.float32) / 255.0)
+    if bent and camera.lens:
+        return straightened(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
+    return mask

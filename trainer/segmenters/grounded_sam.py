@@ -1,0 +1,136 @@
+"""What a sentence names: GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al. 2023) outlines.
+
+Together they are what the paper calls LangSAM. Weights are read from this machine, never fetched unasked.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.pictures import to_picture
+from trainer.options import DETECTOR, OUTLINER
+from trainer.segmenters.base import SegmenterSettings
+
+_BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError)
+"""What transformers raises for a model that is not there, not whole, or another's."""
+
+
+@dataclass(frozen=True)
+class GroundedSam:
+    """Both networks with their processors; make it with `grounded_sam`.
+
+    Args:
+        detector, detector_processor: `GroundingDinoForObjectDetection`, `GroundingDinoProcessor`
+        outliner, outliner_processor: `SamModel`, `SamProcessor`
+        least: confidence of a find, 0..1
+    """
+
+    detector: Any
+    detector_processor: Any
+    outliner: Any
+    outliner_processor: Any
+    least: float
+
+    def __call__(self, image: Tensor, prompt: str) -> Tensor:
+        """See `Segmenter`: the union of the outlines of all that is found."""
+        picture = to_picture(image)
+        with torch.no_grad():
+            boxes = self.boxes(picture, prompt)
+            if not len(boxes):
+                return torch.zeros(image.shape[:2], dtype=torch.bool)
+            inputs = self.outliner_processor(
+                images=picture, input_boxes=[boxes.tolist()], return_tensors="pt"
+            )
+            found = self.outliner(
+                pixel_values=inputs["pixel_values"], input_boxes=inputs["input_boxes"], multimask_output=False
+            )
+        masks: Tensor = self.outliner_processor.post_process_masks(
+            found.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"]
+        )[0]
+        return masks.bool().flatten(0, 1).any(dim=0)
+
+    def boxes(self, picture: Any, prompt: str) -> Tensor:
+        """x0, y0, x1, y1 in pixels of all that is found in a PIL image. [B,4]"""
+        inputs = self.detector_processor(images=picture, text=as_asked(prompt), return_tensors="pt")
+        found = self.detector_processor.post_process_grounded_object_detection(
+            self.detector(**inputs),
+            inputs["input_ids"],
+            threshold=self.least,
+            text_threshold=self.least,
+            target_sizes=[(picture.height, picture.width)],
+        )[0]
+        boxes: Tensor = found["boxes"].float()
+        return boxes
+
+
+def as_asked(prompt: str) -> str:
+    """A prompt as GroundingDINO was trained on: lower case, ending in a full stop."""
+    words = " ".join(prompt.lower().split()).rstrip(". ")
+    return f"{words}."
+
+
+def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
+    """Load both networks from this machine.
+
+    Raises:
+        ProgdfError: transformers is not installed, weights are missing or broken, or a model is another kind.
+    """
+    try:
+        from transformers import (
+            AutoConfig,
+            GroundingDinoForObjectDetection,
+            GroundingDinoProcessor,
+            SamModel,
+            SamProcessor,
+        )
+        from transformers.utils import logging as speaks
+    except ImportError as error:
+        raise ProgdfError(
+            f"text: needs the package transformers ({error}); pip install progdf-studio[segment]"
+        ) from error
+    # it warns on stderr of every optional package that it can do without
+    speaks.set_verbosity(logging.ERROR)
+    speaks.disable_progress_bar()
+
+    def loaded(
+        model: str, kind: str, option: str, usual: str, network: Any, processor: Any
+    ) -> tuple[Any, Any]:
+        try:
+            found = AutoConfig.from_pretrained(model, local_files_only=True).model_type
+            if found != kind:
+                raise ProgdfError(f"{model} is a {found} model, no {kind}; give {option} {usual}")
+            return (
+                network.from_pretrained(model, local_files_only=True, use_safetensors=True).float().eval(),
+                processor.from_pretrained(model, local_files_only=True),
+            )
+        except ProgdfError:
+            raise
+        except _BROKEN as error:
+            raise ProgdfError(_missing(model, option)) from error
+
+    finder = loaded(
+        settings.detector,
+        "grounding-dino",
+        "--detector",
+        DETECTOR,
+        GroundingDinoForObjectDetection,
+        GroundingDinoProcessor,
+    )
+    outliner = loaded(settings.outliner, "sam", "--outliner", OUTLINER, SamModel, SamProcessor)
+    return GroundedSam(*finder, *outliner, settings.least)
+
+
+def _missing(model: str, option: str) -> str:
+    if Path(model).is_dir() or model.startswith((".", "/", "~")):
+        return f"{model} holds no whole model with safetensors weights; give {option} such a folder"
+    return (
+        f"the weights of {model} are not on this machine, or not whole; download them with "
+        f"'hf download {model}', or give {option} the folder of a saved model"
+    )
