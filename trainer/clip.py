@@ -77,10 +77,11 @@ def load_clip(model: str = CLIP_MODEL) -> Clip:
     speaks.disable_progress_bar()
     try:
         config = AutoConfig.from_pretrained(model, local_files_only=True)
-        if config.model_type != "clip":
-            raise ProgdfError(
-                f"{model} is a {config.model_type} model, no CLIP; give --clip-model {CLIP_MODEL}"
-            )
+    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+        raise ProgdfError(_missing(model)) from error
+    if config.model_type != "clip":
+        raise ProgdfError(f"{model} is a {config.model_type} model, no CLIP; give --clip-model {CLIP_MODEL}")
+    try:
         network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
         tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:

@@ -1,0 +1,180 @@
+"""What a report tells: errors over the slider, plots one can read, memory by stage."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.field import BakedField, fit_keyframes
+from progdf.gaussians import pack
+from tests.trained import WHITE, Small, small
+from trainer.judge import Judge, make_judge
+from trainer.losses import GradientL1
+from trainer.measures import courses
+from trainer.memory import PeakMemory
+from trainer.plots import LINES, Plot, draw_plot, ticks
+from trainer.report import best_view, editor_strip, strip, thumbnail
+
+
+def _judged(bear: Small) -> Judge:
+    """A judge whose editor has painted everything darker, at half strength and in full."""
+    edited = {s: [view.image * (1 - 0.5 * s) for view in bear.views] for s in (0.5, 1.0)}
+    return make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
+
+
+def _darker(bear: Small, amount: float = 0.6) -> BakedField:
+    """A field that goes straight to a darker region."""
+    end = torch.zeros(len(bear.region), 14)
+    end[:, 11:] = -amount
+    return fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
+
+
+def _color_count(picture: Image.Image, color: Sequence[int]) -> int:
+    return int((np.abs(np.asarray(picture, dtype=int) - np.array(color)).max(axis=2) <= 12).sum())
+
+
+def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None:
+    bear = small(count=3)
+    judge, field = _judged(bear), _darker(bear)
+    truth = {s: judge.pictures(field.offsets(s)) for s in (0.3, 0.8)}
+    found = courses(judge, {"slider": field}, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
+    assert found.s == (0.3, 0.8)
+    assert found.psnr == (99.0, 99.0)
+    assert found.ssim == pytest.approx((1.0, 1.0), abs=1e-5)  # single precision
+    assert found.lpips == (0.0, 0.0)
+
+
+def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
+    bear = small(count=3)
+    judge = _judged(bear)
+    fields = {"near": _darker(bear, 0.55), "far": _darker(bear, 0.2)}
+    truth = judge.pictures(_darker(bear).offsets(1.0))
+    found = courses(judge, fields, (1.0,), lambda _: truth, GradientL1())
+    assert found["near"].psnr[0] > found["far"].psnr[0] + 6
+    assert found["near"].ssim[0] > found["far"].ssim[0]
+    assert found["near"].lpips[0] < found["far"].lpips[0]
+
+
+def test_ssim_counts_the_pixels_of_the_region_of_all_views_alike() -> None:
+    bear = small(count=3)
+    judge = _judged(bear)
+    truth = judge.pictures(_darker(bear).offsets(0.0))
+    worse = [picture.clone() for picture in truth]
+    worse[0] += 0.2 * torch.rand(worse[0].shape, generator=torch.Generator().manual_seed(0))
+    outside = [torch.where(px[..., None], p, 1 - p) for p, px in zip(truth, judge.pixels, strict=True)]
+    assert judge.ssim(truth, truth) == pytest.approx(1.0, abs=1e-5)
+    assert judge.ssim(worse, truth) < 0.95
+    # pixels beside the region reach into the window of those at its border, and no further
+    assert judge.psnr(outside, truth) == 99.0
+
+
+def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_was_not_asked() -> None:
+    bear = small(count=3)
+    judge = _judged(bear)
+    ours, own = strip(judge, _darker(bear), 64), editor_strip(judge, 64)
+    assert len(ours) == len(own) == 5
+    assert {picture.shape for picture in (*ours, *own)} == {ours[0].shape}
+    assert torch.equal(ours[0], own[0])
+    assert float(ours[4].mean()) < float(ours[2].mean()) < float(ours[0].mean())
+    grey = (own[1] - own[1].mean()).abs() < 0.02
+    assert float(grey.float().mean()) > 0.5
+    assert int(judge.pixels[best_view(judge)].sum()) == max(int(p.sum()) for p in judge.pixels)
+
+
+@pytest.mark.parametrize("size", [(40, 40), (20, 60), (90, 30)])
+def test_a_thumbnail_has_the_width_that_is_asked_for_and_is_never_tall(size: tuple[int, int]) -> None:
+    picture = thumbnail(torch.zeros(*size, 3), 80)
+    assert picture.shape[1] == 80
+    assert picture.shape[0] <= 100
+    assert float((picture < 0.1).float().sum()) > 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (23.96, 63.4), (0.9, 0.9), (-0.31, 0.27), (1e-4, 3e-4)]
+)
+def test_ticks_are_few_even_and_enclose_the_range(low: float, high: float) -> None:
+    marks = ticks(low, high)
+    assert 2 <= len(marks) <= 9
+    assert marks[0] <= low
+    assert marks[-1] >= high
+    assert np.allclose(np.diff(marks), marks[1] - marks[0])
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_every_line_of_a_plot_is_drawn_in_its_colour(scale: str) -> None:
+    x = [i / 10 for i in range(11)]
+    lines = {f"line {k}": (x, [0.1 + 0.2 * k + 0.05 * v for v in x]) for k in range(4)}
+    picture = draw_plot(Plot("title", lines, "slider", scale), 400, 270)  # type: ignore[arg-type]
+    assert picture.size == (400, 270)
+    assert all(_color_count(picture, color) > 150 for color in LINES[:4])
+    assert _color_count(picture, LINES[4]) == 0
+
+
+def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:
+    holes = ([0.0, 0.5, 1.0], [float("nan"), 0.0, 2.0])
+    for scale in ("linear", "log"):
+        draw_plot(Plot("t", {"holes": holes, "none": ([], [])}, scale=scale), 300, 200)  # type: ignore[arg-type]
+    empty = draw_plot(Plot("t", {"none": ([], [])}), 300, 200)
+    assert _color_count(empty, LINES[0]) == 0
+
+
+def test_bars_stand_on_zero_and_are_as_high_as_their_values() -> None:
+    values = [1.0, 2.0, 4.0]
+    picture = np.asarray(draw_plot(Plot("t", {"b": ([0, 1, 2], values)}, form="bars"), 300, 220), dtype=int)
+    blue = np.abs(picture - np.array(LINES[0])).max(axis=2) <= 12
+    columns = blue.sum(axis=0)
+    heights = [int(part.max()) for part in np.array_split(columns[30:], 3)]
+    assert heights[1] == pytest.approx(2 * heights[0], abs=3)
+    assert heights[2] == pytest.approx(4 * heights[0], abs=5)
+
+
+def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
+    lines = {f"a name of some length {k}": ([0.0, 1.0], [k, k + 1.0]) for k in range(4)}
+    picture = np.asarray(draw_plot(Plot("t", lines), 400, 270), dtype=int)
+    for color in LINES[:4]:
+        rows = np.nonzero((np.abs(picture - np.array(color)).max(axis=2) <= 12).sum(axis=1) >= 10)[0]
+        assert rows.min() < 90, color  # the legend's, above the plot
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a peak cannot be forgotten")
+def test_every_stage_has_its_own_peak_of_memory() -> None:
+    memory = PeakMemory()
+    memory.begin("large")
+    block: Tensor | None = torch.ones(32 << 20)  # 128 MB
+    memory.end("large")
+    block = None
+    memory.begin("small")
+    memory.begin("inner")
+    memory.end("inner")
+    memory.end("small")
+    assert block is None
+    assert memory.by_stage["large"] > memory.by_stage["small"] + 100
+    assert memory.by_stage["small"] >= memory.by_stage["inner"] > 10
+    assert memory.peak() == memory.by_stage["large"]
+
+
+def test_a_resumed_run_remembers_the_peaks_of_its_first_session() -> None:
+    memory = PeakMemory()
+    memory.begin("views")
+    memory.end("views")
+    memory.restore({"views": 1 << 20, "edit": 7}, 1 << 21)
+    assert memory.by_stage == {"views": 1 << 20, "edit": 7}
+    assert memory.peak() == 1 << 21
+
+
+def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None:
+    bear = small(count=3)
+    edited = {1.0: [view.image for view in bear.views]}
+    wide = pack(bear.scene[bear.region.members], with_shN=True).shape[1]
+    assert wide > 14
+    judge = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, wide)
+    offsets = _darker(bear).offsets(1.0)
+    narrow = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
+    for a, b in zip(judge.pictures(offsets), narrow.pictures(offsets), strict=True):
+        assert torch.allclose(a, b, atol=1e-6)
