@@ -1,11 +1,11 @@
 """Training commands that are stopped in every way there is, and what they must have in common afterwards.
 
-    python -m tests.stopped SCENE_FOLDER SAVE_EVERY MOMENT[,MOMENT…]
+    python -m tests.stopped SCENE_FOLDER OPTIONS MOMENT[,MOMENT…]
 
-trains into the folder `run` of the current one, again and again with --resume, and is killed -9 each time: at
-a whole MOMENT just before (even) or after (odd) that many files were put in place, at a broken one after so
-many seconds. The processes are forked from one that has imported everything. After the last moment nothing
-is killed. Prints a line for each: the moment and how the process ended.
+trains with these OPTIONS, a JSON table, into the folder `run` of the current one, again and again with
+--resume, and is killed -9 each time: at a whole MOMENT just before (even) or after (odd) that many files were
+put in place, at a broken one after so many seconds. The processes are forked from one that has imported
+everything. After the last moment nothing is killed. Prints a line for each: the moment and how it ended.
 """
 
 from __future__ import annotations
@@ -90,6 +90,6 @@ def killed_again_and_again(options: TrainOptions, moments: Sequence[float]) -> l
 
 
 if __name__ == "__main__":
-    run = small_run(Path(sys.argv[1]), save_every=float(sys.argv[2]))
+    run = small_run(Path(sys.argv[1]), **json.loads(sys.argv[2]))
     ends = killed_again_and_again(run, [float(moment) for moment in sys.argv[3].split(",") if moment])
     sys.exit(ends[-1])

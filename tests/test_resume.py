@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -134,10 +134,11 @@ def files_up_to(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def killed(scene: Path, where: Path, save_every: float, moments: list[float]) -> list[str]:
+def killed(scene: Path, where: Path, moments: Sequence[float], **options: object) -> list[str]:
     """`python -m tests.stopped`; its lines."""
+    arguments = [str(scene), json.dumps(options), ",".join(map(str, moments))]
     told = subprocess.run(
-        [sys.executable, "-m", "tests.stopped", str(scene), str(save_every), ",".join(map(str, moments))],
+        [sys.executable, "-m", "tests.stopped", *arguments],
         cwd=where,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
         capture_output=True,
@@ -153,25 +154,32 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
 ) -> None:
     draw = random.Random(7)
     # among the views, among the edited ones, twice in the optimisation, at the end
-    moments = [
-        float(draw.randint(low, high)) for low, high in ((2, 12), (14, 26), (19, 40), (30, 50), (9, 30))
-    ]
-    lines = killed(scene, tmp_path, 0.0, moments)
+    spans = ((2, 12), (14, 26), (19, 40), (30, 50), (9, 30))
+    lines = killed(scene, tmp_path, [float(draw.randint(*span)) for span in spans], save_every=0)
     assert sum(line.endswith("-9") for line in lines) >= 4, lines
     assert bits(tmp_path / OUT) == bits(uninterrupted)
 
 
 @pytest.mark.slow
-def test_a_run_killed_at_forty_moments_goes_on_to_the_same_bits(
-    scene: Path, uninterrupted: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"save_every": 0.2},
+        {"save_every": 0, "kind": "geometry", "group_steps": 12},
+        {"save_every": 0, "field": "neural", "fit": "alongside", "size": "tiny", "quick": True},
+    ],
+    ids=["colour", "parts", "alongside"],
+)
+def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
+    scene: Path, tmp_path: Path, options: dict[str, object]
 ) -> None:
+    killed(scene, tmp_path, [], **options)
+    expected = bits(tmp_path / OUT)
+    shutil.rmtree(tmp_path / OUT)
     draw = random.Random(11)
-    for every in (0.0, 0.2):
-        where = tmp_path / str(every)
-        where.mkdir()
-        moments = [draw.choice((float(draw.randint(1, 60)), draw.uniform(0.2, 3.5))) for _ in range(20)]
-        killed(scene, where, every, moments)
-        assert bits(where / OUT) == bits(uninterrupted)
+    moments = [draw.choice((float(draw.randint(1, 60)), draw.uniform(0.2, 4.0))) for _ in range(16)]
+    killed(scene, tmp_path, moments, **options)
+    assert bits(tmp_path / OUT) == expected
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
