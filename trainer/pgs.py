@@ -57,8 +57,7 @@ class PgsSettings:
         ramp: share of a stage's steps in which its target moves from the last stage's pictures to its own
         fall: share of a stage's steps, its last, in which the learning rate falls to a tenth; 0: flat
         reach: mean change of the changing pixels in a stage for which the rates are right; a shorter way gets
-            smaller steps, a longer one larger, up to 1.5 times; 0: the same for all
-        least: how much smaller, at most
+            smaller steps, down to a quarter, a longer one larger, up to 1.5 times; 0: the same for all
         smoothing: share that the recorded running mean keeps of itself at each step; 0 records the bare
             iterates
         growth: how many times a Gaussian may grow, beyond what its stage places it at
@@ -72,7 +71,6 @@ class PgsSettings:
     ramp: float = 0.6
     fall: float = 0.35
     reach: float = 0.05
-    least: float = 0.25
     smoothing: float = 0.9
     growth: float = math.inf
     snapshots: int = 32
@@ -89,14 +87,15 @@ class Stage:
         steps: how many steps
         place: turns the members' own offsets, which are optimised, into those that are seen and recorded: a
             part that moves as a whole takes them along; differentiable. [M,C] -> [M,C]
-        start: the boxes as the stage finds them; None: at the last stage's targets. [h,w,3] each
+        length: factor to the learning rates; None: by the way that the pictures have to go, see
+            `PgsSettings.reach`
     """
 
     strength: float
     targets: Sequence[Tensor]
     steps: int
     place: Callable[[Tensor], Tensor] = lambda offsets: offsets
-    start: Sequence[Tensor] | None = None
+    length: float | None = None
 
 
 @dataclass(frozen=True)
@@ -186,11 +185,12 @@ def optimise(
         state.pictures = render_all(probes, original)
     for index in range(state.stage, len(stages)):
         stage = stages[index]
-        before = stage.start or (stages[index - 1].targets if index else render_all(crops, original))
+        before = stages[index - 1].targets if index else render_all(crops, original)
         objective.begin_stage()
-        change, reach = _way(stage.targets, before)
+        change, reach = visible_way(stage.targets, before)
         spacing = change * len(stages) / settings.snapshots
-        size = min(1.5, max(settings.least, reach / settings.reach)) if settings.reach > 0 else 1.0
+        size = min(1.5, max(0.25, reach / settings.reach)) if settings.reach > 0 else 1.0
+        size = size if stage.length is None else stage.length
         targets = stage.targets
         while state.local < stage.steps:
             if renewal is not None:
@@ -242,7 +242,7 @@ def _gradient(terms: Mapping[str, Tensor], state: PgsState) -> Tensor:
     return gradient
 
 
-def _way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
+def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
     """Mean change of the pictures, over all pixels and over those that change at all."""
     total, every, changing = 0.0, 0, 0
     for target, start in zip(targets, before, strict=True):
