@@ -89,6 +89,6 @@ def _unpacked_network(
         recorded,
     )
     pull = {name.removeprefix("pull."): t for name, t in tensors.items() if name.startswith("pull.")}
-    ranks = {str(name): int(rank) for name, rank in described["ranks"].items()}
-    error = {str(name): float(value) for name, value in described["bake_error"].items()}
+    ranks = {str(name): int(rank) for name, rank in dict(described["ranks"]).items()}
+    error = {str(name): float(value) for name, value in dict(described["bake_error"]).items()}
     return NeuralForm(network, BakePlan(tensors["nodes"], ranks, pull), str(described["rows_sha256"]), error)
