@@ -57,7 +57,15 @@ class PgsState:
             self._queue = torch.randperm(count, generator=self._order).tolist()
         return self._queue[-1]
 
-    def descend(self, gradient: Tensor, rates: Tensor, length: float, damped: bool, smoothing: float) -> None:
+    def descend(
+        self,
+        gradient: Tensor,
+        rates: Tensor,
+        length: float,
+        damped: bool,
+        smoothing: float,
+        growth: float = math.inf,
+    ) -> None:
         """One step of Adam (Kingma and Ba 2015), with a rate per column; the next view is due.
 
         Adam does not know how large a gradient is, so a member that hardly shows would wander as far as one
@@ -71,6 +79,7 @@ class PgsState:
             length: factor to them all
             damped: see above; False is Adam as printed
             smoothing: share that the running mean keeps of itself; it starts exactly at the original
+            growth: how many times as large as it was a member may become
         """
         done = self.step + 1
         self.first.lerp_(gradient, 0.1)
@@ -84,16 +93,11 @@ class PgsState:
         with torch.no_grad():
             self.previous.copy_(self.moved)
             self.moved -= length * (rates * mean / (spread + floor))
+            if growth < math.inf:
+                self.moved[:, attribute_slices(len(rates))["log_scales"]].clamp_(max=math.log(growth))
         self.average.lerp_(self.moved.detach(), 1.0 - min(smoothing, (self.step + 1) / (self.step + 10)))
         self.step, self.local = done, self.local + 1
         self._queue.pop()
-
-    def hold_growth(self, most: float) -> None:
-        """Let no member be more than `most` times as large as it was; inf: however large."""
-        if math.isfinite(most):
-            columns = attribute_slices(self.moved.shape[1])["log_scales"]
-            with torch.no_grad():
-                self.moved[:, columns].clamp_(max=math.log(most))
 
     def saved(self) -> Saved:
         """See `state.Resumable`."""
