@@ -15,7 +15,7 @@ from trainer.crops import CropScene, crop_scene
 from trainer.editors import make_editor
 from trainer.losses import GradientL1
 from trainer.objective import LossWeights, Objective
-from trainer.pgs import PgsSettings, Snapshot, Stage, learning_rates, optimise
+from trainer.pgs import PgsSettings, Snapshot, Stage, learning_rates, most_change, optimise
 from trainer.views import crop
 
 STRENGTHS = (0.5, 1.0)
@@ -117,3 +117,15 @@ def test_geometry_edits_have_rates_for_everything_and_scale_with_the_size_of_the
     means = attribute_slices(14)["means"]
     assert torch.allclose(large_rates[means], 10 * small_rates[means])
     assert torch.equal(large_rates[3:], small_rates[3:])
+
+
+def test_steps_are_sized_by_the_farthest_changes_and_not_by_their_mean() -> None:
+    before = torch.zeros(10, 10, 3)
+    target = torch.full((10, 10, 3), 0.02)
+    target[:1, :, 1] = 0.5  # a tenth of the pixels goes far
+    target[5:] = 0.0  # half do not change at all
+    assert most_change([target], [before]) == pytest.approx(0.5)
+    assert most_change([before], [before]) == 0.0
+    strip = torch.full((20, 10, 3), 0.1)
+    strip[0, :2] = 1.0  # a hundredth is no measure
+    assert most_change([strip], [torch.zeros(20, 10, 3)]) == pytest.approx(0.1)

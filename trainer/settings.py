@@ -100,7 +100,7 @@ def pgs_settings(
         warmup,
         # one target alone is approached slowly: quick steps towards it shine in all colours half way
         ramp=0.0 if kind == "geometry" else 0.9 if stages == 1 else 0.6,
-        reach=0.0 if kind == "geometry" else 0.05,
+        reach=0.0 if kind == "geometry" else 0.16,
         fall=1.0 if stages == 1 else 0.35,
         smoothing=smoothing,
         growth=GROWTH if kind == "geometry" and options.group_steps else math.inf,
