@@ -128,8 +128,8 @@ class TrainOptions:
     sharpness_weight: float | None = None
     """Weight of the sharpness; by default .3 for hinge, 1 for paper."""
     recording: Literal["smooth", "raw"] = "smooth"
-    """Record a running mean of the parameters and drop jitter, or the bare iterates (paper), between which
-    the slider's steps differ five times as much."""
+    """Record a running mean of the parameters whenever the pictures have moved, and drop jitter; or the bare
+    iterates at even steps (paper), between which the slider's steps differ far more."""
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
     field: FieldKind = "auto"

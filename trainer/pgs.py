@@ -64,6 +64,7 @@ class PgsSettings:
             iterates
         growth: how many times a Gaussian may grow, beyond what its stage places it at
         snapshots: recordings over all stages, about
+        every: record every so many steps; 0: by visible change
         seed: order of the views
     """
 
@@ -76,6 +77,7 @@ class PgsSettings:
     smoothing: float = 0.9
     growth: float = math.inf
     snapshots: int = 32
+    every: int = 0
     seed: int = 0
 
 
@@ -220,10 +222,10 @@ def optimise(
             )
 
             last = state.local == stage.steps
-            if last or state.local % 2:
+            if last or (state.step % settings.every == 0 if settings.every else state.local % 2):
                 offsets = stage.place(state.average)
                 pictures = render_all(probes, original + offsets, moving)
-                if last or _mean_distance(pictures, state.pictures) >= spacing:
+                if last or settings.every or _mean_distance(pictures, state.pictures) >= spacing:
                     state.pictures = pictures
                     state.recorded += 1
                     yield Snapshot(state.step, index, last, offsets.clone(), state.means.read())

@@ -83,7 +83,7 @@ def pgs_settings(
     if options.sh == "off":
         rates[BASE_CHANNELS:] = 0.0
     warmup = options.progressive == "warmup"
-    smoothing = 0.9 if options.recording == "smooth" else 0.0
+    smoothing, every = (0.9, 0) if options.recording == "smooth" else (0.0, max(1, options.steps // 32))
     if options.rates == "3dgs":  # a plain descent: the target at once, the same steps throughout
         return PgsSettings(
             rates,
@@ -93,6 +93,7 @@ def pgs_settings(
             fall=0.0,
             reach=0.0,
             smoothing=smoothing,
+            every=every,
             seed=options.seed,
         )
     return PgsSettings(
@@ -103,6 +104,7 @@ def pgs_settings(
         reach=0.0 if kind == "geometry" else 0.16,
         fall=1.0 if stages == 1 else 0.35,
         smoothing=smoothing,
+        every=every,
         growth=GROWTH if kind == "geometry" and options.group_steps else math.inf,
         seed=options.seed,
     )
