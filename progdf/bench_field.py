@@ -7,27 +7,33 @@ in views that the choice of ranks has not seen, over the pixels that the edit ch
 from __future__ import annotations
 
 import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from progdf.bench import Table
+from progdf.bench_course import edit_of, known_course, milliseconds, step_ms
+from progdf.bench_network import network_table
 from progdf.camera import Camera
-from progdf.checkpoint import Gdf, fingerprint
+from progdf.checkpoint import Gdf
 from progdf.compose import compose
 from progdf.composer import Composer
-from progdf.field import BakedField, Candidate, FieldJudge, choose_field, fit_keyframes, fit_separable
+from progdf.field import (
+    Candidate,
+    choose_field,
+    fit_keyframes,
+    fit_separable,
+)
 from progdf.field.choose import separable_within
-from progdf.field.rendered import Render, rendered_courses
+from progdf.field.rendered import rendered_courses
 from progdf.field.separable import channel_weights
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.layers import Layer
-from progdf.rasterize import alpha_weights, render, set_threads
+from progdf.rasterize import set_threads
 from progdf.rasterize.threads import threads
-from progdf.region import from_mask
 from progdf.scenes import AnalyticEdit, bear, bear_edits
 
 EDITS = ("gold", "stripes", "tilted ears")
@@ -38,7 +44,7 @@ CLOUDS = ((3_000, 30_000), (100_000, 100_000))
 
 def tables() -> list[Table]:
     """Error against bytes; a slider step against copying as many bytes."""
-    return [_field_table(), _compose_table()]
+    return [_field_table(), _network_table(), _compose_table()]
 
 
 def _field_table() -> Table:
@@ -50,7 +56,7 @@ def _field_table() -> Table:
         edit, members = edits[name]
         for candidate in _candidates(scene.gaussians, edit, members, cameras):
             field = candidate.field
-            step = _step_ms(scene.gaussians, _edit(scene.gaussians, members, field))
+            step = step_ms(scene.gaussians, edit_of(scene.gaussians, members, field))
             rows.append(
                 (
                     f"{name}, {len(members)} members",
@@ -70,25 +76,21 @@ def _field_table() -> Table:
     )
 
 
+def _network_table() -> Table:
+    scene = bear(BEAR)
+    edit, members = bear_edits(scene)[EDITS[0]]
+    cameras = [camera.resized(SIDE, SIDE) for camera in scene.cameras]
+    stand = known_course(scene.gaussians, edit, members, cameras, SNAPSHOTS)
+    return network_table(EDITS[0], scene.gaussians, members, stand)
+
+
 def _candidates(
     scene: Gaussians, edit: AnalyticEdit, members: Tensor, cameras: Sequence[Camera]
 ) -> list[Candidate]:
-    with_sh = bool((edit.apply(scene, members, 1.0).shN != scene.shN).any())
-    start = pack(scene[members], with_sh)
-
-    def truth(s: float) -> Tensor:
-        return pack(edit.apply(scene, members, s)[members], with_sh) - start
-
-    strengths = torch.linspace(0, 1, SNAPSHOTS)
-    offsets = torch.stack([truth(float(s)) for s in strengths])
-    seen, unseen = cameras[::11][:3], cameras[5::10][:3]
-    judge = FieldJudge(strengths, offsets, _changed_pixels(scene, members, offsets, unseen), truth)
-    visible = sum(
-        (alpha_weights(scene, camera, torch.ones(SIDE, SIDE))[members, 2].float() for camera in seen),
-        torch.zeros(len(members)),
-    )
-    weights = visible / visible.mean() + 1e-3
-    look = _changed_pixels(scene, members, offsets, seen)
+    stand = known_course(scene, edit, members, cameras, SNAPSHOTS)
+    strengths, offsets, judge, look, weights = (
+        stand.strengths, stand.offsets, stand.judge, stand.look, stand.weights
+    )  # fmt: skip
     found = [
         judge.candidate(fit_keyframes(strengths, offsets, count), f"{count} keyframes, float32")
         for count in (2, 4, 9)
@@ -103,18 +105,6 @@ def _candidates(
     return [*found, Candidate(chosen.field, chosen.curve, f"auto at 40 dB: {chosen.label}")]
 
 
-def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras: Sequence[Camera]) -> Render:
-    start = pack(scene[members], offsets.shape[2] > 14)
-
-    def pictures(moved: Tensor) -> list[Tensor]:
-        edited = scene.replace_rows(members, start + moved)
-        return [render(edited, camera) for camera in cameras]
-
-    ends = [pictures(offsets[t]) for t in (0, len(offsets) // 2, -1)]
-    counts = [((b - a).abs() + (c - a).abs()).amax(dim=2) > 2 / 255 for a, b, c in zip(*ends, strict=True)]
-    return lambda moved: torch.cat([p[c] for p, c in zip(pictures(moved), counts, strict=True)])
-
-
 def _compose_table() -> Table:
     rows = []
     for members, count in CLOUDS:
@@ -124,7 +114,7 @@ def _compose_table() -> Table:
         offsets = torch.randn(9, members, 14, generator=rng).cumsum(dim=0)
         offsets -= offsets[:1].clone()
         field = fit_separable(torch.linspace(0, 1, 9), offsets, dict.fromkeys(ATTRIBUTES, 2))
-        rows.append(_compose_row(scene, _edit(scene, chosen, field)))
+        rows.append(_compose_row(scene, edit_of(scene, chosen, field)))
     return Table(
         name="compose",
         title="A slider step: new attributes of all members",
@@ -156,12 +146,12 @@ def _compose_row(scene: Gaussians, edit: Gdf) -> tuple[str, ...]:
         for i in range(25):
             layer = Layer(edit, 0.03 + 0.9 * i / 25)
             if i % 5 == 0:
-                times["plain"].append(_ms(lambda layer=layer: compose(scene, [layer])))  # type: ignore[misc]
+                times["plain"].append(milliseconds(partial(compose, scene, [layer])))
             for key, count in (("one", 1), ("two", 2)):
                 set_threads(count)
                 composer.update([])
-                times[key].append(_ms(lambda layer=layer: composer.update([layer])))  # type: ignore[misc]
-            times["copy"].append(_ms(lambda: np.copyto(target, source)))
+                times[key].append(milliseconds(partial(composer.update, [layer])))
+            times["copy"].append(milliseconds(partial(np.copyto, target, source)))
             if i % 5 == 0:
                 plain = pack(compose(scene, [layer]))
                 difference = max(difference, float((pack(composer.gaussians) - plain).abs().max()))
@@ -177,23 +167,6 @@ def _compose_row(scene: Gaussians, edit: Gdf) -> tuple[str, ...]:
         f"{min(one, two) / copied:.1f}",
         f"{difference:g}",
     )
-
-
-def _step_ms(scene: Gaussians, edit: Gdf) -> float:
-    composer = Composer(scene, [edit])
-    return statistics.median(_ms(lambda s=s: composer.update([Layer(edit, s / 20)])) for s in range(1, 20))  # type: ignore[misc]
-
-
-def _ms(work: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    work()
-    return 1e3 * (time.perf_counter() - begin)
-
-
-def _edit(scene: Gaussians, members: Tensor, field: BakedField) -> Gdf:
-    mask = torch.zeros(len(scene), dtype=torch.bool)
-    mask[members] = True
-    return Gdf("edit", from_mask("edit", mask), field, fingerprint(scene))
 
 
 def _cloud(count: int, rng: torch.Generator) -> Gaussians:
