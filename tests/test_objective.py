@@ -16,7 +16,7 @@ from trainer.crops import crop_scene
 from trainer.editors import make_editor
 from trainer.losses import GradientL1, LpipsLoss, eroded, l1, progressive_change, sharpness
 from trainer.objective import LossWeights, Moment, Objective, TermMeans, loss_table, summed
-from trainer.pgs import PgsSettings, Stage, learning_rates, optimise
+from trainer.pgs import PgsSettings, Snapshot, Stage, learning_rates, optimise
 from trainer.views import crop
 
 
@@ -145,16 +145,21 @@ def test_the_progressive_change_is_the_printed_sum() -> None:
         assert decayed == pytest.approx(0.05 * 1.1 ** (-step / 50) * length)
 
 
-def distance_travelled(weights: LossWeights, steps: int = 30) -> float:
-    """Mean offset after a short recolouring of a small bear."""
+def recoloured(weights: LossWeights, steps: int = 30, **more: object) -> list[Snapshot]:
+    """The recordings of a short recolouring of a small bear."""
     case = small("body")
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     stage = Stage(1.0, [crop(editor.edit(v, 1.0), v.box) for v in case.views], steps)
     settings = PgsSettings(learning_rates("colour", original.shape[1], 1.0), ramp=0.0)
-    found = list(optimise(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
-    return float(found[-1].offsets.abs().mean())
+    settings = replace(settings, **more)  # type: ignore[arg-type]
+    return list(optimise(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
+
+
+def distance_travelled(weights: LossWeights) -> float:
+    """Mean offset at the end of it."""
+    return float(recoloured(weights)[-1].offsets.abs().mean())
 
 
 def test_the_printed_constraint_freezes_the_edit_and_a_small_weight_of_it_does_not() -> None:
@@ -164,6 +169,12 @@ def test_the_printed_constraint_freezes_the_edit_and_a_small_weight_of_it_does_n
         assert distance_travelled(weights) < 0.2 * free, progressive
     slight = LossWeights(progressive="decay", progressive_weight=1e-6)
     assert distance_travelled(slight) > 0.8 * free
+
+
+def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps() -> None:
+    frozen = LossWeights(progressive="growth")
+    assert [found.step for found in recoloured(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
+    assert len(recoloured(frozen)) < 4 < len(recoloured(LossWeights())), "else by what is seen"
 
 
 # ---- sharpness

@@ -63,7 +63,7 @@ def test_the_papers_trainer_is_as_printed() -> None:
     settings = pgs_settings(options, "colour", 23, 1.0, 1)
     assert bool((settings.rates > 0).all()), "all attributes are free"
     assert (settings.damped, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
-    assert settings.smoothing == 0.0
+    assert (settings.smoothing, settings.every) == (0.0, options.steps // 32)
     assert 1500 <= options.steps <= 2000
     assert (options.stages, options.views, options.slider) == (1, 96, "time")
 
