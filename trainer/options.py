@@ -126,7 +126,7 @@ class TrainOptions:
     """Sharpness of the renders: not less than the target's (hinge), or the printed term, which pulls at no
     pixel but the rim's (paper). auto: hinge for style, off for colour and geometry."""
     sharpness_weight: float | None = None
-    """Weight of the sharpness; by default .3 for hinge, 1 for paper."""
+    """Weight of the sharpness; by default .1 for hinge, 1 for paper."""
     recording: Literal["smooth", "raw"] = "smooth"
     """Record a running mean of the parameters whenever the pictures have moved, and drop jitter; or the bare
     iterates at even steps (paper), between which the slider's steps differ far more."""
