@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from progdf.field import BakedField, fit_keyframes
 from progdf.gaussians import pack
@@ -61,17 +62,20 @@ def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
     assert found["near"].lpips[0] < found["far"].lpips[0]
 
 
-def test_ssim_counts_the_pixels_of_the_region_of_all_views_alike() -> None:
+def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> None:
     bear = small(count=3)
-    judge = _judged(bear)
+    unedited = {1.0: [view.image for view in bear.views]}
+    judge = make_judge(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
     truth = judge.pictures(_darker(bear).offsets(0.0))
     worse = [picture.clone() for picture in truth]
     worse[0] += 0.2 * torch.rand(worse[0].shape, generator=torch.Generator().manual_seed(0))
-    outside = [torch.where(px[..., None], p, 1 - p) for p, px in zip(truth, judge.pixels, strict=True)]
-    assert judge.ssim(truth, truth) == pytest.approx(1.0, abs=1e-5)
+    # the window of a pixel at the region's border reaches 5 pixels beyond it
+    reach = [max_pool2d(pixels[None, None].float(), 11, 1, 5)[0, 0] > 0 for pixels in judge.pixels]
+    beyond = [torch.where(near[..., None], p, 1 - p) for p, near in zip(truth, reach, strict=True)]
+    assert any(not torch.equal(a, b) for a, b in zip(beyond, truth, strict=True))
+    assert judge.ssim(beyond, truth) == pytest.approx(1.0, abs=1e-5)
     assert judge.ssim(worse, truth) < 0.95
-    # pixels beside the region reach into the window of those at its border, and no further
-    assert judge.psnr(outside, truth) == 99.0
+    assert judge.psnr(beyond, truth) == 99.0
 
 
 def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_was_not_asked() -> None:

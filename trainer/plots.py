@@ -14,7 +14,7 @@ LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158,
 
 _ZOOM = 2  # drawn at twice the size and scaled down, for smooth edges
 _MARKED = 20  # lines of at most so many points show them
-_DECADES = 3  # a logarithmic axis shows no more, the least values lie on its floor
+_DECADES = 4  # a logarithmic axis shows no more, the least values lie on its floor
 
 Points = tuple[Sequence[float], Sequence[float]]
 """xs and ys; what is not finite leaves a gap."""
