@@ -266,6 +266,17 @@ def test_views_that_are_edited_are_not_edited_again(
     gone_on(scene, uninterrupted)
 
 
+@pytest.mark.usefixtures("stopped")
+def test_the_region_is_not_looked_for_again(
+    scene: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def parse_region(*_: object) -> None:
+        raise AssertionError("looked for again")
+
+    monkeypatch.setattr(trainer.run, "parse_region", parse_region)
+    gone_on(scene, uninterrupted)
+
+
 @pytest.mark.parametrize("broken", ["gone", "cut short"])
 @pytest.mark.usefixtures("stopped")
 def test_an_edited_view_that_was_lost_is_edited_again(scene: Path, uninterrupted: Path, broken: str) -> None:

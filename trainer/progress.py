@@ -71,9 +71,13 @@ class RunLog:
         self._earlier = saved.values["total"]
         self.memory.restore(**saved.values["memory"])
 
+    def note(self, text: str) -> None:
+        """A line for the file alone."""
+        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {text}\n")
+
     def say(self, text: str) -> None:
         """One line."""
-        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {text}\n")
+        self.note(text)
         if self._bar:
             self._console.print(f"[dim]{time.perf_counter() - self._start:6.1f} s[/dim]  {_escaped(text)}")
         else:

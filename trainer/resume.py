@@ -21,6 +21,9 @@ from trainer.options import TrainOptions, settled
 _ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
 """Options that change no bit of the result; `quick` is worked into others."""
 
+REGION = "region"
+"""Of the saved state: members and score."""
+
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -37,6 +40,13 @@ class Session:
     does: Literal["start", "go on", "nothing"]
     threads: int
     notes: tuple[str, ...] = ()
+
+
+def kept_region(options: TrainOptions) -> Region | None:
+    """The region of a stopped run that is to go on: what it was made from need not be looked at again."""
+    state = RunFolder(options.out).state
+    saved = state.load(REGION) if options.resume and state.identity() is not None else None
+    return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"]) if saved else None
 
 
 def open_session(
@@ -59,11 +69,11 @@ def open_session(
         _check_options(folder, _finished_options(folder), options, "leave --resume away to train anew")
         return Session("nothing", threads)
     remove_leftovers(folder)
-    now = _identity(options, region, threads)
+    now = _identity(options, threads)
     if options.resume and saved is not None:
         remedy = "give --resume the run's own options, or train anew in another folder"
         _check_options(folder, saved["options"], options, remedy)
-        for what in ("scene", "cameras", "region"):
+        for what in ("scene", "cameras"):
             if saved[what] != now[what]:
                 raise ProgdfError(
                     f"the {what} is no longer what {folder.root} was begun with; bring it back and go on "
@@ -82,6 +92,7 @@ def open_session(
         )
     begin_log(folder, edit)
     folder.state.begin(now)
+    folder.state.save(REGION, {"members": region.members, "score": region.score}, {"name": region.name})
     notes = (
         ["nothing to resume was saved yet, so the run starts from the beginning"] if options.resume else []
     )
@@ -142,13 +153,12 @@ def plain_options(options: TrainOptions) -> dict[str, Any]:
     }
 
 
-def _identity(options: TrainOptions, region: Region, threads: int) -> dict[str, Any]:
+def _identity(options: TrainOptions, threads: int) -> dict[str, Any]:
     """All that decides the bits of a run's result, as JSON values."""
     return {
         "options": plain_options(options),
         "scene": _digest(options.scene),
         "cameras": _digest(options.cameras) if options.cameras is not None else None,
-        "region": hashlib.sha256(region.members.numpy().tobytes()).hexdigest(),
         "threads": threads,
         "torch": torch.__version__,
     }

@@ -42,7 +42,7 @@ from trainer.progress import RunLog
 from trainer.reedit import reedit
 from trainer.regions import region_kinds, region_settings
 from trainer.reopen import its_views, reopened
-from trainer.resume import one_line, open_session, plain_options, still_there
+from trainer.resume import kept_region, one_line, open_session, plain_options, still_there
 from trainer.settings import loss_weights, stages_to_ask
 from trainer.training import retimed, trained
 from trainer.trajectory import load_trajectory, save_trajectory
@@ -63,10 +63,13 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
     """
     options = settled(options)
     check_editor(options.editor)
+    use_threads(options.threads)
     scene = load_ply(options.scene)
     edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
-    kinds = region_kinds(region_settings(options, edit, quiet))
-    region = parse_region(options.region, scene, options.name, kinds)
+    region = kept_region(options)
+    if region is None:
+        kinds = region_kinds(region_settings(options, edit, quiet))
+        region = parse_region(options.region, scene, options.name, kinds)
     folder = claim(options.out, edit)
     with stopping(), locked(folder), one_line(folder):
         session = open_session(folder, options, edit, region, wanted_threads(options.threads))
@@ -82,7 +85,7 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
             folder.state.end()
             return result
         except KeyboardInterrupt:
-            log.say("interrupted")
+            log.note("interrupted")
             raise
         finally:
             log.close()
