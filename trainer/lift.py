@@ -14,7 +14,7 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.region import Region
-from trainer.neighbours import surface_share
+from trainer.neighbours import surface_vote
 
 Rule = Literal["share", "count", "paper"]
 
@@ -99,25 +99,48 @@ def lift_masks(
         threshold: least score of a member, 0..1; None is the rule's own, see `THRESHOLDS`
 
     Returns:
-        The members, and the score of every Gaussian: the rule's for those that a view shows clearly; the
-        share of members among their neighbours, see `neighbours.majority`, for those that none does.
+        The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
+        is the rule's for Gaussians that the views decide; for the others it tells how much of the surface
+        around them belongs to the members (see `neighbours.surface_vote`), half of it being the threshold.
+        Where the views decide on no member there is none.
+
+    Intersection over union with the exact labels, mean and worst of the seven parts of the demo bear (24 000
+    Gaussians) that have at least 500, masks from 32 views of 512 pixels around the scene; in brackets the
+    mean if hidden Gaussians went by the rule as well, as they do in the paper:
+
+        threshold      share               count               paper
+        .01                                                    .76  .62  (.72)
+        .03                                                    .45  .30  (.45)
+        .1                                                     0    0    (0)
+        .3             .989 .978 (.86)     .88  .78  (.83)     0    0    (0)
+        .4             .990 .981 (.88)     .92  .86  (.84)
+        .5             .991 .982 (.89)     .94  .88  (.85)
+        .6             .990 .981 (.88)     .92  .84  (.85)
+        .7             .987 .977 (.86)     .86  .74  (.82)
+        .8             .973 .959 (.82)     .79  .64  (.74)     0    0    (0)
+        .9             .881 .685 (.73)     .54  .27  (.55)
+
+    At 256 pixels, or from 12 views, `share` at .7 is as good (worst .975, .978). 15 % of the bear are in no
+    view's sight, inside the scarf and under the plinth; of a trained scene (a toy robot, 31 000) few are, and
+    its parts come back with .998 to 1. Masks drawn a pixel too wide or too narrow cost far more than any rule
+    does: a splat is only a few pixels across.
     """
     least = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)
     scores = score(evidence, rule)
-    member = scores >= least
-    unseen = undecided(evidence)
-    if bool(member[~unseen].any()):
-        rows = unseen.nonzero()[:, 0]
-        scores[rows] = surface_share(scene, member, rows)
-        member[rows] = scores[rows] > 0.5
-    else:
-        scores, member = torch.where(unseen, 0.0, scores), member & ~unseen
+    rows = undecided(evidence, least).nonzero()[:, 0]
+    member = (scores >= least).index_fill(0, rows, False)
+    scores[rows] = 0.0
+    if bool(member.any()):
+        vote = surface_vote(scene, member, rows)
+        below = (least * (1 + vote)).clamp_max(float(torch.nextafter(torch.tensor(least), torch.tensor(0.0))))
+        scores[rows] = torch.where(vote > 0, least + (1 - least) * vote, below)
+        member[rows] = vote > 0
     return Region(name, member.nonzero()[:, 0], scores.clamp(0.0, 1.0))
 
 
-def undecided(evidence: Evidence) -> Tensor:
+def undecided(evidence: Evidence, least: float) -> Tensor:
     """Which Gaussians the views tell nothing sure of: hidden, or half hidden and of mixed share. [N] bool"""
     share = score(evidence, "share")
-    mixed = (share > _DOUBTFUL[0]) & (share < _DOUBTFUL[1])
+    mixed = (share > min(_DOUBTFUL[0], 1 - least)) & (share < max(_DOUBTFUL[1], least))
     return (evidence.clearness < _HIDDEN) | (mixed & (evidence.clearness < _HALF_HIDDEN))

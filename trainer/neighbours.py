@@ -59,12 +59,12 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return found, distances
 
 
-def surface_share(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
-    """How much of what surrounds each undecided Gaussian, on its own surface, belongs to the members.
+def surface_vote(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
+    """Whether what surrounds each undecided Gaussian, on its own surface, belongs to the members.
 
     Nearness in space alone would give the lining of a scarf to the neck under it. What counts is nearness
     along the surface: neighbours in each other's tangent plane that face the same way and have the same
-    colour and size. Undecided neighbours count with what they get themselves (the harmonic extension of the
+    colour and size. Undecided neighbours vote as they are voted on themselves (the harmonic extension of the
     decided ones), so that a decision travels along a surface to where no view looks.
 
     Args:
@@ -73,15 +73,15 @@ def surface_share(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor
         undecided: rows to decide. [U] int64
 
     Returns:
-        0..1, a half where no decided Gaussian is in reach. [U]
+        −1 none does .. 1 all do, 0 where no decided Gaussian is in reach. [U]
     """
     near, distances = nearest_rows(scene.means, undecided, _NEIGHBOURS)
     weights = _likeness(scene, undecided, near, distances)
-    share = member.float()
-    share[undecided] = 0.5
+    vote = 2.0 * member.float() - 1.0
+    vote[undecided] = 0.0
     for _ in range(_ROUNDS):
-        share[undecided] = (weights * share[near]).sum(dim=1)
-    return share[undecided]
+        vote[undecided] = (weights * vote[near]).sum(dim=1)
+    return vote[undecided]
 
 
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
