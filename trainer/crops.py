@@ -8,7 +8,7 @@ the box.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import Crop, rasterize
 from progdf.sh import basis, shade
 from trainer.losses import clamp_towards
+from trainer.tiles import live_pixels, live_tiles, reaching
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class CropScene:
         rows: where the members are among them, in the region's order. [M] int64
         member_shN: higher SH bands of the members in the original. [M,K,3]
         background: what shows through. [3]
+        cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
+            None where all are drawn
     """
 
     camera: Camera
@@ -44,6 +47,7 @@ class CropScene:
     rows: Tensor
     member_shN: Tensor
     background: Tensor
+    cached: tuple[Tensor, Tensor] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -77,6 +81,9 @@ class CropScene:
             put(members.opacities, self.opacities) if "logit_opacities" in moving else self.opacities,
             self.colors.index_copy(0, self.rows, member_colors(members, self.camera.position)),
         )
+        if self.cached is not None:
+            live, original = self.cached
+            image = torch.where(live, image, original)
         return clamp_towards(image, 0.0, 1.0), transmittance
 
     def _draw(
@@ -100,6 +107,10 @@ class CropScene:
         return image, transmittance
 
 
+GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
+"""Attributes that decide which pixels a Gaussian contributes to."""
+
+
 def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
     """SH colours seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
 
@@ -112,8 +123,25 @@ def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
     return clamp_towards(raw, 0.0, float("inf"))
 
 
-def crop_scene(scene: Gaussians, members: Tensor, camera: Camera, box: Crop, background: Tensor) -> CropScene:
-    """Prepare one view. `members`: rows of the region [M] int64; `background` [3]."""
+def crop_scene(
+    scene: Gaussians,
+    members: Tensor,
+    camera: Camera,
+    box: Crop,
+    background: Tensor,
+    still: bool = False,
+) -> CropScene:
+    """Prepare one view.
+
+    Args:
+        scene: the original
+        members: rows of the region. [M] int64
+        camera: the whole view
+        box: the pixels that are rendered
+        background: rgb. [3]
+        still: nothing but colours will move, so only the tiles that show a member are drawn, see `tiles`;
+            transmittance is then right in these only
+    """
     directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
     colors = shade(min(scene.sh_degree, 3), directions, scene.sh)
     _, _, seen = rasterize(
@@ -132,7 +160,7 @@ def crop_scene(scene: Gaussians, members: Tensor, camera: Camera, box: Crop, bac
     kept = seen.visible.clone()
     kept[members] = True  # a member that is out of sight now may come into it
     index = kept.nonzero()[:, 0]
-    return CropScene(
+    whole = CropScene(
         camera,
         box,
         scene.means[index],
@@ -144,6 +172,32 @@ def crop_scene(scene: Gaussians, members: Tensor, camera: Camera, box: Crop, bac
         scene.shN[members],
         background,
     )
+    return _live(whole) if still else whole
+
+
+def _live(view: CropScene) -> CropScene:
+    """The view with all that no member contributes to taken from the original picture."""
+    member = torch.zeros_like(view.opacities)
+    member[view.rows] = 1.0
+    share, _ = replace(view, background=torch.zeros(3))._draw(
+        view.means, view.quats, view.scales, view.opacities, member[:, None].expand(-1, 3).contiguous()
+    )
+    live = live_tiles((share > 0).any(dim=2), view.box)
+    if bool(live_pixels(live, view.box).all()):
+        return view
+    kept = reaching(view.means, view.scales, view.camera, live)
+    kept[view.rows] = True
+    index = kept.nonzero()[:, 0]
+    return replace(
+        view,
+        means=view.means[index],
+        quats=view.quats[index],
+        scales=view.scales[index],
+        opacities=view.opacities[index],
+        colors=view.colors[index],
+        rows=torch.searchsorted(index, view.rows),
+        cached=(live_pixels(live, view.box)[..., None], view.original()),
+    )
 
 
 def render_all(
@@ -154,7 +208,7 @@ def render_all(
         return [crop.render(packed, moving)[0] for crop in crops]
 
 
-def moving_attributes(offsets: Tensor) -> list[str]:
-    """The attributes that these offsets [M,14] or [M,14+3K] move at all."""
+def moving_attributes(offsets: Tensor, among: Collection[str] = ATTRIBUTES) -> list[str]:
+    """The attributes (`among` these) that these offsets [M,14] or [M,14+3K] move at all."""
     slices = attribute_slices(offsets.shape[1])
-    return [name for name, columns in slices.items() if bool(offsets[:, columns].any())]
+    return [name for name, columns in slices.items() if name in among and bool(offsets[:, columns].any())]

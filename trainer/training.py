@@ -12,7 +12,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.framing import scene_sphere
 from progdf.gaussians import BASE_CHANNELS, pack
-from trainer.crops import CropScene, crop_scene, moving_attributes, render_all
+from trainer.crops import GEOMETRY, CropScene, crop_scene, moving_attributes, render_all
 from trainer.descent import PgsState
 from trainer.editors.base import EditKind
 from trainer.groups import Groups, group_stage, restored_groups, way
@@ -21,7 +21,7 @@ from trainer.losses import Perceptual, eroded
 from trainer.network import begin_alongside, keep
 from trainer.objective import Losses, Objective, loss_table
 from trainer.options import TrainOptions
-from trainer.pgs import Renewal, Snapshot, Stage, optimise
+from trainer.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
 from trainer.settings import loss_weights, pgs_settings
@@ -114,7 +114,8 @@ def trained(
     """
     scene, members = stand.scene, stand.region.members
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    crops = [crop_scene(scene, members, v.camera, v.box, stand.background) for v in stand.train]
+    still = not moving_attributes(learning_rates(kind, original.shape[1], 1.0, options.rates)[None], GEOMETRY)
+    crops = [crop_scene(scene, members, v.camera, v.box, stand.background, still) for v in stand.train]
     stages = [
         Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
         for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
@@ -189,7 +190,15 @@ def _groups(
     if done is not None:
         return restored_groups(original, done.tensors)
     try:
-        groups = group_stage(original, crops, targets, options.group_steps, options.seed)
+        with log.steps("move parts", options.group_steps * len(targets)) as advance:
+            groups = group_stage(
+                original,
+                crops,
+                targets,
+                options.group_steps,
+                options.seed,
+                lambda step, loss: advance(step, f"loss {loss:.4f}"),
+            )
     except FloatingPointError as error:
         raise ProgdfError(
             f"training broke down: {error}; mend the edited views and go on with --resume"

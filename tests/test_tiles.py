@@ -1,0 +1,103 @@
+"""Tiles that an edit cannot change are not drawn again; picture and gradients are the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians, pack
+from progdf.rasterize import rasterize
+from progdf.rasterize.binning import TILE_H, TILE_W
+from tests.scenes import hard_cases, orbit_camera, random_gaussians
+from tests.trained import WHITE, small
+from trainer.crops import CropScene, crop_scene, render_all
+from trainer.tiles import live_pixels, live_tiles, reaching
+
+COLOURS = ("sh0", "shN")
+
+
+def picture_and_gradient(view: CropScene, rows: Tensor) -> tuple[Tensor, Tensor]:
+    packed = rows.clone().requires_grad_()
+    image, _ = view.render(packed, COLOURS)
+    weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(0))
+    (image * weights).sum().backward()  # type: ignore[no-untyped-call]
+    assert packed.grad is not None
+    return image.detach(), packed.grad
+
+
+def recoloured(scene: Gaussians, members: Tensor) -> Tensor:
+    rows = pack(scene[members], with_shN=scene.sh_degree > 0)
+    rows[:, 11:] += 0.3 * torch.randn(rows[:, 11:].shape, generator=torch.Generator().manual_seed(3))
+    return rows
+
+
+@pytest.mark.parametrize("part", ["scarf", "ears", "head"])
+def test_picture_and_gradients_are_the_bits_of_the_whole_box(part: str) -> None:
+    case = small(part, count=3, image_size=120)
+    rows = recoloured(case.scene, case.region.members)
+    saved = 0
+    for view in case.views:
+        box = (0, 0, view.camera.width, view.camera.height)
+        whole = crop_scene(case.scene, case.region.members, view.camera, box, WHITE)
+        tiles = crop_scene(case.scene, case.region.members, view.camera, box, WHITE, still=True)
+        (image, gradient), (expected, expected_gradient) = (
+            picture_and_gradient(v, rows) for v in (tiles, whole)
+        )
+        assert torch.equal(image, expected)
+        assert torch.equal(gradient, expected_gradient)
+        assert float(expected_gradient[:, 11:].abs().max()) > 0
+        saved += len(whole.means) - len(tiles.means)
+    assert saved > 0, "nothing was left out"
+
+
+def test_a_region_that_no_pixel_shows_is_the_original_picture() -> None:
+    scene = random_gaussians(50, seed=4, sh_degree=1)
+    scene.means[:3] = torch.tensor([0.0, 0.0, -50.0])
+    members = torch.arange(3)
+    camera = orbit_camera(64, 40)
+    whole, tiles = (crop_scene(scene, members, camera, (0, 0, 64, 40), WHITE, s) for s in (False, True))
+    rows = recoloured(scene, members)
+    assert torch.equal(*(render_all([v], rows, COLOURS)[0] for v in (whole, tiles)))
+
+
+def test_live_tiles_are_those_of_the_full_image() -> None:
+    contributes = torch.zeros(20, 70, dtype=torch.bool)
+    contributes[5, 40] = True
+    box = (10, 13, 80, 33)
+    live = live_tiles(contributes, box)
+    assert live.nonzero().tolist() == [[(13 + 5) // TILE_H, (10 + 40) // TILE_W]]
+    pixels = live_pixels(live, box)
+    assert pixels.shape == (20, 70)
+    rows, columns = pixels.nonzero().unbind(dim=1)
+    assert (int(rows.min()) + 13, int(columns.min()) + 10) == (16, 32)
+    assert (int(rows.max()) + 13, int(columns.max()) + 10) == (23, 63)
+
+
+def _cases() -> dict[str, Callable[[], object]]:
+    return {name: (lambda case=case: case) for name, case in hard_cases().items()}
+
+
+@pytest.mark.parametrize("name", sorted(_cases()))
+def test_no_gaussian_that_reaches_a_tile_is_left_out(name: str) -> None:
+    case = hard_cases()[name]
+    scene, camera = case.gaussians, case.camera
+    if case.antialiased:
+        pytest.skip("views are not trained with antialiasing")
+    for row in range(-(-camera.height // TILE_H)):
+        for column in range(-(-camera.width // TILE_W)):
+            window = (
+                column * TILE_W,
+                row * TILE_H,
+                min(camera.width, (column + 1) * TILE_W),
+                min(camera.height, (row + 1) * TILE_H),
+            )
+            _, _, found = rasterize(
+                scene.means, scene.quats, scene.scales, scene.opacities, torch.zeros(len(scene), 3),
+                camera.viewmat, camera.K, camera.width, camera.height, crop=window,
+            )  # fmt: skip
+            live = torch.zeros(-(-camera.height // TILE_H), -(-camera.width // TILE_W), dtype=torch.bool)
+            live[row, column] = True
+            assert not bool((found.visible & ~reaching(scene.means, scene.scales, camera, live)).any())
