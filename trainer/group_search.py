@@ -58,7 +58,7 @@ class GroupSearch:
         Args:
             targets: the edited box of each view. [h,w,3] each
             start: where to look first
-            on_step: progress; called for `steps` steps, or twice as many
+            on_step: progress: steps done in this search; a wide one counts from 1 again
 
         Returns:
             The best motion found; `start` where none is better in the mean of all views.

@@ -106,7 +106,7 @@ def group_stage(
         targets: of each stage, the edited box of each view. [h,w,3] each
         steps: of a search; a stage takes one or two
         seed: order of the views
-        on_step: progress: steps done in all, loss
+        on_step: progress: steps done in all, each stage counting as `steps` however many it takes; loss
 
     Raises:
         FloatingPointError: the loss is not finite.
@@ -115,9 +115,14 @@ def group_stage(
     parts = make_parts(original, connected_parts(means))
     search = GroupSearch(original, parts, crops, steps, seed)
     motions: list[Motion] = []
-    for pictures in targets:
+    for stage, pictures in enumerate(targets):
+
+        def step_done(step: int, loss: float, begun: int = stage * steps) -> None:
+            if on_step is not None:
+                on_step(begun + step, loss)
+
         start = motions[-1] if motions else parts.still()
-        motions.append(search.find(pictures, start, on_step))
+        motions.append(search.find(pictures, start, step_done))
     return Groups(parts, tuple(motions))
 
 
