@@ -4,29 +4,18 @@ Measured on held-out views: PSNR and LPIPS of the finished edit, PSNR to the edi
 strengths .25, .5 and .75, sharpness over that of the editor's picture, evenness of the slider (its smallest
 step over its largest).
 
-The robot of playbot_31k recoloured, 13 views of 160 pixels, 240 steps in 4 stages, 10 to 13 ms a step
-    default                       29.5 dB  .004   29.7 24.5 26.5   sharp  .96   even .20
-    no LPIPS; LPIPS 1             29.6     .004 ; 24.5 .016
-    LPIPS through VGG16           29.1     .005 , 2.3 times as long
-    LPIPS at every step           29.4     .004
-    progressive warmup            22.5     .018   27.4 15.4 16.0   sharp  .95   even .40
-    progressive decay, growth      9.5     .284 (before the edit: 9.7 dB, .263)
-    progressive decay, 1e-4       26.1     .007   29.4 20.2 21.3   sharp  .95   even .43
-    sharpness hinge               29.1     .005   29.7 23.5 26.0   sharp 1.07   even .19
-    sharpness paper               29.5     .004 , the same pictures
-    rates of 3DGS                 13.7     .127   21.8 13.0 12.2   sharp 1.19   even .31
-    recording raw                 29.5     .004   29.7 25.5 26.8   sharp  .96   even .04
-    one target                    29.4     .004   19.8 15.2 17.3   sharp  .96   even .60
-
-Painted in a style, every strength a cross-fade (* as it was before)
-    one target, no hinge          18.8 dB  .157   29.5 24.5 21.2   sharp  .60   even .68
-    one target, hinge .3          18.5     .151   29.4 24.0 20.6   sharp 1.00   even .22
-    one target, hinge .5          18.6     .154   29.0 23.9 20.7   sharp 1.02   even .18
-    2 stages, hinge .5            18.2     .143   24.3 22.5 20.4   sharp 1.04   even .00
-    4 stages, hinge .5            18.3     .154   27.8 23.0 20.1   sharp 1.00   even .03
-    robot, one target, no hinge * 16.6     .166   26.4 21.7 18.6   sharp  .75   even .61
-    robot, one target, hinge .3   16.6     .167   26.4 21.6 18.7   sharp  .93   even .68
-    robot, 8 stages, no hinge *   16.3     .172   25.0 20.5 18.1   sharp  .78   even .00
+The robot of playbot_31k recoloured (before: 9.4 dB, .305), 13 views of 160 pixels, 240 steps in 4 stages
+    default                       30.8 dB  .007   30.9 25.3 27.5   sharp  .91   even .14
+    no LPIPS                      30.8     .008   31.0 25.4 27.5   sharp  .90   even .16
+    LPIPS of weight 1             25.7     .024   27.8 19.8 22.9   sharp  .94   even .14
+    LPIPS at every step           30.7     .008   30.8 25.1 27.6   sharp  .92   even .10
+    LPIPS through VGG16           30.5     .008   30.8 25.0 27.3   sharp  .91   even .17   2.1 times as long
+    plainly clamped colours       19.9     .062   31.6 21.4 21.0   sharp  .96   even .32
+    progressive warmup            24.2     .027   28.0 15.4 16.8   sharp  .91   even .37
+    progressive decay              9.2     .311   and growth alike: frozen
+    sharpness hinge               30.1     .008   30.6 24.9 27.2   sharp 1.06   even .10
+    recording raw                 30.8     .008   31.0 25.4 27.3   sharp  .91   even .01
+    one target                    30.9     .007   19.0 14.9 17.6   sharp  .91   even .67
 
 Painted in style 14 in the region's box (editors/style.py), one target, 24 views of 256 pixels, 480 steps
     bear's body, no hinge         27.9 dB  .107   clean and soft
