@@ -23,7 +23,7 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralField, NeuralSettings, baked_neural, fit_neural, position_floor
 from progdf.field.bake import NeuralForm, bake_nodes
 from progdf.field.judge import FieldJudge
-from progdf.field.neural import NeuralShape
+from progdf.field.neural import NeuralShape, course
 from progdf.field.neural_fit import NeuralFit, rendered_importance, trained
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
 from progdf.layers import Layer
@@ -91,6 +91,13 @@ def smooth_trajectory(places: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("form", FORMS)
 def test_a_network_answers_exactly_zero_at_zero(form: str) -> None:
     assert not bool(network(form).bound(rows()).offsets(0.0).any())
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_answer_of_the_network_moves_anything_at_zero(form: str) -> None:
+    shape = network(form).shape
+    wild = torch.full((5, 6), 1e6)
+    assert not bool(course(shape, torch.zeros(5), wild, wild).any())
 
 
 @pytest.mark.parametrize("form", ["own", "position"])

@@ -26,7 +26,8 @@ TOLERANCE = 0.01
 
 MOST_NODES, MOST_RANK = 257, 16
 
-_PER_BIN = 4
+_PER_BIN, _FEW_PER_BIN = 4, 2
+_LARGE = 100_000  # numbers in a network beyond which fewer nodes are asked for, as loading waits for them
 _JUMP = 1e-5  # width of the edge between two hard bins
 
 
@@ -118,7 +119,8 @@ def baked_neural(
         tolerance: see `TOLERANCE`
     """
     field, end = network.bound(rows), full_end(network)
-    nodes = bake_nodes(network.shape.bins, network.shape.hard)
+    large = network.parameters - network.codes.numel() > _LARGE
+    nodes = bake_nodes(network.shape.bins, network.shape.hard, _FEW_PER_BIN if large else _PER_BIN)
     plan = BakePlan(nodes, {}, _pull(field, end, nodes, truth))
     course = pinned_course(field, end, plan)
     plan = replace(plan, ranks=_ranks(course, tolerance))
@@ -128,10 +130,10 @@ def baked_neural(
     return replace(baked, origin=replace(form, error=bake_error(field, baked, plan, render)))
 
 
-def bake_nodes(bins: int, hard: bool) -> Tensor:
-    """Strengths to bake at: four to a smooth bin; both sides of every edge of hard ones. [S] float32"""
+def bake_nodes(bins: int, hard: bool, per_bin: int = _PER_BIN) -> Tensor:
+    """Strengths to bake at: `per_bin` to a smooth bin; both sides of every edge of hard ones. [S] float32"""
     if not hard:
-        return torch.linspace(0, 1, _PER_BIN * bins + 1)
+        return torch.linspace(0, 1, per_bin * bins + 1)
     edges = torch.arange(1, bins) / bins
     inner = torch.stack([edges - _JUMP, edges], dim=1).flatten()
     return torch.cat([torch.tensor([0.0, _JUMP]), inner, torch.tensor([1.0 - _JUMP, 1.0])])
