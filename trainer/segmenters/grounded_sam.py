@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -18,7 +19,7 @@ from progdf.pictures import to_picture
 from trainer.options import DETECTOR, OUTLINER
 from trainer.segmenters.base import SegmenterSettings
 
-_BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError)
+_BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
 """What transformers raises for a model that is not there, not whole, or another's."""
 
 
@@ -41,13 +42,11 @@ class GroundedSam:
     def __call__(self, image: Tensor, prompt: str) -> Tensor:
         """See `Segmenter`: the union of the outlines of all that is found."""
         picture = to_picture(image)
+        boxes = self.boxes(picture, prompt)
+        if not len(boxes):
+            return torch.zeros(image.shape[:2], dtype=torch.bool)
+        inputs = self.outliner_processor(images=picture, input_boxes=[boxes.tolist()], return_tensors="pt")
         with torch.no_grad():
-            boxes = self.boxes(picture, prompt)
-            if not len(boxes):
-                return torch.zeros(image.shape[:2], dtype=torch.bool)
-            inputs = self.outliner_processor(
-                images=picture, input_boxes=[boxes.tolist()], return_tensors="pt"
-            )
             found = self.outliner(
                 pixel_values=inputs["pixel_values"], input_boxes=inputs["input_boxes"], multimask_output=False
             )
@@ -59,8 +58,10 @@ class GroundedSam:
     def boxes(self, picture: Any, prompt: str) -> Tensor:
         """x0, y0, x1, y1 in pixels of all that is found in a PIL image. [B,4]"""
         inputs = self.detector_processor(images=picture, text=as_asked(prompt), return_tensors="pt")
+        with torch.no_grad():
+            answer = self.detector(**inputs)
         found = self.detector_processor.post_process_grounded_object_detection(
-            self.detector(**inputs),
+            answer,
             inputs["input_ids"],
             threshold=self.least,
             text_threshold=self.least,
