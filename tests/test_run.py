@@ -88,7 +88,9 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
         "slider": {"monotone", "uniformity", "largest_jump", "t50", "t90"},
         "between": {"0.25", "0.5", "0.75"},
         "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
+        "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
         "time": {"views", "edit", "optimise", "fit", "total"},
+        "memory_by_stage_mb": {"views", "edit", "optimise", "fit", "report"},
         "options": {"scene", "editor", "seed"},
     }
     for part, keys in expected.items():
