@@ -91,7 +91,7 @@ def test_one_target_by_default_and_strengths_by_guidance_on_request(pix2pix: str
     assert editor_of(settings_of(pix2pix)).stages == (1.0,)
     with pytest.raises(ValueError, match=r"not 0\.5"):
         editor_of(settings_of(pix2pix)).edit(view, 0.5)
-    dial = editor_of(settings_of(pix2pix, dial="guidance"))
+    dial = editor_of(settings_of(pix2pix, dial=True))
     assert dial.stages == ()
     half = editor_of(settings_of(pix2pix, guidance=4.25)).edit(view, 1.0)  # half way from 1 to 7.5
     assert torch.equal(dial.edit(view, 0.5), half)
@@ -177,12 +177,21 @@ def test_without_the_packages_one_line_names_the_extra(monkeypatch: pytest.Monke
 def test_a_run_is_trained_on_what_a_pipeline_makes_of_its_views(pix2pix: str, tmp_path: Path) -> None:
     write_bear(tmp_path, 900)
     options = quick_options(
-        tmp_path, editor=BATMAN, model=pix2pix, edit_steps=1, edit_size=64, steps=24, views=5, image_size=64
+        tmp_path,
+        editor=BATMAN,
+        model=pix2pix,
+        edit_steps=1,
+        edit_size=64,
+        steps=24,
+        stages=1,
+        views=5,
+        image_size=64,
     )
     result = train(options, quiet=True)
     painted = result.folder.root / "views" / "painted"
     assert len(list(painted.glob("*.png"))) == len(list(painted.glob("*.json"))) == 5
     assert result.report["trajectory"]["stages"] == [1.0]
+    assert "the edited views" in result.folder.log.read_text(encoding="utf-8")
     assert set(result.report["agreement"]) == {"psnr_best", "unexplained", "agree"}
     for path in painted.glob("*.png"):
         original = Image.open(result.folder.view("original", path.stem))

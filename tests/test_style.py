@@ -11,10 +11,12 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.pictures import write_image
-from tests.trained import small
+from tests.trained import quick_options, small
 from trainer.editors import EditorSettings, make_editor
+from trainer.editors.base import Confine, EditKind
 from trainer.editors.kept import KeptPictures
 from trainer.editors.style import StyleEditor, mixed
+from trainer.preparation import to_confine
 
 
 def crispness(image: Tensor) -> float:
@@ -177,3 +179,25 @@ def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(t
     assert paint.calls == 1
     with pytest.raises(ProgdfError, match="gone; "):
         editor.edit_again(view, 1.0, None, 400)
+
+
+@pytest.mark.parametrize(
+    ("editor", "confine", "kind", "expected"),
+    [
+        ("folder", "auto", "style", True),
+        ("folder", "auto", "geometry", False),
+        ("folder", "yes", "geometry", True),
+        ("folder", "no", "style", False),
+        ("night", "yes", "colour", False),  # it leaves the rest alone by itself
+    ],
+)
+def test_what_changed_outside_is_put_back_unless_parts_move_or_the_user_says(
+    tmp_path: Path, editor: str, confine: Confine, kind: EditKind, expected: bool
+) -> None:
+    case = small()
+    for view in case.views:
+        write_image(tmp_path / f"{view.camera.name}.png", 1.0 - view.image)
+    spec = f"folder:{tmp_path}" if editor == "folder" else editor
+    options = quick_options(tmp_path, editor=spec, confine=confine)
+    made = make_editor(spec, case.scene, case.region, case.views)
+    assert to_confine(made, options, kind) == expected

@@ -78,8 +78,6 @@ class TrainOptions:
     """instruct: seed of the noise, which is the same in every view."""
     edit_size: int | None = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
-    edit_dial: Literal["off", "guidance"] = "off"
-    """instruct: the finished edit alone, or strengths too, by rising guidance; each costs a pass of edits."""
     confine: Literal["auto", "yes", "no"] = "auto"
     """Put back what the editor changed outside the region; auto: unless --kind is geometry."""
     reedit_every: int = 0
@@ -104,7 +102,8 @@ class TrainOptions:
     or twice as many; 0: every Gaussian finds its own way, which smears what moves far."""
     stages: int = 0
     """Strengths that an editor with a dial is asked for; 0: 8, but 1 for a style, which is the paper's way,
-    towards the end alone."""
+    towards the end alone. instruct is asked for strengths, by rising guidance, only if more than 1 are asked
+    for here: each is another pass over the views."""
     sh: Literal["auto", "off"] = "auto"
     """Colours that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (auto), or left as they are."""
@@ -280,7 +279,7 @@ def settled(options: TrainOptions) -> TrainOptions:
 def _check_editor_options(options: TrainOptions) -> None:
     """No option is passed over in silence: one that the editor does not know is told."""
     kind = options.editor.partition(":")[0]
-    of_instruct = ("model", "guidance", "image_guidance", "edit_steps", "edit_seed", "edit_dial")
+    of_instruct = ("model", "guidance", "image_guidance", "edit_steps", "edit_seed")
     of_painters = ("edit_size", "reedit_every")
     for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
         for name in names:

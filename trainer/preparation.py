@@ -83,7 +83,7 @@ def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
         options.edit_steps,
         options.edit_seed,
         options.edit_size,
-        options.edit_dial,
+        options.stages > 1,
         options.confine,
         folder.root / "views" / "painted",
     )

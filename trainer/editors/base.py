@@ -28,7 +28,7 @@ class EditorSettings:
         steps: denoising steps
         seed: of the noise, the same in every view
         size: longer side in pixels at which pictures are painted
-        dial: strengths by rising guidance, or the finished edit alone
+        dial: picture strengths by rising guidance, not the finished edit alone
         confine: see `Confine`
         kept: folder in which painted pictures are kept; None keeps nothing
     """
@@ -39,7 +39,7 @@ class EditorSettings:
     steps: int | None = None
     seed: int = 0
     size: int | None = None
-    dial: Literal["off", "guidance"] = "off"
+    dial: bool = False
     confine: Confine = "auto"
     kept: Path | None = None
 

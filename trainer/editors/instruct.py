@@ -5,8 +5,8 @@ they are read from this machine and never fetched unasked.
 
 Why one target by default: text guidance is no strength. With little of it the picture is not the original
 (it has been through the model's autoencoder), and as it rises the edit arrives at once, at another guidance
-in every view. `--edit-dial guidance` asks for strengths that way all the same, at the price of a whole pass
-over the views for each.
+in every view. `--stages 4` asks for strengths that way all the same, at the price of a whole pass over the
+views for each.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def instruct(
         "size": asked.size,
         "seed": asked.seed,
     }
-    dial = settings.dial == "guidance" and asked.guidance > 1.0
+    dial = settings.dial and asked.guidance > 1.0
     return InstructEditor(
         lambda picture, guidance: _painted(pipeline(), asked, picture, guidance),
         asked.guidance,
