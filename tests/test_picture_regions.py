@@ -172,13 +172,13 @@ def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
 def test_a_sentence_is_segmented_once_and_kept(reddish: Asked, tmp_path: Path) -> None:
     told = settings(tmp_path)
     first = region_of('text:"the Red scarf"', told)
-    assert reddish == ["the Red scarf"] * VIEWS
+    assert reddish == ["the Red scarf"] * (2 * VIEWS)  # around the scene, and near what was found
     again = region_of('text:"the Red scarf"', told)
-    assert len(reddish) == VIEWS
+    assert len(reddish) == 2 * VIEWS
     assert torch.equal(first.members, again.members)
     assert torch.equal(first.score, again.score)
     region_of('text:"the Red scarf"', replace(told, segmenter=SegmenterSettings(least=0.5)))
-    assert len(reddish) == 2 * VIEWS
+    assert len(reddish) == 4 * VIEWS
 
 
 def test_what_a_sentence_found_is_a_folder_of_masks(reddish: Asked, tmp_path: Path) -> None:
@@ -222,7 +222,7 @@ def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked
         train(replace(options, region="text:unicorn"), quiet=True)
     done = train(replace(options, region="text:scarf"), quiet=True)
     assert done.gdf.is_file()
-    assert len(list((done.folder.segmented / "scarf").glob("*.png"))) == 5
+    assert len(list((done.folder.segmented / "scarf").glob("*.png"))) == 10
 
 
 def test_prompts_are_asked_as_the_detector_was_trained() -> None:
@@ -277,7 +277,7 @@ def test_a_run_trains_a_region_that_a_sentence_names(tiny: SegmenterSettings, tm
     )
     done = train(options, quiet=True)
     assert done.gdf.is_file()
-    assert len(list((done.folder.segmented / "the-scarf").glob("*.png"))) == 3
+    assert len(list((done.folder.segmented / "the-scarf").glob("*.png"))) == 6
 
 
 def test_missing_weights_are_one_line_that_tells_how_to_get_them(
