@@ -104,9 +104,10 @@ class TrainOptions:
     """Strengths that an editor with a dial is asked for; 0: 8, but 1 for a style, which is the paper's way,
     towards the end alone. instruct is asked for strengths, by rising guidance, only if more than 1 are asked
     for here: each is another pass over the views."""
-    sh: Literal["auto", "off"] = "auto"
+    sh: Literal["auto", "on", "off"] = "auto"
     """Colours that change with the direction one looks from: trained, and kept where leaving them out would
-    cost 0.1 dB (auto), or left as they are."""
+    cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colours and the region's own
+    hardly change with the view (auto)."""
     rates: Rates = "kind"
     """Learning rates: as the kind of edit needs, with short steps on the last stretch; or 3DGS's own, flat,
     for all attributes (paper), which hardly move in 600 steps."""

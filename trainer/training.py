@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -25,6 +25,7 @@ from trainer.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
 from trainer.settings import loss_weights, pgs_settings
+from trainer.sheen import NEEDED, view_dependence
 from trainer.state import Autosave, Resumable, Saved, StateFolder
 from trainer.trajectory import Trajectory, record, retime, straightened
 from trainer.views import crop
@@ -113,6 +114,7 @@ def trained(
         KeyboardInterrupt: interrupted; the state is saved.
     """
     scene, members = stand.scene, stand.region.members
+    options = _with_bands_decided(options, stand, kind, log)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = not moving_attributes(learning_rates(kind, original.shape[1], 1.0, options.rates)[None], GEOMETRY)
     crops = [crop_scene(scene, members, v.camera, v.box, stand.background, still) for v in stand.train]
@@ -175,6 +177,21 @@ def trained(
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = way(original, groups, offsets, [made.step for made in ends], settings.snapshots)
     return record(snapshots, end, list(edited)), losses
+
+
+def _with_bands_decided(options: TrainOptions, stand: Stand, kind: EditKind, log: RunLog) -> TrainOptions:
+    """`options.sh` as "on" or "off": a colour edit trains the bands where the region's own show (`sheen`)."""
+    if options.sh != "auto" or stand.scene.sh_degree == 0:
+        return options
+    if kind != "colour" or options.rates == "3dgs":
+        return replace(options, sh="on")
+    change = view_dependence(stand.scene[stand.region.members], [view.camera for view in stand.train])
+    needed = change >= NEEDED
+    log.say(
+        f"the region's colours change with the view by {change:.3f} of 1: "
+        f"the SH bands beyond DC are {'trained' if needed else 'left as they are'} ({NEEDED:g} is needed)"
+    )
+    return replace(options, sh="on" if needed else "off")
 
 
 def _groups(

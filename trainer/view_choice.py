@@ -176,7 +176,7 @@ def _sampled(scene: Gaussians, region: Region) -> Tensor:
     """Rows that stand for the region, evenly by the area they can cover. -> [S] int64"""
     _, middle, long = scene.scales[region.members].sort(dim=1).values.double().unbind(1)
     areas = scene.opacities[region.members].double() * middle * long
-    areas = areas.clamp_max(20 * float(areas.median()))  # no giant stands for all
+    areas = areas.clamp_max(20 * float(areas.mean()))  # no giant stands for all
     total = areas.cumsum(dim=0)
     ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
     picked = torch.searchsorted(total, ticks).clamp_max(len(total) - 1)
