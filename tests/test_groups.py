@@ -187,6 +187,17 @@ def test_the_same_seed_finds_the_same_bits() -> None:
     assert torch.equal(kept.saved()["motions"], first["motions"])
 
 
+def test_a_place_three_sizes_away_is_found_by_the_wide_search() -> None:
+    case = small("arms")
+    pivots = arm_pivots(case)
+    rows = pack(case.scene[case.region.members], with_shN=True)
+    size = float(make_parts(rows, connected_parts(rows[:, :3])).sizes.mean())
+    shift = torch.tensor([0.0, 3.0 * size, 0.0])
+    rows, crops, targets = pictured(case, grown(1.0, pivots, shift))
+    motion = group_stage(rows, crops, [targets]).motions[0]
+    assert float((motion.shift - shift).norm(dim=1).max()) < 0.1 * size
+
+
 def test_targets_that_are_not_finite_stop_the_search() -> None:
     case = small("arms")
     rows, crops, targets = pictured(case, grown(1.3, arm_pivots(case)))
