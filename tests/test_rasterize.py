@@ -232,9 +232,15 @@ def test_camera_gradients_of_some_rows_only_are_refused() -> None:
         )  # fmt: skip
 
 
-def test_bits_do_not_depend_on_the_run_or_the_number_of_threads() -> None:
+@pytest.mark.parametrize("few", [0, 8192])
+def test_bits_do_not_depend_on_the_run_or_the_number_of_threads(
+    few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from progdf.rasterize import cpu
+
     scene, camera = random_gaussians(2000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
+    monkeypatch.setattr(cpu, "FEW", few)  # one thread lists few Gaussians, several list more
     set_threads(1)
     for again in (draw(scene, camera, "cpu"), draw(scene, camera, "cpu")):
         assert torch.equal(again.image, first.image)

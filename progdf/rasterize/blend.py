@@ -50,14 +50,14 @@ def blend_row(state: Array, cards: Array, card: Number, row: Number, place: Numb
     peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
     top = cards[card + TOP + row]
     red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    begin = np.uint64(start) // LANES * LANES
-    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
+    begin = np.uint64(start)
+    end = begin + (np.uint64(stop - start) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
         p = row * np.uint64(TILE_W) + j
         column = np.int32(j)
         u = u_peak + step * (np.float32(column) - peak)
         alpha = min(_ALPHA_MAX, exp2(top - u * u))
-        alpha = alpha if (column >= start) & (column < stop) else _ZERO
+        alpha = alpha if (column < stop) else _ZERO
         before = state[p]
         after = before * (_ONE - alpha)
         taken = after > _T_MIN

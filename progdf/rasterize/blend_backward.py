@@ -60,15 +60,15 @@ def unblend_row(state: Array, cards: Array, card: Number, row: Number, place: Nu
     peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
     top = cards[card + TOP + row]
     red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    begin = np.uint64(start) // LANES * LANES
-    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
+    begin = np.uint64(start)
+    end = begin + (np.uint64(stop - start) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
         p = row * np.uint64(TILE_W) + j
         column = np.int32(j)
         u = u_peak + step * (np.float32(column) - peak)
         raw = exp2(top - u * u)
         alpha = min(_ALPHA_MAX, raw)
-        alpha = alpha if (column >= start) & (column < stop) & (place <= state[p + _LAST]) else _ZERO
+        alpha = alpha if (column < stop) & (place <= state[p + _LAST]) else _ZERO
         inverse = _ONE / (_ONE - alpha)
         before = state[p] * inverse
         g0, g1, g2 = state[p + _G0], state[p + _G1], state[p + _G2]
@@ -95,14 +95,14 @@ def pass_row(state: Array, cards: Array, card: Number, row: Number, place: Numbe
     peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
     top = cards[card + TOP + row]
     red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    begin = np.uint64(start) // LANES * LANES
-    end = (np.uint64(stop) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
+    begin = np.uint64(start)
+    end = begin + (np.uint64(stop - start) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
     for j in range(begin, end):
         p = row * np.uint64(TILE_W) + j
         column = np.int32(j)
         u = u_peak + step * (np.float32(column) - peak)
         alpha = min(_ALPHA_MAX, exp2(top - u * u))
-        alpha = alpha if (column >= start) & (column < stop) & (place <= state[p + _LAST]) else _ZERO
+        alpha = alpha if (column < stop) & (place <= state[p + _LAST]) else _ZERO
         before = state[p] / (_ONE - alpha)
         shown = red * state[p + _G0] + green * state[p + _G1] + blue * state[p + _G2]
         state[p] = before

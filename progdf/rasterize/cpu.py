@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.rasterize import binning, projection, weights
+from progdf.rasterize import binning, few, projection, weights
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.blend import blend
 from progdf.rasterize.blend_backward import SUMS, unblend
@@ -27,6 +27,10 @@ Array = NDArray[Any]
 
 MOST_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
+
+
+FEW = 8192
+"""Gaussians up to which one thread lists them: handing work to others would take longer than the work."""
 
 
 @dataclass(frozen=True)
@@ -145,22 +149,29 @@ def _list_splats(
     means, quats, scales, opacities, colors = gaussians
     n = len(means)
     centres, depths, candidates = np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_)
-    projection.cull(
-        means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
-        centres, depths, candidates,
-    )  # fmt: skip
-    ids, ranks = binning.depth_order(depths, candidates, workers)
-    splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
     visible = np.zeros(n, np.bool_)
-    projection.project(
-        ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
-        view.size, view.window, view.antialiased, splats, rgb, visible,
-    )  # fmt: skip
     tiles = int(view.grid[2] * view.grid[3])
-    counts, per_splat = np.empty((workers, tiles), np.int64), np.empty(len(ids) + 1, np.int64)
-    binning.count_tiles(splats, view.window, view.grid, counts, per_splat)
     tile_starts = np.empty(tiles + 1, np.int64)
-    total = binning.place_tiles(counts, tile_starts, per_splat)
+    if n <= FEW:
+        ids, ranks, splats, rgb, counts, per_splat, total = few.list_few(
+            means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
+            view.window, view.near, view.antialiased, view.grid, centres, depths, candidates, visible,
+            tile_starts,
+        )  # fmt: skip
+    else:
+        projection.cull(
+            means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
+            centres, depths, candidates,
+        )  # fmt: skip
+        ids, ranks = binning.depth_order(depths, candidates, workers)
+        splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
+        projection.project(
+            ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
+            view.size, view.window, view.antialiased, splats, rgb, visible,
+        )  # fmt: skip
+        counts, per_splat = np.empty((workers, tiles), np.int64), np.empty(len(ids) + 1, np.int64)
+        binning.count_tiles(splats, view.window, view.grid, counts, per_splat)
+        total = binning.place_tiles(counts, tile_starts, per_splat)
     if total > MOST_INTERSECTIONS:
         raise ProgdfError(
             f"{len(ids)} Gaussians meet {total} tiles of the image, more than {MOST_INTERSECTIONS}; "
@@ -168,7 +179,8 @@ def _list_splats(
         )
     members = np.empty(total, np.int32)
     slots = np.empty(total if for_gradients else 0, np.int64)
-    binning.fill_tiles(splats, view.window, view.grid, counts, per_splat, members, slots)
+    fill = few.fill_few if n <= FEW else binning.fill_tiles
+    fill(splats, view.window, view.grid, counts, per_splat, members, slots)
     return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), [centres, depths, visible]
 
 

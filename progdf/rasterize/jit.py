@@ -106,6 +106,12 @@ def kernel(
     return decorate
 
 
+def without_threads(compiled: _F) -> _F:
+    """The same kernel, for other kernels to call on their own thread."""
+    alone: _F = numba.njit(nogil=True, error_model="numpy")(compiled.py_func)  # type: ignore[attr-defined]
+    return alone
+
+
 @contextmanager
 def running(stage: str, seconds: int) -> Iterator[int]:
     """Hold the kernels for one call and give the number of threads to use.

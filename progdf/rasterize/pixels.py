@@ -19,10 +19,11 @@ from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2,
 Array = NDArray[Any]
 
 LANES = np.uint64(8)
-"""Pixels are worked on in aligned groups of this many."""
+"""Pixels are worked on in groups of this many, from the first that a splat touches; the surplus is masked."""
 
-PLANE = np.uint64(TILE_W * TILE_H)
-"""A tile's state is planes of this many float32 in one buffer: so LLVM can tell that they do not overlap."""
+PLANE = np.uint64(TILE_W * TILE_H + 8)
+"""A tile's state is planes of this many float32 in one buffer: so LLVM can tell that they do not overlap. A
+group of pixels that begins in a plane's last columns ends in its padding."""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 

@@ -73,6 +73,16 @@ def rasterize(
     splats, info = project(
         means, quats, scales, opacities, colors, viewmat, K, width, height, near, sh_degree, antialiased, crop
     )
+    image, transmittance = blend(splats, crop, background)
+    return image, transmittance, info
+
+
+def blend(splats: Splats, crop: tuple[int, int, int, int], background: Tensor) -> tuple[Tensor, Tensor]:
+    """Blend projected Gaussians tile by tile, front to back.
+
+    Returns:
+        image [h,w,3] and transmittance [h,w] of the window, of the splats' type
+    """
     x0, y0, x1, y1 = crop
     left, top = x0 // TILE * TILE, y0 // TILE * TILE
     bands = []
@@ -85,7 +95,7 @@ def rasterize(
         bands.append(torch.cat(tiles, dim=1))
     window = torch.cat(bands, dim=0)[y0 - top : y1 - top, x0 - left : x1 - left]
     transmittance = window[..., 3]
-    return window[..., :3] + transmittance[..., None] * background.to(means.dtype), transmittance, info
+    return window[..., :3] + transmittance[..., None] * background.to(window.dtype), transmittance
 
 
 def project(
