@@ -24,6 +24,7 @@ from progdf.layers import Gains, Layer
 from .headless import is_software
 from .painters import CpuPainter, GlPainter, Image, Painter
 from .sort import back_to_front
+from .stack import shown
 from .state import ViewState
 from .turntable import to_camera
 
@@ -99,6 +100,7 @@ class Engine:
             raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
         if draw == "gl" and ctx is None:
             raise ValueError("draw is 'gl', which needs a context")
+        self.scene = scene
         self.gdfs = tuple(gdfs)
         self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
         self.timings = FrameTimings()
@@ -212,6 +214,6 @@ class Engine:
 
 
 def _edits(view: ViewState) -> _Edits:
-    """Layers that are off or at strength 0 do not count, so that touching them does no work."""
-    layers = tuple((l.gdf, l.strength, l.gains) for l in view.layers if l.enabled and l.strength != 0.0)
+    """Layers that are not shown or at strength 0 do not count, so that touching them does no work."""
+    layers = tuple((l.gdf, l.strength, l.gains) for l in shown(view) if l.strength != 0.0)
     return _Edits(layers, view.blend) if layers else _Edits()

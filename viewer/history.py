@@ -15,6 +15,7 @@ class Edit:
 
     layers: tuple[LayerState, ...]
     blend: str
+    overshoot: bool = False
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class History:
 
 
 def edit_of(state: ViewState) -> Edit:
-    return Edit(state.layers, state.blend)
+    return Edit(state.layers, state.blend, state.overshoot)
 
 
 def begin(state: ViewState) -> History:
@@ -63,4 +64,4 @@ def redo(history: History, state: ViewState) -> tuple[History, ViewState]:
 
 
 def _restored(state: ViewState, edit: Edit) -> ViewState:
-    return replace(state, layers=edit.layers, blend=edit.blend)
+    return replace(state, layers=edit.layers, blend=edit.blend, overshoot=edit.overshoot)

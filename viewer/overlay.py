@@ -143,7 +143,7 @@ def bindings(area: Area, ui: UiContext) -> None:
 def key_help() -> tuple[tuple[str, str], ...]:
     """Chord and help of every key that has a help text, in the words of a person."""
     names = {"1": "1–9", "Shift+1": "Shift+1–9", "Right": "← →", "Shift+Right": "Shift+← →"}
-    names |= {"Ctrl+Right": "Ctrl+← →", "Escape": "Esc"}
+    names |= {"Ctrl+Right": "Ctrl+← →", "Escape": "Esc", "Alt+Down": "Alt+↑ ↓"}
     return tuple((names.get(key.chord, key.chord), key.help) for key in controls.KEYS if key.help)
 
 

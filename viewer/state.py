@@ -34,18 +34,50 @@ class ViewCamera:
 
 @dataclass(frozen=True)
 class LayerState:
-    """One layer row: which .gdf (by its place in the engine's list), and how much of it."""
+    """One layer row: which .gdf (by its place in the engine's list), and how much of it.
+
+    Args:
+        gdf: index into the engine's edits
+        name: no two layers of a stack share one
+        strength: 0..1, up to `stack.OVERSHOOT` where the view allows it
+        enabled: the eye; `solo` wins over it
+        gains: how much of each kind of change comes through, 0..1
+        solo: only soloed layers are shown while there are any
+        locked: strength, gains and paint stay as they are
+    """
 
     gdf: int
     name: str
     strength: float = 0.0
     enabled: bool = True
     gains: Gains = Gains()
+    solo: bool = False
+    locked: bool = False
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How the edited picture is set against the original (see compare.py).
+
+    Args:
+        mode: "off", "split" or "difference"
+        divider: where the edited side of a split begins, share of the picture's width
+        amplify: what a difference is multiplied by, 1 to 64
+    """
+
+    mode: str = "off"
+    divider: float = 0.5
+    amplify: float = 4.0
 
 
 @dataclass(frozen=True)
 class ViewState:
-    """Everything that decides the picture, and nothing else."""
+    """Everything that decides the picture, and what of the panel is open.
+
+    Args:
+        overshoot: sliders go on to `stack.OVERSHOOT`, which extrapolates
+        unfolded: which edits (`LayerState.gdf`) show their gains and curve
+    """
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
@@ -53,3 +85,6 @@ class ViewState:
     background: Vec3 = (1.0, 1.0, 1.0)
     overlay: bool = False
     panel: bool = True
+    compare: Comparison = Comparison()
+    overshoot: bool = False
+    unfolded: tuple[int, ...] = ()

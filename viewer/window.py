@@ -28,7 +28,10 @@ _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
 _NAMES = {
     **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
-    **{getattr(glfw, f"KEY_{name.upper()}"): name for name in ("Left", "Right", "Up", "Down", "Escape")},
+    **{
+        getattr(glfw, f"KEY_{name.upper()}"): name
+        for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter")
+    },
     glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
 }
 _HINTS = (

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from . import controls, history, turntable
+from progdf.layers import BLENDS
+
+from . import controls, history, stack, turntable
 from .history import History
 from .layer_rows import LayerRow
-from .state import LayerState, ViewCamera, ViewState
+from .state import ViewCamera, ViewState
 from .turntable import Bounds
 
 
@@ -51,6 +53,8 @@ class Workspace:
         past: undo and redo
         home: the first camera
         focus: the focused layer, an index into `view.layers`, or None
+        dial: which of `stack.DIALS` of the focused layer the arrow keys move
+        renaming: the layer whose name is being typed, or None
         help: whether the list of bindings is shown
         message: the line at the bottom, or None
         requests: what the window has still to do: "picture", "window_picture", "full_screen", "quit"
@@ -60,6 +64,8 @@ class Workspace:
     past: History
     home: ViewCamera
     focus: int | None = None
+    dial: str = "strength"
+    renaming: int | None = None
     help: bool = False
     message: Message | None = None
     requests: tuple[str, ...] = ()
@@ -72,7 +78,7 @@ def opened(view: ViewState) -> Workspace:
 
 def original(view: ViewState) -> ViewState:
     """The same view without any edit."""
-    return replace(view, layers=tuple(replace(layer, enabled=False) for layer in view.layers))
+    return replace(view, layers=tuple(replace(layer, enabled=False, solo=False) for layer in view.layers))
 
 
 def settled(workspace: Workspace) -> Workspace:
@@ -125,7 +131,10 @@ def _focus(workspace: Workspace, number: str) -> Workspace:
 
 
 def _toggle(workspace: Workspace, number: str) -> Workspace:
-    return _with_layer(workspace, int(number) - 1, lambda layer: replace(layer, enabled=not layer.enabled))
+    view = stack.changed(
+        workspace.view, int(number) - 1, lambda layer: replace(layer, enabled=not layer.enabled)
+    )
+    return replace(workspace, view=view)
 
 
 def _hide(workspace: Workspace, _: str) -> Workspace:
@@ -133,29 +142,64 @@ def _hide(workspace: Workspace, _: str) -> Workspace:
 
 
 def _nudge(workspace: Workspace, by: str) -> Workspace:
-    def moved(layer: LayerState) -> LayerState:
-        # rounded, so that steps forth and back end on the number they began with
-        return replace(layer, strength=round(min(1.0, max(0.0, layer.strength + float(by))), 6))
-
-    return workspace if workspace.focus is None else _with_layer(workspace, workspace.focus, moved)
+    return _on_focused(workspace, lambda view, i: stack.nudged(view, i, workspace.dial, float(by)))
 
 
-def _with_layer(workspace: Workspace, index: int, change: Callable[[LayerState], LayerState]) -> Workspace:
-    layers = list(workspace.view.layers)
-    if index >= len(layers):
+def _dial(workspace: Workspace, by: str) -> Workspace:
+    """The next dial of the focused layer; its gains unfold, so that one sees which."""
+    if workspace.focus is None or not workspace.view.layers:
         return workspace
-    layers[index] = change(layers[index])
-    return replace(workspace, view=replace(workspace.view, layers=tuple(layers)))
+    dials = stack.DIALS
+    dial = dials[(dials.index(workspace.dial) + int(by)) % len(dials)]
+    view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
+    if dial != "strength" and gdf not in view.unfolded:
+        view = replace(view, unfolded=(*view.unfolded, gdf))
+    return replace(workspace, dial=dial, view=view)
+
+
+def _move(workspace: Workspace, by: str) -> Workspace:
+    """The focused layer up or down in the list; the focus goes with it."""
+    if workspace.focus is None:
+        return workspace
+    to = max(0, min(workspace.focus + int(by), len(workspace.view.layers) - 1))
+    return replace(workspace, view=stack.moved(workspace.view, workspace.focus, to), focus=to)
+
+
+def _lock(workspace: Workspace, _: str) -> Workspace:
+    def turned(view: ViewState, index: int) -> ViewState:
+        return stack.changed(view, index, lambda layer: replace(layer, locked=not layer.locked))
+
+    return _on_focused(workspace, turned)
+
+
+def _blend(workspace: Workspace, _: str) -> Workspace:
+    after = BLENDS[(BLENDS.index(workspace.view.blend) + 1) % len(BLENDS)]
+    return replace(workspace, view=replace(workspace.view, blend=after))
+
+
+def _on_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
+    if workspace.focus is None:
+        return workspace
+    return replace(workspace, view=change(workspace.view, workspace.focus))
 
 
 def _undo(workspace: Workspace, _: str) -> Workspace:
     past, view = history.undo(workspace.past, workspace.view)
-    return replace(workspace, past=past, view=view)
+    return _with_layers_of(replace(workspace, past=past), view)
 
 
 def _redo(workspace: Workspace, _: str) -> Workspace:
     past, view = history.redo(workspace.past, workspace.view)
-    return replace(workspace, past=past, view=view)
+    return _with_layers_of(replace(workspace, past=past), view)
+
+
+def _with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
+    """Another state; the focus stays on its layer, wherever that has gone."""
+    focus, before = workspace.focus, workspace.view.layers
+    if focus is not None and focus < len(before):
+        places = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
+        focus = focus if focus in places else next(iter(places), None)
+    return replace(workspace, view=view, focus=focus)
 
 
 def _fly(workspace: Workspace, _: str) -> Workspace:
@@ -169,6 +213,15 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "toggle": _toggle,
     "hide": _hide,
     "nudge": _nudge,
+    "dial": _dial,
+    "move": _move,
+    "solo": lambda workspace, _: _on_focused(workspace, stack.soloed),
+    "show_all": lambda w, _: replace(w, view=stack.all_shown(w.view)),
+    "lock": _lock,
+    "fold": lambda workspace, _: _on_focused(workspace, stack.folded),
+    "rename": lambda workspace, _: replace(workspace, renaming=workspace.focus),
+    "blend": _blend,
+    "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
     "undo": _undo,
     "redo": _redo,
     "fly": _fly,
