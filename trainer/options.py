@@ -88,7 +88,8 @@ class TrainOptions:
     name: str = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     cameras: Path | None = None
-    """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at the region."""
+    """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at
+    the region."""
     views: int = 30
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with."""
     image_size: int = 256
