@@ -169,6 +169,27 @@ def test_a_painter_that_fails_leaves_no_note_behind(tmp_path: Path) -> None:
     assert paint.calls == 0, "what was kept before is whole"
 
 
+def test_killed_between_picture_and_note_it_is_painted_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = small().views[0].image
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+
+    class Killed(BaseException):
+        pass
+
+    def killed(path: Path) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr("trainer.editors.kept.written_whole", killed)
+        with pytest.raises(Killed):
+            KeptPictures(tmp_path).picture("v", source, {"style": 2}, lambda picture: 0.5 * picture)
+    paint = Counting()
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, paint)
+    assert paint.calls == 1, "the picture on disk is that of style 2"
+
+
 def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(tmp_path: Path) -> None:
     view = small().views[0]
     editor, paint = _negatives(tmp_path, {"style": 1})
