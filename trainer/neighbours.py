@@ -13,9 +13,9 @@ _LEAF = 64
 _NEIGHBOURS = 96
 _ROUNDS = 100
 
-# Standard deviations within one surface. The bear's parts lift back with IoU .977-.999 (worst, best); without
-# the normals .905, without the sizes .871, without the planes .957; without the colours or the distance nothing
-# is lost there, but not all parts of all scenes differ in size. Half as large again, the first three: the same.
+# Standard deviations within one surface. The bear's parts lift back with IoU .977-.999, the worst without the
+# normals with .905, without the sizes .871, without the planes .957. Colours and distance gain nothing there,
+# but not everywhere do parts differ in size. The first three may be half as large again.
 _NEAR = 8  # the distance to this neighbour is the unit of the next two
 _ALONG, _OFF_PLANE = 2.0, 0.5
 _TURN = 0.18  # radians between the normals
