@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from progdf.checkpoint import Gdf
 from progdf.gaussians import Gaussians
+from progdf.layers import KINDS
 from progdf.sh import sh0_to_rgb
 
+from .change_curve import Curve, curve_of, flat
 from .turntable import Bounds, bounds_of
 
 Rgb = tuple[float, float, float]
@@ -24,6 +28,9 @@ class LayerRow:
         recorded: strengths of the recorded snapshots
         instruction: what was asked for
         bounds: what the camera frames for this layer
+        shared: per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
+        kinds: which gains of `Gains` have something to scale
+        curve: the visible change over the strength, measured when it is first asked for
     """
 
     count: int
@@ -31,14 +38,17 @@ class LayerRow:
     recorded: tuple[float, ...]
     instruction: str
     bounds: Bounds
+    shared: tuple[int, ...] = ()
+    kinds: frozenset[str] = frozenset(KINDS.values())
+    curve: Curve = flat
 
 
 def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:
     """One row per .gdf, in their order."""
-    return tuple(_row(scene, gdf) for gdf in gdfs)
+    return tuple(_row(scene, gdf, gdfs) for gdf in gdfs)
 
 
-def _row(scene: Gaussians, gdf: Gdf) -> LayerRow:
+def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
     members = gdf.region.members
     return LayerRow(
         count=len(members),
@@ -46,7 +56,16 @@ def _row(scene: Gaussians, gdf: Gdf) -> LayerRow:
         recorded=gdf.field.recorded,
         instruction=gdf.instruction,
         bounds=bounds_of(scene[members]),
+        shared=tuple(_in_both(gdf, other) for other in gdfs),
+        kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
+        curve=curve_of(scene, gdf),
     )
+
+
+def _in_both(gdf: Gdf, other: Gdf) -> int:
+    """How many Gaussians two regions share."""
+    members = (gdf.region.members.numpy(), other.region.members.numpy())
+    return len(np.intersect1d(*members, assume_unique=True))
 
 
 def _mean_colour(scene: Gaussians, gdf: Gdf) -> Rgb:
