@@ -14,7 +14,8 @@ from progdf.colour import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 
-from .state import LayerState, Vec3, ViewCamera
+from .compare import MOST_AMPLIFIED
+from .state import Comparison, LayerState, Vec3, ViewCamera
 from .turntable import FARTHEST
 
 LARGEST_SIDE = 16_384
@@ -132,6 +133,33 @@ def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
     K[2, 2] = 1.0
     K[0, 2] = width / 2 + (camera.K[0, 2] - camera.width / 2) * scale
     return replace(camera, K=K, width=width, height=height)
+
+
+def parse_comparison(split: str | None, amplify: str | None) -> Comparison:
+    """What `--split X` or `--difference AMPLIFY` asks for; neither is no comparison.
+
+    Raises:
+        ProgdfError: X is no number from 0 to 1, or AMPLIFY none from 1 to 64.
+    """
+    if split is not None:
+        if not is_number(split) or not 0.0 <= float(split) <= 1.0:
+            raise ProgdfError(f"--split {split} is no place in the picture; give a number from 0 to 1")
+        return Comparison("split", divider=float(split))
+    if amplify is not None:
+        if not is_number(amplify) or not 1.0 <= float(amplify) <= MOST_AMPLIFIED:
+            raise ProgdfError(
+                f"--difference {amplify} cannot be drawn; give a factor from 1 to {MOST_AMPLIFIED:g}"
+            )
+        return Comparison("difference", amplify=float(amplify))
+    return Comparison()
+
+
+def is_number(text: str) -> bool:
+    """Whether `text` is a finite number."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def parse_background(text: str) -> Vec3:

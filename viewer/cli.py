@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,6 +25,7 @@ from progdf.load_report import counted
 from progdf.ply import GEOMETRY, load_ply, save_ply
 
 from . import arguments, film
+from .compare import Comparer, labelled
 from .engine import Engine
 from .headless import headless_context
 from .state import ViewState
@@ -37,6 +38,9 @@ Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar=
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 DEFAULT_SIZE = (640, 480)
+ONE_OF = ("sweep", "sheet", "split", "difference")
+"""Options of `progdf render` that each say what the picture is."""
+_BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,10 @@ class RenderOptions:
     """Move this edit's slider from 0 to 1 and back: an animation."""
     sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]")] = None
     """A contact sheet over this edit's slider, or a grid over two sliders."""
+    split: Annotated[str | None, tyro.conf.arg(metavar="[X]")] = None
+    """The original beside the edited picture, which begins at this share of the width (0.5)."""
+    difference: Annotated[str | None, tyro.conf.arg(metavar="[AMPLIFY]")] = None
+    """What differs from the original, amplified (4), with the PSNR."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +135,7 @@ def render(argv: Sequence[str]) -> int:
     swept = _swept(options, gdfs)
     camera = _camera(options, scene, size)
     state = ViewState(layers=layers, blend=options.blend, background=background)
+    comparison = arguments.parse_comparison(options.split, options.difference)
     with _engine(scene, gdfs, options.engine) as engine, written_whole(options.out) as beside:
 
         def picture(wanted: ViewState) -> film.Pixels:
@@ -140,11 +149,15 @@ def render(argv: Sequence[str]) -> int:
             Image.fromarray(film.grid(swept[0], swept[1], picture, state)).save(beside)
         elif swept:
             Image.fromarray(film.contact_sheet(swept[0], picture, state)).save(beside)
+        elif comparison.mode != "off":
+            decibels = _compare(engine, replace(state, compare=comparison), camera, beside)
         else:
             Image.fromarray(picture(state)).save(beside)
         drawn_with = engine.draws_with
     each = "each " if options.sheet is not None else ""
     print(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_with})")
+    if comparison.mode != "off":
+        print(f"PSNR of edited against original {decibels:.2f} dB")
     if gdfs and not swept and not any(layer.strength for layer in layers):
         print(f"every slider is at 0, so this is the original; --set {gdfs[0].name}=1 shows an edit")
     return 0
@@ -172,6 +185,17 @@ def export(argv: Sequence[str]) -> int:
 def _load(scene_path: Path, gdf_paths: Sequence[Path]) -> tuple[Gaussians, tuple[Gdf, ...]]:
     scene = load_ply(scene_path)
     return scene, arguments.load_edits(gdf_paths, scene, scene_path)
+
+
+def _compare(engine: Engine, view: ViewState, camera: Camera, path: Path) -> float:
+    """Write the comparison that `view` asks for; gives the PSNR of its two pictures, dB."""
+    comparer = Comparer(engine, engine.ctx)
+    try:
+        image = comparer.image(view, camera=camera)
+        Image.fromarray(labelled(image, view.compare, comparer.psnr)).save(path)
+    finally:
+        comparer.release()
+    return comparer.psnr
 
 
 def _swept(options: RenderOptions, gdfs: Sequence[Gdf]) -> list[str]:
@@ -221,8 +245,9 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], draw: str) -> Iterator[Engine
 def _check_output(options: RenderOptions) -> None:
     """Whether the file's name fits what goes into it."""
     suffix = options.out.suffix.lower()
-    if options.sweep is not None and options.sheet is not None:
-        raise ProgdfError("--sweep and --sheet were both given; give one of them")
+    given = [name for name in ONE_OF if getattr(options, name) is not None]
+    if len(given) > 1:
+        raise ProgdfError(f"--{given[0]} and --{given[1]} were both given; give one of them")
     if options.sweep is not None and suffix not in (".gif", ".mp4"):
         raise ProgdfError(f"{options.out} cannot hold an animation; --sweep writes a .gif or an .mp4")
     if options.sweep is None and suffix in (".gif", ".mp4"):
@@ -261,11 +286,16 @@ def _check_by_plyfile(written: Gaussians, path: Path) -> None:
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
-    """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option."""
+    """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option.
+
+    `--split` and `--difference` without a number get theirs.
+    """
     joined: list[str] = []
     for argument in argv:
         if joined and joined[-1] == "--orbit":
             joined[-1] = f"--orbit={argument}"
+        elif joined and joined[-1] in _BARE and arguments.is_number(argument):
+            joined[-1] = f"{joined[-1]}={argument}"
         else:
             joined.append(argument)
-    return joined
+    return [f"{argument}={_BARE[argument]}" if argument in _BARE else argument for argument in joined]

@@ -100,7 +100,7 @@ class Engine:
             raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
         if draw == "gl" and ctx is None:
             raise ValueError("draw is 'gl', which needs a context")
-        self.scene = scene
+        self.ctx, self.scene = ctx, scene
         self.gdfs = tuple(gdfs)
         self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
         self.timings = FrameTimings()

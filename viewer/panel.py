@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from . import layer_cards, turntable
+from . import compare, layer_cards, turntable
 from .layer_rows import LayerRow
 from .state import Vec3, ViewState
 from .ui_context import PALETTE, Icon, UiContext
@@ -34,6 +34,8 @@ class PanelInput:
         focus: the focused layer, an index into `state.layers`, or None
         undos, redos: how many entries there are either way
         reveal: scroll to the focused layer
+        dial: which of `stack.DIALS` of the focused layer the arrow keys move
+        renaming: the layer whose name is being typed, or None
     """
 
     title: str
@@ -43,15 +45,21 @@ class PanelInput:
     undos: int = 0
     redos: int = 0
     reveal: bool = False
+    dial: str = "strength"
+    renaming: int | None = None
 
 
 @dataclass(frozen=True)
 class PanelResult:
-    """The changed state, the focused layer, and the actions asked for (named as in `controls.KEYS`)."""
+    """The changed state, the focused layer, the one being renamed, and the actions asked for.
+
+    Actions are named as in `controls.KEYS`.
+    """
 
     state: ViewState
     focus: int | None
     actions: tuple[str, ...] = ()
+    renaming: int | None = None
 
 
 def width(ui: UiContext) -> float:
@@ -80,12 +88,13 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     imgui.begin_child("body", imgui.ImVec2(0.0, -footer), 0, flags.no_nav.value)
     state = layer_cards.heading(state, ui)
-    state, focus = layer_cards.draw(state, shown.rows, shown.focus, shown.reveal, ui)
+    cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
+    state, focus, renaming = layer_cards.draw(state, cards, ui)
     state = _view(state, ui, actions)
     imgui.end_child()
     _footer(shown, ui, actions)
     imgui.end()
-    return PanelResult(state, focus, tuple(actions))
+    return PanelResult(state, focus, tuple(actions), renaming)
 
 
 def _title(shown: PanelInput, ui: UiContext) -> None:
@@ -123,6 +132,19 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
     background = (red, green, blue) if changed else state.background
+    shown = compare.MODES.index(state.compare.mode)
+    label("Compare", column)
+    chosen = choice("compare", ("Off", "Split", "Difference"), shown, ui)
+    tip("With the original: beside each other (Y), or what differs (Shift+Y)")
+    comparison = state.compare if chosen is None else replace(state.compare, mode=compare.MODES[chosen])
+    if comparison.mode == "difference":
+        label("Amplify", column)
+        imgui.set_next_item_width(-1.0)
+        changed, times = imgui.slider_float(
+            "##amplify", comparison.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
+        )
+        comparison = replace(comparison, amplify=float(round(times))) if changed else comparison
+        tip("What the difference is multiplied by")
     label("Show", column)
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
@@ -132,10 +154,11 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
         actions.append("home")
     tip("Back to the first view (Shift+F)")
-    return replace(state, camera=camera, background=background)
+    return replace(state, camera=camera, background=background, compare=comparison)
 
 
 _ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
+_LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
 
 
 def _footer(shown: PanelInput, ui: UiContext, actions: list[str]) -> None:

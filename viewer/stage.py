@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 
-from . import controls, inputs, overlay, panel, workspace
+from . import compare_overlay, controls, inputs, overlay, panel, workspace
+from .compare import Comparer, labelled
 from .engine import Engine, FrameTimings
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
@@ -55,6 +56,7 @@ class Stage:
         pictures: Path = Path(),
     ) -> None:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
+        self.comparer = Comparer(engine, context)
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self.work = workspace.opened(view)
@@ -73,10 +75,12 @@ class Stage:
         self.ui.make_current()
         imgui.backends.opengl3_shutdown()
         self.ui.close()
+        self.comparer.release()
 
     def serve(self, engine: Engine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
-        self.engine, self.facts = engine, facts
+        self.comparer.release()
+        self.engine, self.facts, self.comparer = engine, facts, Comparer(engine, self.context)
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -178,7 +182,8 @@ class Stage:
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
             self._panel(reveal=self.work.focus != focus)
-        self.work = workspace.with_camera(self.work, self._moved_by_mouse(self.work.view.camera))
+        camera = self._moved_by_mouse(self.work.view.camera)  # may move the divider of a split instead
+        self.work = workspace.with_camera(self.work, camera)
 
     def _perform(self, action: str) -> None:
         area = self._area()
@@ -187,27 +192,49 @@ class Stage:
     def _panel(self, reveal: bool) -> None:
         facts, past = self.facts, self.work.past
         shown = panel.PanelInput(
-            facts.title, facts.count, facts.rows, self.work.focus, len(past.past), len(past.future), reveal
+            facts.title,
+            facts.count,
+            facts.rows,
+            self.work.focus,
+            len(past.past),
+            len(past.future),
+            reveal,
+            self.work.dial,
+            self.work.renaming,
         )
         result = panel.draw(self.work.view, shown, self.ui)
-        self.work = replace(self.work, view=result.state, focus=result.focus)
+        self.work = replace(self.work, view=result.state, focus=result.focus, renaming=result.renaming)
         for action in result.actions:
             self._perform(action)
 
     def _moved_by_mouse(self, camera: ViewCamera) -> ViewCamera:
         io, radius, scale = imgui.get_io(), self.facts.bounds.radius, self.ui.scale
         dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
-        if self._drag and (dx or dy):
+        if self._drag == compare_overlay.DIVIDER:
+            self.work = replace(self.work, view=compare_overlay.moved(self.work.view, self._area()))
+        elif self._drag and (dx or dy):
             # also where the button went up within this frame: a slow frame must not lose the end of a drag
             camera = controls.drag(camera, self._drag, dx, dy, self._area().height / scale, radius)
         if not inputs.any_button_down():
             self._drag = None
         if not io.want_capture_mouse:
+            if self._grips_divider():
+                compare_overlay.show_grip()
+                if imgui.is_mouse_clicked(0):
+                    self._drag = compare_overlay.DIVIDER
+                    return camera
             if imgui.is_mouse_double_clicked(0):
                 return self._pivot_picked(camera)
             self._drag = inputs.drag_begun(camera.mode) or self._drag
             camera = controls.zoom(camera, io.mouse_wheel, radius) if io.mouse_wheel else camera
         return camera
+
+    def _grips_divider(self) -> bool:
+        """Whether the divider of a split is in the hand, or under it."""
+        if self._drag is not None:
+            return self._drag == compare_overlay.DIVIDER
+        over = imgui.get_io().want_capture_mouse
+        return not over and compare_overlay.near(self.work.view, self._area(), self.ui)
 
     def _pivot_picked(self, camera: ViewCamera) -> ViewCamera:
         mouse, density = imgui.get_io().mouse_pos, imgui.get_io().display_framebuffer_scale
@@ -227,8 +254,8 @@ class Stage:
         view, size = self._shown(), self._picture_size()
         screen.use()
         screen.clear(*PALETTE.panel)
-        new = self.engine.needs_draw(view, size)
-        timings = self.engine.draw(view, screen, size)
+        new = self.comparer.needs_draw(view, size)
+        timings = self.comparer.draw(view, screen, size)
         if new:
             self.timings = timings
             self.drawn += 1
@@ -237,6 +264,9 @@ class Stage:
         area, work = self._area(), self.work
         if inputs.holds_original(self._keys):
             overlay.banner("Original", area, self.ui)
+        else:
+            held = self._grips_divider()
+            compare_overlay.draw(work.view, self.comparer.psnr, area, held, self.ui)
         if work.view.overlay:
             overlay.table(self.figures(), self.ui)
         if work.help:
@@ -258,8 +288,8 @@ class Stage:
 
     def _save_pictures(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         if "picture" in self.work.requests:
-            image = self.engine.image(self._shown(), self._picture_size())
-            self._save(np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8))
+            image = self.comparer.image(self._shown(), self._picture_size())
+            self._save(labelled(image, self._shown().compare, self.comparer.psnr))
         if "window_picture" in self.work.requests:
             self._save(read_rgb(screen, size))
         left = tuple(r for r in self.work.requests if r not in ("picture", "window_picture"))

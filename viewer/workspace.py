@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 from progdf.layers import BLENDS
 
-from . import controls, history, stack, turntable
+from . import compare, controls, history, stack, turntable
 from .history import History
 from .layer_rows import LayerRow
-from .state import ViewCamera, ViewState
+from .state import Comparison, ViewCamera, ViewState
 from .turntable import Bounds
 
 
@@ -78,7 +78,8 @@ def opened(view: ViewState) -> Workspace:
 
 def original(view: ViewState) -> ViewState:
     """The same view without any edit."""
-    return replace(view, layers=tuple(replace(layer, enabled=False, solo=False) for layer in view.layers))
+    layers = tuple(replace(layer, enabled=False, solo=False) for layer in view.layers)
+    return replace(view, layers=layers, compare=Comparison())
 
 
 def settled(workspace: Workspace) -> Workspace:
@@ -226,6 +227,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "redo": _redo,
     "fly": _fly,
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
+    "split": lambda w, _: replace(w, view=compare.switched(w.view, "split")),
+    "difference": lambda w, _: replace(w, view=compare.switched(w.view, "difference")),
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
 }
