@@ -1,34 +1,69 @@
-"""The stack of edits in the panel: one card per layer, and the rule by which they blend."""
+"""The stack of edits in the panel: one card per layer, dragged into their order, and the rule of blending."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
 from progdf.compose import BLENDS
 
-from . import strength_slider
+from . import layer_fold, stack, strength_slider
 from .layer_rows import LayerRow
 from .state import LayerState, ViewState
 from .ui_context import PALETTE, Icon, Rgba, UiContext, u32
-from .widgets import elided, grouped, icon_button, right_edge, section, small, tip
+from .widgets import elided, grouped, icon_button, right_edge, section, small, small_toggle, tip
 
 BLEND_HELP = {
     "normalised": "Overlapping edits share a Gaussian by their weights; never more than a full edit.",
     "sum": "Overlapping edits add up.",
     "over": "A later edit covers the ones above it in the list, as far as its strength goes.",
 }
+TOGGLE_PX, GRIP_PX = 24.0, 4.0
+
+
+@dataclass(frozen=True)
+class Cards:
+    """What the cards show besides the state.
+
+    Args:
+        rows: one per .gdf, indexed by `LayerState.gdf`
+        focus: the focused layer, an index into `ViewState.layers`, or None
+        reveal: scroll to it
+        dial: which of `stack.DIALS` of it the arrow keys move
+        renaming: the layer whose name is being typed, or None
+    """
+
+    rows: Sequence[LayerRow]
+    focus: int | None = None
+    reveal: bool = False
+    dial: str = "strength"
+    renaming: int | None = None
+
+
+@dataclass(frozen=True)
+class _Card:
+    """What one card made of the state: the layer touched, being renamed, dragged or dropped."""
+
+    state: ViewState
+    touched: bool = False
+    renaming: bool = False
+    drag: str = ""
 
 
 def heading(state: ViewState, ui: UiContext) -> ViewState:
-    """The heading of the stack, with the blend rule where there is something to blend."""
+    """The heading of the stack: overshoot, and the blend rule where there is something to blend."""
     right = right_edge()
     section("Edits", ui)
-    if len(state.layers) < 2:
+    if not state.layers:
         return state
-    combo = 118.0 * ui.scale
+    combo = 118.0 * ui.scale if len(state.layers) > 1 else 0.0
+    wide = 40.0 * ui.scale
+    imgui.same_line(right - combo - wide - (6.0 * ui.scale if combo else 0.0))
+    state = _overshoot(state, wide)
+    if not combo:
+        return state
     imgui.same_line(right - combo)
     imgui.set_next_item_width(combo)
     if imgui.begin_combo("##blend", state.blend.capitalize()):
@@ -38,40 +73,87 @@ def heading(state: ViewState, ui: UiContext) -> ViewState:
             tip(BLEND_HELP[blend])
         imgui.end_combo()
     else:
-        tip("Where edits overlap: " + BLEND_HELP[state.blend])
+        tip("Where edits overlap (M): " + BLEND_HELP[state.blend])
     return state
 
 
-def draw(
-    state: ViewState, rows: Sequence[LayerRow], focus: int | None, reveal: bool, ui: UiContext
-) -> tuple[ViewState, int | None]:
-    """All cards; the changed state and the focused layer.
+def _overshoot(state: ViewState, width: float) -> ViewState:
+    on = state.overshoot
+    for slot, colour in (
+        (imgui.Col_.button, PALETTE.warning_dark if on else PALETTE.field),
+        (imgui.Col_.text, PALETTE.text if on else PALETTE.dim),
+    ):
+        imgui.push_style_color(slot, imgui.ImVec4(*colour))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y))
+    if imgui.button(f"{stack.OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
+        state = stack.with_overshoot(state, not on)
+    imgui.pop_style_var()
+    imgui.pop_style_color(2)
+    tip(f"Sliders to {stack.OVERSHOOT:g} (O). Beyond 1 the edit is extrapolated: nothing was learned there.")
+    return state
 
-    Args:
-        state: what the cards show
-        rows: one per .gdf, indexed by `LayerState.gdf`
-        focus: the focused layer, an index into `state.layers`, or None
-        reveal: scroll to it
-        ui: fonts and scale
-    """
+
+def draw(state: ViewState, cards: Cards, ui: UiContext) -> tuple[ViewState, int | None, int | None]:
+    """All cards; the changed state, the focused layer, and the layer being renamed."""
     if not state.layers:
         imgui.push_text_wrap_pos(0.0)
         imgui.text_disabled("No edits are loaded. Drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
-    layers = list(state.layers)
-    for i, layer in enumerate(layers):
-        layers[i], touched = _card(i, layer, rows[layer.gdf], focus == i, ui)
-        if reveal and focus == i:
+    focus, renaming = cards.focus, None
+    dragged: int | None = None
+    dropped = False
+    spans: list[tuple[float, float]] = []
+    for i in range(len(state.layers)):
+        top = imgui.get_cursor_screen_pos().y
+        card = _card(state, i, cards, ui)
+        state = card.state
+        spans.append((top, imgui.get_item_rect_max().y))
+        if cards.reveal and cards.focus == i:
             imgui.set_scroll_here_y(0.5)
-        focus = i if touched else focus
-    return replace(state, layers=tuple(layers)), focus
+        focus = i if card.touched else focus
+        renaming = i if card.renaming else renaming
+        if card.drag:
+            dragged, dropped = i, card.drag == "dropped"
+    if dragged is not None:
+        to = _place(dragged, spans, imgui.get_mouse_pos().y)
+        if dropped:
+            state, focus = stack.moved(state, dragged, to), to
+        else:
+            _show_place(dragged, to, spans, ui)
+    return state, focus, renaming
 
 
-def _card(
-    index: int, layer: LayerState, row: LayerRow, focused: bool, ui: UiContext
-) -> tuple[LayerState, bool]:
-    """One card: eye, swatch, name and value; the slider; count and instruction."""
+def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:
+    """Where in the stack the dragged card would lie: past each card over whose middle the hand is."""
+    return sum(y > (top + bottom) / 2 for i, (top, bottom) in enumerate(spans) if i != dragged)
+
+
+def _show_place(dragged: int, to: int, spans: Sequence[tuple[float, float]], ui: UiContext) -> None:
+    """A veil over the dragged card and a line where it would lie; near an edge the list scrolls."""
+    imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ns)
+    canvas, left = imgui.get_window_draw_list(), imgui.get_window_pos().x
+    right, gap = left + imgui.get_window_width(), imgui.get_style().item_spacing.y / 2
+    top, bottom = spans[dragged]
+    veil = imgui.ImVec2(left, top), imgui.ImVec2(right, bottom)
+    canvas.add_rect_filled(*veil, u32((*PALETTE.panel[:3], 0.6)), 6.0 * ui.scale)
+    if to != dragged:
+        y = spans[to][1] + gap if to > dragged else spans[to][0] - gap
+        ends = imgui.ImVec2(left, y - ui.scale), imgui.ImVec2(right, y + ui.scale)
+        canvas.push_clip_rect_full_screen()
+        canvas.add_rect_filled(*ends, u32(PALETTE.accent), ui.scale)
+        canvas.pop_clip_rect()
+    mouse, margin, step = imgui.get_mouse_pos().y, 24.0 * ui.scale, 6.0 * ui.scale
+    if mouse < imgui.get_window_pos().y + margin:
+        imgui.set_scroll_y(max(imgui.get_scroll_y() - step, 0.0))
+    elif mouse > imgui.get_window_pos().y + imgui.get_window_height() - margin:
+        imgui.set_scroll_y(min(imgui.get_scroll_y() + step, imgui.get_scroll_max_y()))
+
+
+def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
+    """One card: eye, swatch, name and value; the slider; count and toggles; unfolded, curve and gains."""
     scale, p = ui.scale, PALETTE
+    layer, focused = state.layers[index], cards.focus == index
+    row, active = cards.rows[layer.gdf], layer in stack.shown(state)
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
@@ -84,7 +166,9 @@ def _card(
         child.auto_resize_y.value | child.always_use_window_padding.value,
         imgui.WindowFlags_.no_nav.value,
     )
-    layer = _head(layer, row, ui)
+    card = _head(_Card(state), index, row, cards.renaming == index, active, ui)
+    layer = card.state.layers[index]
+    imgui.begin_disabled(layer.locked)
     strength = strength_slider.draw(
         "##strength",
         layer.strength,
@@ -92,20 +176,26 @@ def _card(
         imgui.get_content_region_avail().x,
         scale,
         p.accent if focused else p.accent_dark,
-        layer.enabled,
+        active,
+        stack.most(state),
     )
     touched = imgui.is_item_active()
-    layer = replace(layer, strength=strength)
-    note = f"{grouped(row.count)} splats" + (f"  ·  {row.instruction}" if row.instruction else "")
-    small(note, p.dim)
-    pressed = imgui.is_window_hovered() and imgui.is_mouse_clicked(imgui.MouseButton_.left.value)
+    imgui.end_disabled()
+    card = replace(card, state=stack.changed(card.state, index, lambda old: replace(old, strength=strength)))
+    card = replace(card, state=_foot(card.state, index, row, ui))
+    if layer.gdf in card.state.unfolded:
+        dial = cards.dial if focused else None
+        unfolded = layer_fold.draw(card.state.layers[index], row, dial, stack.most(state), ui)
+        card = replace(card, state=stack.changed(card.state, index, lambda _: unfolded))
+    over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
+    pressed = over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value)
     if focused:
         _focus_bar(clip, scale)
     imgui.end_child()
     imgui.pop_style_var()
     imgui.pop_style_color()
     imgui.pop_id()
-    return layer, touched or pressed
+    return replace(card, touched=card.touched or touched or pressed)
 
 
 def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], scale: float) -> None:
@@ -117,36 +207,111 @@ def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], scale: float) -> None:
     canvas.pop_clip_rect()
 
 
-def _head(layer: LayerState, row: LayerRow, ui: UiContext) -> LayerState:
+def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, ui: UiContext) -> _Card:
     scale, p = ui.scale, PALETTE
+    state, layer = card.state, card.state.layers[index]
     right = right_edge()
-    if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not layer.enabled):
-        layer = replace(layer, enabled=not layer.enabled)
-    tip("Show or hide this edit (H)")
+    if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
+        if imgui.get_io().key_alt:
+            state = stack.soloed(state, index)
+        else:
+            state = stack.changed(state, index, lambda old: replace(old, enabled=not old.enabled))
+    tip("Show or hide this edit (H); Alt+click: show it alone")
     imgui.same_line()
-    _swatch(row.swatch, layer.enabled, ui)
+    _swatch(row.swatch, active, ui)
     imgui.same_line()
     number = f"{layer.strength:.3f}"
     number_width = imgui.calc_text_size(number).x
-    imgui.align_text_to_frame_padding()
     room = right - number_width - 10 * scale - imgui.get_cursor_pos_x()
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(p.text if layer.enabled else p.dim)))
-    imgui.text(elided(layer.name, room))
+    card = _name(replace(card, state=state), index, room, renaming, active, ui)
     imgui.same_line(right - number_width)
-    imgui.text(number)
-    imgui.pop_style_color()
-    if imgui.is_item_clicked():
+    imgui.align_text_to_frame_padding()
+    beyond = p.warning if layer.strength > 1.0 else p.text
+    imgui.text_colored(imgui.ImVec4(*(beyond if active else p.dim)), number)
+    if imgui.is_item_clicked() and not layer.locked:
         strength_slider.start_typing("##strength")
-    tip("Click, or Ctrl+click the slider, to type a value")
-    return layer
+    tip("Locked (L)" if layer.locked else "Click, or Ctrl+click the slider, to type a value")
+    return card
 
 
-def _swatch(colour: tuple[float, float, float], enabled: bool, ui: UiContext) -> None:
+def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui: UiContext) -> _Card:
+    """The name: dragged it moves the card, double-clicked it becomes a text field."""
+    layer = card.state.layers[index]
+    if renaming:
+        text = _typed_name(layer, room)
+        return replace(card, renaming=text is None, state=stack.renamed(card.state, index, text or ""))
+    x, y = imgui.get_cursor_screen_pos()
+    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
+    colour = PALETTE.text if active else PALETTE.dim
+    imgui.get_window_draw_list().add_text(at, u32(colour), elided(layer.name, room))
+    tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double click to rename (Enter)")
+    if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
+        return replace(card, renaming=True, touched=True)
+    threshold = GRIP_PX * ui.scale
+    if imgui.is_item_active() and imgui.is_mouse_dragging(imgui.MouseButton_.left.value, threshold):
+        return replace(card, drag="dragged")
+    moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, threshold)
+    if imgui.is_item_deactivated() and (moved.x or moved.y):
+        return replace(card, drag="dropped")
+    return card
+
+
+def _typed_name(layer: LayerState, room: float) -> str | None:
+    """The text field of a name; None while it is open, "" where it was left as it was."""
+    storage, slot = imgui.get_state_storage(), int(imgui.get_id("name/focused"))
+    if not storage.get_bool(slot):
+        imgui.set_keyboard_focus_here()
+        storage.set_bool(slot, True)
+    imgui.set_next_item_width(room)
+    flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
+    entered, text = imgui.input_text("##name", layer.name, flags)
+    if not (entered or imgui.is_item_deactivated()):
+        return None
+    storage.set_bool(slot, False)
+    return text if entered or imgui.is_item_deactivated_after_edit() else ""
+
+
+def _foot(state: ViewState, index: int, row: LayerRow, ui: UiContext) -> ViewState:
+    """Count, overlap and instruction; at the right alone, lock and the fold."""
+    layer, wide = state.layers[index], TOGGLE_PX * ui.scale
+    right, left = right_edge(), imgui.get_cursor_pos_x()
+    overlaps = [
+        (other.name, row.shared[other.gdf])
+        for i, other in enumerate(state.layers)
+        if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
+    ]
+    note = f"{grouped(row.count)} splats"
+    if len(overlaps) == 1:
+        note += f"  ·  {grouped(overlaps[0][1])} in {overlaps[0][0]}"
+    elif overlaps:
+        note += f"  ·  shared with {len(overlaps)} layers"
+    elif row.instruction:
+        note += f"  ·  {row.instruction}"
+    small(note, PALETTE.dim, right - left - 3 * wide - 6.0 * ui.scale)
+    shared = (f"{grouped(count)} of its splats are also in {name}" for name, count in overlaps)
+    tip("\n".join((f"{grouped(row.count)} splats", *filter(None, [row.instruction]), *shared)))
+    imgui.same_line(right - 3 * wide)
+    if small_toggle("solo", "S", layer.solo, wide, ui):
+        state = stack.soloed(state, index)
+    tip("Show this edit alone, and others that are alone (Shift+H)")
+    imgui.same_line(right - 2 * wide)
+    if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
+        state = stack.changed(state, index, lambda old: replace(old, locked=not old.locked))
+    tip("Lock strength, gains and paint (L)")
+    imgui.same_line(right - wide)
+    if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
+        state = stack.folded(state, index)
+    tip("Gains, and the curve of visible change (G)")
+    return state
+
+
+def _swatch(colour: tuple[float, float, float], active: bool, ui: UiContext) -> None:
     side = 12.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
     top = y + (imgui.get_frame_height() - side) / 2
     imgui.dummy(imgui.ImVec2(side, imgui.get_frame_height()))
-    rgba: Rgba = (*colour, 1.0 if enabled else 0.35)
+    rgba: Rgba = (*colour, 1.0 if active else 0.35)
     canvas = imgui.get_window_draw_list()
     corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
     canvas.add_rect_filled(*corners, u32(rgba), 3 * ui.scale)

@@ -1,7 +1,7 @@
 """The strength slider: 0 is the original, 1 the full edit; ticks where the trajectory was recorded.
 
 Press on the track jumps there, press on the handle grabs it, Shift drags ten times finer, Ctrl+click (or a
-click on the number) types a value.
+click on the number) types a value. Where overshoot is on it goes beyond 1, on a ground that warns.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one type
 FINE = 0.1
 
 
-def parse_strength(text: str) -> float | None:
-    """What a person types for a strength: "0.7", "70%", ",7"; kept to 0..1. None where it is no number."""
+def parse_strength(text: str, most: float = 1.0) -> float | None:
+    """What a person types for a strength, "0.7", "70%", ",7", kept to 0..`most`; None: it is no number."""
     cleaned = text.strip().replace(",", ".")
     percent = cleaned.endswith("%")
     try:
@@ -25,7 +25,7 @@ def parse_strength(text: str) -> float | None:
     except ValueError:
         return None
     value = value / 100.0 if percent else value
-    return min(1.0, max(0.0, value)) if value == value else None
+    return min(most, max(0.0, value)) if value == value else None
 
 
 def draw(
@@ -36,41 +36,44 @@ def draw(
     scale: float,
     fill: Rgba,
     active: bool = True,
+    most: float = 1.0,
 ) -> float:
     """Draw the slider at the cursor and return the value it now has.
 
     Args:
         label: imgui id
-        value: strength, 0..1
+        value: strength, 0..`most`
         ticks: recorded strengths, 0..1
         width: in window pixels
         scale: window pixels per design pixel
         fill: colour of the track up to the handle
         active: False draws it muted (a hidden layer); it still works
+        most: upper end; beyond 1 the track lies on warning ground
     """
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "typing")):
-        return _typed(label, value, width)
+        return _typed(label, value, width, most)
     left, top = imgui.get_cursor_screen_pos()
     imgui.invisible_button(label, imgui.ImVec2(width, HEIGHT_PX * scale))
     hovered, held = imgui.is_item_hovered(), imgui.is_item_active()
     radius = 7.0 * scale
-    start, span = left + radius, max(width - 2 * radius, 1.0)
+    start, span = left + radius, max(width - 2 * radius, 1.0) / most
     mouse = imgui.get_io().mouse_pos.x
     if imgui.is_item_activated():
         if imgui.get_io().key_ctrl:
             start_typing(label)
             return value
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
-        value = value if on_handle else min(1.0, max(0.0, (mouse - start) / span))
+        value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
         _anchor(label, mouse, value)
     elif held or imgui.is_item_deactivated():  # a slow frame may hold the last move and the release
         fine = imgui.get_io().key_shift
         if storage.get_bool(_slot(label, "fine")) != fine:
             _anchor(label, mouse, value)
         moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if fine else 1.0)
-        value = min(1.0, max(0.0, storage.get_float(_slot(label, "value")) + moved))
-    _paint(start, top, span, radius, value, ticks, scale, fill if active else PALETTE.faint, hovered or held)
+        value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
+    colour = fill if active else PALETTE.faint
+    _paint(start, top, span, radius, value, ticks, scale, colour, hovered or held, most)
     return value
 
 
@@ -92,7 +95,7 @@ def _anchor(label: str, mouse: float, value: float) -> None:
     storage.set_bool(_slot(label, "fine"), imgui.get_io().key_shift)
 
 
-def _typed(label: str, value: float, width: float) -> float:
+def _typed(label: str, value: float, width: float, most: float) -> float:
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "wants focus")):
         imgui.set_keyboard_focus_here()
@@ -104,7 +107,7 @@ def _typed(label: str, value: float, width: float) -> float:
     if entered or left:
         storage.set_bool(_slot(label, "typing"), False)
     kept = entered or imgui.is_item_deactivated_after_edit()
-    parsed = parse_strength(text) if kept else None
+    parsed = parse_strength(text, most) if kept else None
     return value if parsed is None else parsed
 
 
@@ -118,19 +121,26 @@ def _paint(
     scale: float,
     fill: Rgba,
     lit: bool,
+    most: float,
 ) -> None:
     canvas, p = imgui.get_window_draw_list(), PALETTE
     middle, half = top + radius + 1.0 * scale, 2.0 * scale
     at = start + value * span
     canvas.add_rect_filled(
         imgui.ImVec2(start - half, middle - half),
-        imgui.ImVec2(start + span + half, middle + half),
+        imgui.ImVec2(start + span * most + half, middle + half),
         u32(p.field),
         half,
     )
     canvas.add_rect_filled(
         imgui.ImVec2(start - half, middle - half), imgui.ImVec2(at, middle + half), u32(fill), half
     )
+    if most > 1.0:
+        end = imgui.ImVec2(start + span * most + half, middle + half)
+        canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning_dark), half)
+        if value > 1.0:
+            end.x = at
+            canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning), half)
     foot = middle + radius + 2.0 * scale
     for tick in ticks:
         x = round(start + tick * span) + 0.5

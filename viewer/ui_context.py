@@ -37,6 +37,8 @@ class Palette:
     accent_dark: Rgba = _rgb(0x2E5F9E)
     handle: Rgba = _rgb(0xF2F4F7)
     error: Rgba = _rgb(0xE8705F)
+    warning: Rgba = _rgb(0xE0A44A)
+    warning_dark: Rgba = _rgb(0x6E5632)
     scrim: Rgba = _rgb(0x16181B, 0.86)
 
 
@@ -54,6 +56,9 @@ class Icon:
     HELP = icons.ICON_FA_QUESTION
     HOME = icons.ICON_FA_HOUSE
     FRAME = icons.ICON_FA_EXPAND
+    LOCKED = icons.ICON_FA_LOCK
+    UNLOCKED = icons.ICON_FA_LOCK_OPEN
+    GAINS = icons.ICON_FA_SLIDERS
 
 
 @dataclass(frozen=True)

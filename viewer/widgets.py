@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from imgui_bundle import imgui
 
-from .ui_context import PALETTE, SMALL_PX, Rgba, UiContext
+from .ui_context import PALETTE, SMALL_PX, Rgba, UiContext, u32
 
 
 def section(name: str, ui: UiContext) -> None:
@@ -31,10 +31,11 @@ def label(text: str, column: float) -> None:
     imgui.same_line(column)
 
 
-def small(text: str, colour: Rgba) -> None:
-    """Small text, shortened to the line."""
+def small(text: str, colour: Rgba, room: float | None = None) -> None:
+    """Small text, shortened to `room` window pixels, or to the line."""
     imgui.push_font(None, SMALL_PX)
-    imgui.text_colored(imgui.ImVec4(*colour), elided(text, imgui.get_content_region_avail().x))
+    room = imgui.get_content_region_avail().x if room is None else room
+    imgui.text_colored(imgui.ImVec4(*colour), elided(text, room))
     imgui.pop_font()
 
 
@@ -55,6 +56,22 @@ def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
     imgui.pop_style_var()
     imgui.pop_style_color(2)
     return bool(pressed)
+
+
+def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
+    """A button of small text on the present line, in the accent's colour while on; True when pressed."""
+    colours = (PALETTE.accent, PALETTE.text) if lit else (PALETTE.faint, PALETTE.dim)
+    height = 3.0 * ui.scale  # reaches above its line, so that the hand finds it
+    x, y = imgui.get_cursor_screen_pos()
+    imgui.push_font(None, SMALL_PX)
+    line = imgui.get_text_line_height()
+    imgui.set_cursor_screen_pos(imgui.ImVec2(x, y - height))
+    pressed = bool(imgui.invisible_button(name, imgui.ImVec2(width, line + height)))
+    size = imgui.calc_text_size(text)
+    at = imgui.ImVec2(round(x + (width - size.x) / 2), round(y + (line - size.y) / 2))
+    imgui.get_window_draw_list().add_text(at, u32(colours[imgui.is_item_hovered()]), text)
+    imgui.pop_font()
+    return pressed
 
 
 def choice(name: str, options: Sequence[str], current: int | None, ui: UiContext) -> int | None:
