@@ -87,6 +87,13 @@ def test_three_passes_are_more_even_than_one_where_recordings_jitter() -> None:
     assert float(thrice.min() / thrice.max()) > float(once.min() / once.max()) + 0.05
 
 
+def test_chords_as_long_as_a_step_make_steps_even_where_shorter_ones_count_jitter() -> None:
+    noisy = along([i / 60 for i in range(1, 61)], noise=0.02)
+    ours, fine = (even_chords(retime(noisy, seen, "even", samples=samples)) for samples in (20, 60))
+    assert float(ours.min() / ours.max()) > 0.7
+    assert float(ours.min() / ours.max()) > float(fine.min() / fine.max()) + 0.05
+
+
 def test_stage_ends_keep_their_strengths_whatever_happens_between() -> None:
     progress = [0.01, 0.02, 0.05, 0.1, 0.3, 0.95, 1.0]
     trajectory = retime(along(progress, [2, 4, 5, 7]), seen, "stages")

@@ -134,9 +134,9 @@ def widened(stand: Stand, edited: Pictures) -> Stand:
     return replace(stand, train=views)
 
 
-def probes(stand: Stand) -> list[CropScene]:
+def probes(stand: Stand, count: int = _PROBES) -> list[CropScene]:
     """A few training views at half size, in which movement is measured."""
-    chosen = stand.train[:: max(1, len(stand.train) // _PROBES)][:_PROBES]
+    chosen = stand.train[:: max(1, len(stand.train) // count)][:count]
     return [
         crop_scene(
             stand.scene,

@@ -33,6 +33,8 @@ from trainer.views import crop
 PART = "training"
 """Of the saved state: all that changes while the members are optimised."""
 
+_TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -228,7 +230,7 @@ def _groups(
 
 def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Trajectory:
     """Without jitter, and at the slider values where its change is due."""
-    small = probes(stand)
+    small = probes(stand, _TIMED_VIEWS)
     rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
 
     moving = moving_attributes(trajectory.end)

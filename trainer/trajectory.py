@@ -85,13 +85,15 @@ def retime(
     render: Callable[[Tensor], Tensor],
     slider: Slider = "stages",
     passes: int = 3,
-    samples: int = 6,
+    samples: int = 20,
 ) -> Trajectory:
     """Give every recording the slider value at which its visible change is due.
 
     The chord length between pictures is what counts: arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
-    stretches the slider accordingly.
+    stretches the slider accordingly. Chords are as long as the steps that a hand makes: shorter ones count
+    jitter that no step shows (a recoloured robot's 20 steps: least over largest .71 instead of .66; a bear's
+    scarf .93 instead of .76, its hands .85).
 
     Args:
         trajectory: recordings with any slider values
@@ -99,7 +101,7 @@ def retime(
         slider: "stages": even change between the stages' pinned strengths; "even": over the whole slider,
             nothing pinned; "time": the optimiser's steps
         passes: how often to repeat
-        samples: chords per pinned segment, at least
+        samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
     if slider == "time":
         return replace(trajectory, s=_placed(0.0, 1.0, trajectory.steps.double()).float())
@@ -118,7 +120,7 @@ def retime(
     for _ in range(passes - 1):
         trajectory = replace(trajectory, s=s.float())
         for nodes, low, high in segments:
-            count = max(samples, nodes.stop - nodes.start)
+            count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
             progress = _cumulative(_chords([render(trajectory.at(float(x))) for x in even]))
             s[nodes] = _placed(low, high, _interpolate(s[nodes], even, progress))
