@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from .state import LayerState, ViewState
+from .state import LayerState, Timeline, ViewState
 
 LONGEST = 1000  # entries; each is a few hundred bytes
 
@@ -16,6 +16,7 @@ class Edit:
     layers: tuple[LayerState, ...]
     blend: str
     overshoot: bool = False
+    timeline: Timeline = Timeline()
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class History:
 
 
 def edit_of(state: ViewState) -> Edit:
-    return Edit(state.layers, state.blend, state.overshoot)
+    return Edit(state.layers, state.blend, state.overshoot, state.timeline)
 
 
 def begin(state: ViewState) -> History:
@@ -45,6 +46,18 @@ def record(history: History, state: ViewState) -> History:
     if edit == history.present:
         return history
     return History(edit, (*history.past, history.present)[-LONGEST:])
+
+
+def followed(history: History, before: ViewState, after: ViewState) -> History:
+    """The playhead has moved strengths: no entry, as nobody edited them; gestures under way stay such."""
+    if after.layers == before.layers:
+        return history
+    was = {layer.gdf: layer.strength for layer in before.layers}
+    went = {layer.gdf: layer.strength for layer in after.layers if layer.strength != was.get(layer.gdf)}
+    layers = tuple(
+        replace(layer, strength=went.get(layer.gdf, layer.strength)) for layer in history.present.layers
+    )
+    return replace(history, present=replace(history.present, layers=layers))
 
 
 def undo(history: History, state: ViewState) -> tuple[History, ViewState]:
@@ -64,4 +77,6 @@ def redo(history: History, state: ViewState) -> tuple[History, ViewState]:
 
 
 def _restored(state: ViewState, edit: Edit) -> ViewState:
-    return replace(state, layers=edit.layers, blend=edit.blend, overshoot=edit.overshoot)
+    return replace(
+        state, layers=edit.layers, blend=edit.blend, overshoot=edit.overshoot, timeline=edit.timeline
+    )

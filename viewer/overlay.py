@@ -19,6 +19,7 @@ MOUSE_HELP = (
     ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
     ("Right drag", "pan; look around while flying"),
     ("Wheel", "zoom"),
+    ("Click", "focus the layer under the cursor"),
     ("Double click", "turn around the surface under the cursor"),
     ("W A S D Q E", "fly; Shift ten times faster, Alt slower"),
     ("Shift on a slider", "ten times finer"),
@@ -124,7 +125,7 @@ def bindings(area: Area, ui: UiContext) -> None:
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.begin("bindings", None, _FLOATING)
     imgui.push_font(None, SMALL_PX)
-    for column, rows in enumerate((MOUSE_HELP, key_help())):
+    for column, rows in enumerate(_columns()):
         if column:
             imgui.same_line(0.0, 28.0 * ui.scale)
         imgui.begin_group()
@@ -140,10 +141,24 @@ def bindings(area: Area, ui: UiContext) -> None:
     imgui.pop_style_color()
 
 
+def _columns() -> tuple[tuple[tuple[str, str], ...], tuple[tuple[str, str], ...]]:
+    """The mouse and, under it, as many of the last keys as make both columns equally long."""
+    keys = key_help()
+    below = max((len(keys) - len(MOUSE_HELP) - 1) // 2, 0)
+    above = len(keys) - below
+    return (*MOUSE_HELP, ("", ""), *keys[above:]), keys[:above]
+
+
 def key_help() -> tuple[tuple[str, str], ...]:
     """Chord and help of every key that has a help text, in the words of a person."""
     names = {"1": "1–9", "Shift+1": "Shift+1–9", "Right": "← →", "Shift+Right": "Shift+← →"}
-    names |= {"Ctrl+Right": "Ctrl+← →", "Escape": "Esc", "Alt+Down": "Alt+↑ ↓"}
+    names |= {
+        "Ctrl+Right": "Ctrl+← →",
+        "Escape": "Esc",
+        "Alt+Down": "Alt+↑ ↓",
+        ".": ", .",
+        "Shift+.": "Shift+, .",
+    }
     return tuple((names.get(key.chord, key.chord), key.help) for key in controls.KEYS if key.help)
 
 

@@ -71,6 +71,40 @@ class Comparison:
 
 
 @dataclass(frozen=True)
+class Keyframe:
+    """What the timeline shows at one frame.
+
+    Args:
+        frame: from 0
+        strengths: `LayerState.gdf` and its strength
+        camera: None where the film leaves the camera alone
+        easing: how it goes on from here, of `timeline.EASINGS`
+    """
+
+    frame: int
+    strengths: tuple[tuple[int, float], ...] = ()
+    camera: ViewCamera | None = None
+    easing: str = "smooth"
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Keys over frames (see timeline.py).
+
+    Args:
+        keys: by rising frames, no two at the same
+        length: the last frame; frame 0 is the first
+        fps: frames per second
+        ping_pong: back again after the last frame
+    """
+
+    keys: tuple[Keyframe, ...] = ()
+    length: int = 72
+    fps: int = 24
+    ping_pong: bool = False
+
+
+@dataclass(frozen=True)
 class ViewState:
     """Everything that decides the picture, and what of the panel is open.
 
@@ -88,3 +122,4 @@ class ViewState:
     compare: Comparison = Comparison()
     overshoot: bool = False
     unfolded: tuple[int, ...] = ()
+    timeline: Timeline = Timeline()

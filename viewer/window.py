@@ -30,9 +30,11 @@ _NAMES = {
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
     **{
         getattr(glfw, f"KEY_{name.upper()}"): name
-        for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter")
+        for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Space", "Delete")
     },
     glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
+    glfw.KEY_COMMA: ",",
+    glfw.KEY_PERIOD: ".",
 }
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),

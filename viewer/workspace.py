@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 from progdf.layers import BLENDS
 
-from . import compare, controls, history, stack, turntable
+from . import compare, controls, history, playback, stack, timeline, turntable
 from .history import History
 from .layer_rows import LayerRow
+from .playback import Player
 from .state import Comparison, ViewCamera, ViewState
 from .turntable import Bounds
 
@@ -57,7 +58,8 @@ class Workspace:
         renaming: the layer whose name is being typed, or None
         help: whether the list of bindings is shown
         message: the line at the bottom, or None
-        requests: what the window has still to do: "picture", "window_picture", "full_screen", "quit"
+        requests: what the window has still to do: "picture", "window_picture", "full_screen", "quit", …
+        player: the playhead of `view.timeline`
     """
 
     view: ViewState
@@ -69,6 +71,7 @@ class Workspace:
     help: bool = False
     message: Message | None = None
     requests: tuple[str, ...] = ()
+    player: Player = Player()
 
 
 def opened(view: ViewState) -> Workspace:
@@ -88,6 +91,17 @@ def settled(workspace: Workspace) -> Workspace:
     return workspace if past is workspace.past else replace(workspace, past=past)
 
 
+def played(workspace: Workspace, seconds: float) -> Workspace:
+    """After so much time; the film goes on where it is playing."""
+    if not workspace.player.playing:
+        return workspace
+    player = playback.advanced(workspace.player, workspace.view.timeline, seconds)
+    view = workspace.view
+    view = timeline.shown_at(view.timeline, player.frame, view)
+    past = history.followed(workspace.past, workspace.view, view)
+    return replace(workspace, view=view, player=player, past=past)
+
+
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
     """The workspace after an action of `controls.KEYS`.
 
@@ -104,6 +118,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return replace(workspace, requests=(*workspace.requests, name))
     if name in ("frame", "home"):
         return _framed(workspace, facts, aspect) if name == "frame" else _home(workspace)
+    if name == "dial":
+        return _dialled(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
 
 
@@ -146,13 +162,14 @@ def _nudge(workspace: Workspace, by: str) -> Workspace:
     return _on_focused(workspace, lambda view, i: stack.nudged(view, i, workspace.dial, float(by)))
 
 
-def _dial(workspace: Workspace, by: str) -> Workspace:
-    """The next dial of the focused layer; its gains unfold, so that one sees which."""
-    if workspace.focus is None or not workspace.view.layers:
+def _dialled(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
+    """The next dial that the focused layer has; its gains unfold, so that one sees which."""
+    if workspace.focus is None:
         return workspace
-    dials = stack.DIALS
-    dial = dials[(dials.index(workspace.dial) + int(by)) % len(dials)]
     view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
+    dials = [dial for dial in stack.DIALS if dial == "strength" or dial in facts.rows[gdf].kinds]
+    place = dials.index(workspace.dial) if workspace.dial in dials else 0
+    dial = dials[(place + by) % len(dials)]
     if dial != "strength" and gdf not in view.unfolded:
         view = replace(view, unfolded=(*view.unfolded, gdf))
     return replace(workspace, dial=dial, view=view)
@@ -207,14 +224,24 @@ def _fly(workspace: Workspace, _: str) -> Workspace:
     return with_camera(workspace, controls.toggle_fly(workspace.view.camera))
 
 
-REQUESTS = ("picture", "window_picture", "full_screen", "quit")
+def _timed(name: str) -> Callable[[Workspace, str], Workspace]:
+    """An action of the timeline."""
+
+    def act(workspace: Workspace, argument: str) -> Workspace:
+        view, player = playback.perform(workspace.view, workspace.player, f"{name}:{argument}")
+        past = history.followed(workspace.past, workspace.view, view)
+        return replace(workspace, view=view, player=player, past=past)
+
+    return act
+
+
+REQUESTS = ("picture", "window_picture", "timeline_file", "full_screen", "quit")
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": lambda workspace, _: replace(workspace, focus=None),
     "toggle": _toggle,
     "hide": _hide,
     "nudge": _nudge,
-    "dial": _dial,
     "move": _move,
     "solo": lambda workspace, _: _on_focused(workspace, stack.soloed),
     "show_all": lambda w, _: replace(w, view=stack.all_shown(w.view)),
@@ -231,4 +258,5 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "difference": lambda w, _: replace(w, view=compare.switched(w.view, "difference")),
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
+    **{name: _timed(name) for name in playback.ACTIONS},
 }
