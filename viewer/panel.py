@@ -86,15 +86,41 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     actions: list[str] = []
     _title(shown, ui)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
-    imgui.begin_child("body", imgui.ImVec2(0.0, -footer), 0, flags.no_nav.value)
+    _begin_body(footer)
     state = layer_cards.heading(state, ui)
     cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
     state, focus, renaming = layer_cards.draw(state, cards, ui)
     state = _view(state, ui, actions)
-    imgui.end_child()
+    _end_body()
     _footer(shown, ui, actions)
     imgui.end()
     return PanelResult(state, focus, tuple(actions), renaming)
+
+
+def _begin_body(footer: float) -> None:
+    """What scrolls; its scrollbar stands in the panel's margin, so that nothing moves when one is needed."""
+    overflows = imgui.get_state_storage().get_bool(imgui.get_id("overflows"))
+    clear = imgui.ImVec4(0.0, 0.0, 0.0, 0.0)
+    slots = (imgui.Col_.scrollbar_grab, imgui.Col_.scrollbar_grab_hovered, imgui.Col_.scrollbar_grab_active)
+    for slot in () if overflows else slots:
+        imgui.push_style_color(slot, clear)
+    flags = imgui.WindowFlags_
+    wide = imgui.get_content_region_avail().x + imgui.get_style().scrollbar_size
+    imgui.begin_child(
+        "body",
+        imgui.ImVec2(wide, -footer),
+        0,
+        flags.no_nav.value | flags.always_vertical_scrollbar.value,
+    )
+    if not overflows:
+        imgui.pop_style_color(len(slots))
+
+
+def _end_body() -> None:
+    # the content's own height: imgui's scroll range is a frame behind it
+    overflows = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y > imgui.get_window_height()
+    imgui.end_child()
+    imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
 
 
 def _title(shown: PanelInput, ui: UiContext) -> None:

@@ -1,20 +1,41 @@
-"""Which point of the surface lies under the cursor: the depth at which the picture has become half opaque."""
+"""What lies under the cursor: which Gaussians with which shares, which point of the surface, which layer."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.checkpoint import Gdf
 from progdf.gaussians import Gaussians
 from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN, DILATION
 
-from .state import Vec3
+from .stack import shown
+from .state import Vec3, ViewState
 
 HALF = 0.5
 FAINT = 0.05  # less than this in all counts as background
+LEAST_SHARE = 0.25  # of what one sees at a pixel must be a layer's own before a click there means it
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one sees at a pixel, nearest first.
+
+    Args:
+        rows: indices of the Gaussians. [M] int64
+        shares: the part of the pixel's colour that each gives; with the background's share they make 1. [M]
+        depths: in front of the camera, world units. [M]
+    """
+
+    rows: NDArray[np.int64]
+    shares: NDArray[np.float64]
+    depths: NDArray[np.float64]
 
 
 def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Vec3 | None:
@@ -30,8 +51,45 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
         World position; the strongest Gaussian's depth where the pixel never gets half opaque; None on the
         background.
     """
+    seen = seen_at(scene, camera, x, y, near)
+    if seen is None:
+        return None
+    opaque = np.flatnonzero(np.cumsum(seen.shares) >= HALF)
+    at = int(opaque[0]) if len(opaque) else int(seen.shares.argmax())
+    z = float(seen.depths[at])
+    fx, fy, cx, cy = _lens(camera)
     rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
-    fx, fy, cx, cy = (float(v) for v in (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]))
+    wx, wy, wz = (
+        float(v) for v in rotation.T @ (np.array([(x - cx) / fx * z, (y - cy) / fy * z, z]) - translation)
+    )
+    return (wx, wy, wz) if all(math.isfinite(v) for v in (wx, wy, wz)) else None
+
+
+def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
+    """The layer that most of what one sees belongs to, an index into `view.layers`.
+
+    Args:
+        view: what is on screen
+        gdfs: the edits that `LayerState.gdf` counts
+        seen: at the pixel
+
+    Returns:
+        A shown layer goes before a hidden one, of equal ones the later; None where no layer has
+        `LEAST_SHARE` of the pixel.
+    """
+    visible, best, chosen = shown(view), (False, 0.0), None
+    for i, layer in enumerate(view.layers):
+        own = np.isin(seen.rows, gdfs[layer.gdf].region.members.numpy(), assume_unique=True)
+        share = float(seen.shares[own].sum())
+        if share >= LEAST_SHARE and (layer in visible, share) >= best:
+            best, chosen = (layer in visible, share), i
+    return chosen
+
+
+def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Seen | None:
+    """The Gaussians that one sees at a pixel position, None on the background; as `surface_point`."""
+    rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
+    fx, fy, cx, cy = _lens(camera)
     means = scene.means.numpy()
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         local = means @ rotation.T + translation
@@ -51,13 +109,14 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
     if 1.0 - through[-1] < FAINT:
         return None
     shares = alphas[order] * np.concatenate([[1.0], through[:-1]])
-    opaque = np.flatnonzero(1.0 - through >= HALF)
-    at = int(opaque[0]) if len(opaque) else int(shares.argmax())
-    z = float(depth[near_ray[order[at]]])
-    wx, wy, wz = (
-        float(v) for v in rotation.T @ (np.array([(x - cx) / fx * z, (y - cy) / fy * z, z]) - translation)
-    )
-    return (wx, wy, wz) if all(math.isfinite(v) for v in (wx, wy, wz)) else None
+    rows = near_ray[order]
+    return Seen(rows, shares, depth[rows].astype(np.float64))
+
+
+def _lens(camera: Camera) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point, pixels."""
+    fx, fy, cx, cy = (float(v) for v in (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]))
+    return fx, fy, cx, cy
 
 
 def _alphas(

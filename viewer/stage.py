@@ -23,7 +23,7 @@ from .engine import Engine, FrameTimings
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
 from .pace import Pace
-from .pick import surface_point
+from .pick import layer_at, seen_at, surface_point
 from .pictures import save_picture
 from .state import ViewCamera, ViewState
 from .turntable import to_camera
@@ -32,6 +32,7 @@ from .workspace import Message, SceneFacts
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
 MESSAGE_S, ERROR_S = 6.0, 15.0
+CLICK_PX = 3.0  # a press that moves no further, at 1×, is a click
 
 
 class Stage:
@@ -65,6 +66,7 @@ class Stage:
         self.timings = FrameTimings()  # of the picture on screen
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
         self._drag: str | None = None
+        self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
         self._pace = Pace()
@@ -174,14 +176,13 @@ class Stage:
         return max(round(area.width * density.x), 1), max(round(area.height * density.y), 1)
 
     def _handle_input(self, seconds: float) -> None:
-        focus = self.work.focus
         for action in inputs.actions_pressed(self._keys):
             self._perform(action)
         if inputs.flying(self._keys):
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
-            self._panel(reveal=self.work.focus != focus)
+            self._panel(reveal=self.work.focus != self._revealed)
         camera = self._moved_by_mouse(self.work.view.camera)  # may move the divider of a split instead
         self.work = workspace.with_camera(self.work, camera)
 
@@ -204,6 +205,7 @@ class Stage:
         )
         result = panel.draw(self.work.view, shown, self.ui)
         self.work = replace(self.work, view=result.state, focus=result.focus, renaming=result.renaming)
+        self._revealed = result.focus
         for action in result.actions:
             self._perform(action)
 
@@ -215,6 +217,8 @@ class Stage:
         elif self._drag and (dx or dy):
             # also where the button went up within this frame: a slow frame must not lose the end of a drag
             camera = controls.drag(camera, self._drag, dx, dy, self._area().height / scale, radius)
+        if imgui.is_mouse_released(0) and self._drag in ("orbit", "look") and not self._dragged():
+            self._focus_picked(camera)
         if not inputs.any_button_down():
             self._drag = None
         if not io.want_capture_mouse:
@@ -236,14 +240,27 @@ class Stage:
         over = imgui.get_io().want_capture_mouse
         return not over and compare_overlay.near(self.work.view, self._area(), self.ui)
 
-    def _pivot_picked(self, camera: ViewCamera) -> ViewCamera:
+    def _dragged(self) -> bool:
+        """Whether the left button moved between its press and its release, by more than a hand trembles."""
+        moved = imgui.get_mouse_drag_delta(0, CLICK_PX * self.ui.scale)
+        return bool(moved.x or moved.y)
+
+    def _cursor(self) -> tuple[float, float]:
+        """Where the mouse is, in pixels of the picture."""
         mouse, density = imgui.get_io().mouse_pos, imgui.get_io().display_framebuffer_scale
-        point = surface_point(
-            self.engine.gaussians(self._shown()),
-            to_camera(camera, *self._picture_size()),
-            mouse.x * density.x,
-            mouse.y * density.y,
-        )
+        return mouse.x * density.x, mouse.y * density.y
+
+    def _focus_picked(self, camera: ViewCamera) -> None:
+        """A click on the picture: the layer there, if there is one, is focused."""
+        view = self._shown()
+        seen = seen_at(self.engine.gaussians(view), to_camera(camera, *self._picture_size()), *self._cursor())
+        layer = None if seen is None else layer_at(view, self.engine.gdfs, seen)
+        if layer is not None:
+            self._perform(f"focus:{layer + 1}")
+
+    def _pivot_picked(self, camera: ViewCamera) -> ViewCamera:
+        scene = self.engine.gaussians(self._shown())
+        point = surface_point(scene, to_camera(camera, *self._picture_size()), *self._cursor())
         return camera if point is None else controls.pivot_on(camera, point, self.facts.bounds.radius)
 
     def _shown(self) -> ViewState:

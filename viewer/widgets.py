@@ -60,7 +60,7 @@ def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
 
 def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
     """A button of small text on the present line, in the accent's colour while on; True when pressed."""
-    colours = (PALETTE.accent, PALETTE.text) if lit else (PALETTE.faint, PALETTE.dim)
+    colours = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)
     height = 3.0 * ui.scale  # reaches above its line, so that the hand finds it
     x, y = imgui.get_cursor_screen_pos()
     imgui.push_font(None, SMALL_PX)
