@@ -1,7 +1,8 @@
 """One engine, on screen and headless: state → compose → upload → sort → draw, published together.
 
 It compares the state with the one it last drew and does only the work between them: a camera move composes
-nothing, a change of colour sorts nothing, the same state draws nothing.
+nothing, a change of colour sorts nothing, the same state draws nothing, and where the CPU draws, a slider
+draws only the part of the picture that its members touch.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.layers import Gains, Layer
 
+from .cpu_painter import CpuPainter
 from .headless import is_software
-from .painters import CpuPainter, GlPainter, Image, Painter
+from .painters import GlPainter, Image, Painter
 from .sort import back_to_front
 from .stack import shown
 from .state import ViewState
@@ -42,6 +44,7 @@ class FrameTimings:
         draw_ms: the picture
         changed: Gaussians whose attributes were composed anew
         drawn: Gaussians in front of the camera; all of them where the CPU rasteriser draws
+        share: of the picture's pixels that were drawn anew, 0..1
     """
 
     compose_ms: float = 0.0
@@ -50,6 +53,7 @@ class FrameTimings:
     draw_ms: float = 0.0
     changed: int = 0
     drawn: int = 0
+    share: float = 0.0
 
     @property
     def total_ms(self) -> float:
@@ -178,7 +182,7 @@ class Engine:
             self._order = back_to_front(self._composer.gaussians.means.numpy(), camera)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
-        self._painter.draw(camera, view.background, self._order)
+        share = self._painter.draw(camera, view.background, self._order)
         drawn_at = time.perf_counter()
         self._picture = wanted
         return FrameTimings(
@@ -188,6 +192,7 @@ class Engine:
             1e3 * (drawn_at - sorted_at),
             changed,
             len(self._order) if self._painter.wants_order else len(self._composer.gaussians),
+            share,
         )
 
     def _compose(self, edits: _Edits) -> tuple[float, float, int]:

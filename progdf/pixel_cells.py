@@ -1,0 +1,86 @@
+"""Which part of a picture some Gaussians can touch, in cells of 8×8 pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.rasterize.conventions import ALPHA_MIN, DILATION
+from progdf.rasterize.geometry import dot, footprint, make_lens, vec
+from progdf.rasterize.jit import kernel
+
+Array = NDArray[Any]
+
+CELL = 8
+"""Pixels of a cell's side; a cell spans whole rows of the rasteriser's tiles."""
+
+_MARGIN = 1.0  # px on each side: far more than rounding, far less than a cell
+
+
+def no_cells(width: int, height: int) -> NDArray[np.bool_]:
+    """No cell of a picture of this size marked. [⌈height/8⌉, ⌈width/8⌉]"""
+    return np.zeros((-(-height // CELL), -(-width // CELL)), np.bool_)
+
+
+def mark_cells(
+    cells: NDArray[np.bool_],
+    means: NDArray[np.float32],
+    quats: NDArray[np.float32],
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    rows: NDArray[np.int64],
+    camera: Camera,
+    near: float = 0.01,
+) -> None:
+    """Mark every cell with a pixel that one of `rows` can have alpha ≥ 1/255 in, as `rasterize` draws them.
+
+    Args:
+        cells: from `no_cells`; marks are added
+        means, quats, scales, opacities: activated. [N,3], [N,4], [N,3], [N]
+        rows: which Gaussians. [M]
+        camera: the view, without antialiasing
+        near: least camera z, world units
+    """
+    k = camera.K.double().numpy()
+    intrinsics = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
+    viewmat = np.ascontiguousarray(camera.viewmat.double().numpy())
+    size = np.array([camera.width, camera.height], np.int64)
+    _mark(cells, means, quats, scales, opacities, rows, viewmat, intrinsics, size, near)
+
+
+@kernel(contract=True, cache=True)
+def _mark(
+    cells: Array, means: Array, quats: Array, scales: Array, opacities: Array, rows: Array, viewmat: Array,
+    intrinsics: Array, size: Array, near: float,
+) -> None:  # fmt: skip
+    lens = make_lens(viewmat, intrinsics, size)
+    width, height = np.float64(size[0]), np.float64(size[1])
+    for k in range(rows.size):
+        i = rows[k]
+        mean, scale, opacity = vec(means, i), vec(scales, i), np.float64(opacities[i])
+        z = dot(lens.rows[2], mean) + lens.shift[2]
+        total = abs(mean[0]) + abs(mean[1]) + abs(mean[2]) + abs(scale[0]) + abs(scale[1]) + abs(scale[2])
+        if not (z > near and opacity >= ALPHA_MIN and total + opacity < np.inf):
+            continue
+        seen = footprint(
+            lens, mean, np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]),
+            np.float64(quats[i, 3]), scale,
+        )  # fmt: skip
+        px, py = lens.fx * seen.x * seen.inv_z + lens.cx, lens.fy * seen.y * seen.inv_z + lens.cy
+        reach2 = 2.0 * math.log(opacity / ALPHA_MIN)
+        wide = math.sqrt(max(0.0, reach2 * (seen.a + DILATION))) + _MARGIN
+        high = math.sqrt(max(0.0, reach2 * (seen.c + DILATION))) + _MARGIN
+        left, right, top, bottom = px - wide, px + wide, py - high, py + high
+        if right < 0.0 or left >= width or bottom < 0.0 or top >= height:
+            continue
+        if not abs(left) + abs(right) + abs(top) + abs(bottom) < np.inf:  # as far as numbers go: anywhere
+            left, right, top, bottom = 0.0, width, 0.0, height
+        x0, x1 = int(max(left, 0.0)) // CELL, int(min(right, width - 1.0)) // CELL
+        y0, y1 = int(max(top, 0.0)) // CELL, int(min(bottom, height - 1.0)) // CELL
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                cells[y, x] = True
