@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from progdf.field import BakedField, fit_keyframes
