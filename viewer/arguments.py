@@ -38,18 +38,18 @@ def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tup
     return tuple(gdfs)
 
 
-def layers_of(gdfs: Sequence[Gdf], settings: Sequence[str]) -> tuple[LayerState, ...]:
+def layers_of(gdfs: Sequence[Gdf], settings: Sequence[str], most: float = 1.0) -> tuple[LayerState, ...]:
     """One layer per edit, at 0 unless a `NAME=S` of `settings` says otherwise.
 
     Raises:
-        ProgdfError: there is no edit NAME, or S is no number from 0 to 1.
+        ProgdfError: there is no edit NAME, or S is no number from 0 to `most`.
     """
     strengths = {gdf.name: 0.0 for gdf in gdfs}
     for setting in settings:
         name, equals, text = setting.rpartition("=")
         if not equals or not name:
             raise ProgdfError(f"--set {setting} has no NAME=S; write for example --set {_example(gdfs)}=0.7")
-        strengths[known_edit(name, gdfs, "--set")] = _strength(setting, text)
+        strengths[known_edit(name, gdfs, "--set")] = _strength(setting, text, most)
     return tuple(LayerState(i, gdf.name, strengths[gdf.name]) for i, gdf in enumerate(gdfs))
 
 
@@ -172,13 +172,13 @@ def parse_background(text: str) -> Vec3:
     return red, green, blue
 
 
-def _strength(setting: str, text: str) -> float:
+def _strength(setting: str, text: str, most: float) -> float:
     try:
         strength = float(text)
     except ValueError:
         strength = math.nan
-    if not 0.0 <= strength <= 1.0:
-        raise ProgdfError(f"--set {setting}: the strength '{text}' is not a number from 0 to 1")
+    if not 0.0 <= strength <= most:
+        raise ProgdfError(f"--set {setting}: the strength '{text}' is not a number from 0 to {most:g}")
     return strength
 
 

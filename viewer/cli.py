@@ -28,11 +28,15 @@ from . import arguments, film
 from .compare import Comparer, labelled
 from .engine import Engine
 from .headless import headless_context
-from .state import ViewState
+from .layer_arguments import stack_of
+from .stack import shown
+from .state import LayerState, ViewState
 from .turntable import first_camera, to_camera
 
 Blend = Literal["normalised", "sum", "over"]
 Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
+Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
+Solo = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction]
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.ply")]
 Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -53,6 +57,12 @@ class ViewOptions:
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
     """Strength of an edit when the window opens, 0 to 1; 0 where not set. Repeat it for several edits."""
+    gain: Gains = ()
+    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
+    solo: Solo = ()
+    """Show this edit alone. Repeat it for several edits."""
+    overshoot: bool = False
+    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend = "normalised"
     """How edits that share Gaussians go together."""
     background: str = "white"
@@ -79,6 +89,12 @@ class RenderOptions:
     """Pixels; else the camera's own, or 640x480."""
     engine: Literal["auto", "gl", "cpu"] = "auto"
     """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
+    gain: Gains = ()
+    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
+    solo: Solo = ()
+    """Show this edit alone. Repeat it for several edits."""
+    overshoot: bool = False
+    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend = "normalised"
     """How edits that share Gaussians go together."""
     background: str = "white"
@@ -105,6 +121,12 @@ class ExportOptions:
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
     """Strength of an edit, 0 to 1; 0 where not set. Repeat it for several edits."""
+    gain: Gains = ()
+    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
+    solo: Solo = ()
+    """Show this edit alone. Repeat it for several edits."""
+    overshoot: bool = False
+    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend = "normalised"
     """How edits that share Gaussians go together."""
 
@@ -115,9 +137,10 @@ def view(argv: Sequence[str]) -> int:
     scene, gdfs = _load(options.scene, options.gdfs)
     state = ViewState(
         first_camera(scene),
-        arguments.layers_of(gdfs, options.set),
+        _layers(options, gdfs),
         options.blend,
         arguments.parse_background(options.background),
+        overshoot=options.overshoot,
     )
     from .app import Document, run  # imgui and glfw, which render and export do without
 
@@ -131,7 +154,7 @@ def render(argv: Sequence[str]) -> int:
     size = None if options.size is None else arguments.parse_size(options.size)
     background = arguments.parse_background(options.background)
     scene, gdfs = _load(options.scene, options.gdfs)
-    layers = arguments.layers_of(gdfs, options.set)
+    layers = _layers(options, gdfs)
     swept = _swept(options, gdfs)
     camera = _camera(options, scene, size)
     state = ViewState(layers=layers, blend=options.blend, background=background)
@@ -170,8 +193,8 @@ def export(argv: Sequence[str]) -> int:
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
     _check_not_an_input(options.out, (options.scene, *options.gdfs))
     scene, gdfs = _load(options.scene, options.gdfs)
-    states = arguments.layers_of(gdfs, options.set)
-    layers = [Layer(gdfs[state.gdf], state.strength) for state in states]
+    states = shown(ViewState(layers=_layers(options, gdfs)))
+    layers = [Layer(gdfs[state.gdf], state.strength, gains=state.gains) for state in states]
     edited = compose(scene, layers, options.blend)
     with written_whole(options.out) as beside:
         save_ply(beside, edited)
@@ -198,16 +221,30 @@ def _compare(engine: Engine, view: ViewState, camera: Camera, path: Path) -> flo
     return comparer.psnr
 
 
+def _layers(
+    options: ViewOptions | RenderOptions | ExportOptions, gdfs: Sequence[Gdf]
+) -> tuple[LayerState, ...]:
+    return stack_of(gdfs, options.set, options.gain, options.solo, options.overshoot)
+
+
 def _swept(options: RenderOptions, gdfs: Sequence[Gdf]) -> list[str]:
     """Names of the edits whose sliders move in the picture: none, one or two."""
     if options.sweep is not None:
-        return [arguments.known_edit(options.sweep, gdfs, "--sweep")]
+        return [_showing(arguments.known_edit(options.sweep, gdfs, "--sweep"), options, "--sweep")]
     if options.sheet is None:
         return []
-    names = [arguments.known_edit(name, gdfs, "--sheet") for name in options.sheet.split(",")]
+    named = [arguments.known_edit(name, gdfs, "--sheet") for name in options.sheet.split(",")]
+    names = [_showing(name, options, "--sheet") for name in named]
     if len(names) > 2 or len(set(names)) < len(names):
         raise ProgdfError(f"--sheet {options.sheet} does not name one or two different edits; name those")
     return names
+
+
+def _showing(name: str, options: RenderOptions, option: str) -> str:
+    """`name`, when its slider can show something: another edit that is alone hides it."""
+    if options.solo and name not in options.solo:
+        raise ProgdfError(f"{option} {name}: --solo {options.solo[0]} hides it; add --solo {name}")
+    return name
 
 
 def _camera(options: RenderOptions, scene: Gaussians, size: tuple[int, int] | None) -> Camera:
