@@ -18,9 +18,15 @@ def save_picture(folder: Path, stem: str, image: NDArray[np.uint8]) -> Path:
         ProgdfError: the folder does not exist.
         OSError: it cannot be written.
     """
-    number = 1
-    while (path := folder / f"{stem}_{number:03d}.png").exists():
-        number += 1
+    path = free_path(folder, stem, ".png")
     with written_whole(path) as beside:
         Image.fromarray(image).save(beside)
+    return path
+
+
+def free_path(folder: Path, stem: str, suffix: str) -> Path:
+    """STEM_001 with `suffix`, or the next number that no file has."""
+    number = 1
+    while (path := folder / f"{stem}_{number:03d}{suffix}").exists():
+        number += 1
     return path

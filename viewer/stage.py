@@ -17,15 +17,29 @@ from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 
-from . import compare_overlay, controls, inputs, overlay, panel, workspace
+from . import (
+    compare_overlay,
+    controls,
+    dialogs,
+    inputs,
+    overlay,
+    panel,
+    playback,
+    timeline_bar,
+    timeline_file,
+    workspace,
+)
 from .compare import Comparer, labelled
 from .engine import Engine, FrameTimings
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
 from .pace import Pace
 from .pick import layer_at, seen_at, surface_point
-from .pictures import save_picture
+from .pictures import free_path, save_picture
+from .snapshot_cards import SnapshotCard
+from .snapshots import Snapshot, shown
 from .state import ViewCamera, ViewState
+from .thumbnails import Thumbnails
 from .turntable import to_camera
 from .ui_context import PALETTE, UiContext
 from .workspace import Message, SceneFacts
@@ -57,7 +71,8 @@ class Stage:
         pictures: Path = Path(),
     ) -> None:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
-        self.comparer = Comparer(engine, context)
+        self.comparer, self.thumbnails = Comparer(engine, context), Thumbnails(context, engine)
+        self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self.work = workspace.opened(view)
@@ -78,11 +93,14 @@ class Stage:
         imgui.backends.opengl3_shutdown()
         self.ui.close()
         self.comparer.release()
+        self.thumbnails.release()
 
     def serve(self, engine: Engine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
         self.comparer.release()
+        self.thumbnails.release()
         self.engine, self.facts, self.comparer = engine, facts, Comparer(engine, self.context)
+        self.thumbnails = Thumbnails(self.context, engine)
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -90,9 +108,9 @@ class Stage:
         self.work = workspace.settled(replace(self.work, view=view))
         self.wake()
 
-    def restart(self, view: ViewState) -> None:
-        """A new state with nothing to undo."""
-        self.work = workspace.opened(view)
+    def restart(self, view: ViewState, kept: tuple[Snapshot, ...] = ()) -> None:
+        """A new state and snapshots, with nothing to undo."""
+        self.work = workspace.opened(view, kept)
         self.wake()
 
     def patience(self) -> float | None:
@@ -103,7 +121,8 @@ class Stage:
             waits.append(BLINK_S)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
-        return self._pace.patience(waits)
+        film = playback.patience(self.work.player, self.work.view.timeline)
+        return self._pace.patience(waits if film is None else [*waits, film])
 
     def tell(self, text: str, error: bool = False) -> None:
         """Show one line at the bottom of the picture for a while."""
@@ -144,6 +163,7 @@ class Stage:
         imgui.get_io().delta_time = max(seconds, 1e-5)
         self._clock += max(seconds, 0.0)
         self._pace.step()
+        self.work = workspace.played(self.work, seconds)
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
@@ -176,13 +196,14 @@ class Stage:
         return max(round(area.width * density.x), 1), max(round(area.height * density.y), 1)
 
     def _handle_input(self, seconds: float) -> None:
-        for action in inputs.actions_pressed(self._keys):
+        for action in inputs.actions_pressed(self._keys) if self.work.dialog is None else ():
             self._perform(action)
         if inputs.flying(self._keys):
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
             self._panel(reveal=self.work.focus != self._revealed)
+            self._timeline()
         camera = self._moved_by_mouse(self.work.view.camera)  # may move the divider of a split instead
         self.work = workspace.with_camera(self.work, camera)
 
@@ -202,12 +223,19 @@ class Stage:
             reveal,
             self.work.dial,
             self.work.renaming,
+            self._cards(),
         )
         result = panel.draw(self.work.view, shown, self.ui)
         self.work = replace(self.work, view=result.state, focus=result.focus, renaming=result.renaming)
         self._revealed = result.focus
         for action in result.actions:
             self._perform(action)
+
+    def _timeline(self) -> None:
+        player = self.work.player
+        if player.shown:
+            for action in timeline_bar.draw(self.work.view.timeline, player, self._area(), self.ui):
+                self._perform(action)
 
     def _moved_by_mouse(self, camera: ViewCamera) -> ViewCamera:
         io, radius, scale = imgui.get_io(), self.facts.bounds.radius, self.ui.scale
@@ -277,7 +305,32 @@ class Stage:
             self.timings = timings
             self.drawn += 1
 
+    def _cards(self) -> tuple[SnapshotCard, ...]:
+        """The snapshots as the panel shows them; drawn one a frame."""
+        work = self.work
+        if not work.snapshots:
+            return ()
+        kept = shown(work.snapshots, work.view)
+        textures, missing = self.thumbnails.bring(kept, work.view)
+        if missing:
+            self.wake()
+        return tuple(SnapshotCard(s.name, texture) for s, texture in zip(kept, textures, strict=True))
+
+    def _ask(self) -> None:
+        """The question that is open, if one is."""
+        if self.work.dialog is None:
+            return
+        area, display = self._area(), imgui.get_io().display_size
+        pressed = [press.chord for press in self._keys.pressed]
+        middle = (display.x / 2, 0.45 * area.height)
+        answer = dialogs.draw(self.work.dialog, self.recent, pressed, self.ui, middle)
+        if answer.dialog is None:
+            self.wake()
+        requests = (*self.work.requests, *answer.requests)
+        self.work = replace(self.work, dialog=answer.dialog, requests=requests)
+
     def _draw_overlays(self) -> None:
+        self._ask()
         area, work = self._area(), self.work
         if inputs.holds_original(self._keys):
             overlay.banner("Original", area, self.ui)
@@ -289,7 +342,8 @@ class Stage:
         if work.help:
             overlay.bindings(area, self.ui)
         if work.message is not None:
-            closed = overlay.message(work.message, area, self.ui)
+            bar = timeline_bar.height(work.player, self.ui) if work.view.panel else 0.0
+            closed = overlay.message(work.message, replace(area, height=area.height - bar), self.ui)
             if closed or self._clock >= work.message.until:
                 self.work = replace(work, message=None)
                 self.wake()
@@ -309,8 +363,23 @@ class Stage:
             self._save(labelled(image, self._shown().compare, self.comparer.psnr))
         if "window_picture" in self.work.requests:
             self._save(read_rgb(screen, size))
-        left = tuple(r for r in self.work.requests if r not in ("picture", "window_picture"))
+        if "timeline_file" in self.work.requests:
+            self._save_timeline()
+        done = ("picture", "window_picture", "timeline_file")
+        left = tuple(r for r in self.work.requests if r not in done)
         self.work = replace(self.work, requests=left)
+
+    def _save_timeline(self) -> None:
+        view = self.work.view
+        path = free_path(self.pictures, f"{Path(self.facts.title).stem}_timeline", ".json")
+        try:
+            timeline_file.save(path, view.timeline, view.layers)
+        except ProgdfError as error:
+            self.tell(str(error), error=True)
+        except OSError as error:
+            self.tell(f"no timeline was saved in {self.pictures.resolve()}: {error.strerror}", error=True)
+        else:
+            self.tell(f"Saved {path.resolve()}; progdf render … --timeline {path.name} makes a film of it")
 
     def _save(self, image: NDArray[np.uint8]) -> None:
         try:
