@@ -47,6 +47,11 @@ def curved_field(
     return fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), rest_type=rest_type)
 
 
+def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
+    """The field's offsets at these strengths. [T,M,C]"""
+    return torch.stack([field.offsets(float(s)) for s in strengths])
+
+
 def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "shirt") -> Gdf:
     """An edit of these rows ([M] int64, sorted)."""
     score = torch.zeros(len(scene))

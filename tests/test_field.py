@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from edits import curved_field, curved_trajectory
+from edits import at_snapshots, curved_field, curved_trajectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -19,10 +19,6 @@ from progdf.gaussians import ATTRIBUTES, attribute_slices
 
 EVERYTHING = dict.fromkeys(ATTRIBUTES, 2)
 REST_TYPES = [torch.int8, torch.float16, torch.float32]
-
-
-def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
-    return torch.stack([field.offsets(float(s)) for s in strengths])
 
 
 def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
@@ -171,27 +167,6 @@ def test_a_fit_is_the_same_every_time() -> None:
         assert all(torch.equal(part, getattr(b.attributes[name], key)) for key, part in vars(bases).items())
 
 
-# ---- keyframes
-
-
-def test_all_snapshots_kept_are_met_exactly() -> None:
-    strengths, offsets = curved_trajectory(30)
-    field = fit_keyframes(strengths, offsets, 9)
-    assert torch.equal(at_snapshots(field, strengths), offsets)
-
-
-def test_two_keyframes_are_the_straight_way_at_fourteen_floats() -> None:
-    strengths, offsets = curved_trajectory(30)
-    field = fit_keyframes(strengths, offsets, 2)
-    assert field.bytes_per_member == 14 * 4
-    assert torch.allclose(field.offsets(0.3), 0.3 * offsets[-1])
-
-
-def test_fewer_than_two_keyframes_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least 2"):
-        fit_keyframes(*curved_trajectory(3), 1)
-
-
 # ---- baked fields
 
 
@@ -263,6 +238,41 @@ def test_a_target_out_of_reach_is_said_and_the_best_is_kept() -> None:
     assert not chosen.met
     assert chosen.best.worst == max(c.worst for c in chosen.tried if c.field.bytes_per_member <= 80)
     assert chosen.best.field.bytes_per_member <= 80
+
+
+def test_a_budget_alone_gets_the_best_field_within_it_and_says_so() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    render = linear_pictures(60, 14)
+    chosen = choose_field(strengths, offsets, render, target=torch.inf, budget=70.0)
+    assert chosen.met
+    assert chosen.best.field.bytes_per_member <= 70
+    assert chosen.best.worst == max(c.worst for c in chosen.tried if c.field.bytes_per_member <= 70)
+    assert chosen.why == f"the best of {len(chosen.tried)} fields within 70 bytes"
+    more = choose_field(strengths, offsets, render, target=torch.inf, budget=90.0)
+    assert more.best.worst > chosen.best.worst
+
+
+def test_a_budget_that_nothing_fits_into_gets_the_smallest_and_says_so() -> None:
+    strengths, offsets = curved_trajectory(60)
+    chosen = choose_field(strengths, offsets, linear_pictures(60, 14), target=torch.inf, budget=20.0)
+    assert not chosen.met
+    assert chosen.best.field.bytes_per_member == 56
+    assert "none fits into 20 bytes" in chosen.why
+
+
+def test_the_choice_says_that_its_field_is_the_smallest_that_serves() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    chosen = choose_field(strengths, offsets, linear_pictures(60, 14), target=45.0)
+    assert chosen.why == f"the smallest of {len(chosen.tried)} fields that reaches 45 dB"
+    assert {c.field.kind for c in chosen.tried} == {"separable", "keyframes"}
+
+
+def test_a_lossless_field_can_be_asked_for_whatever_it_takes() -> None:
+    strengths, offsets = curved_trajectory(20)
+    chosen = choose_field(strengths, offsets, linear_pictures(20, 14), kind="lossless", target=45.0)
+    assert chosen.met
+    assert chosen.best.worst > 90
+    assert torch.equal(at_snapshots(chosen.best.field, strengths), offsets)
 
 
 def test_an_edit_that_moves_nothing_is_a_choice_too() -> None:

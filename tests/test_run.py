@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -131,12 +132,41 @@ def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
     assert digests[0] == digests[1]
 
 
+@pytest.mark.parametrize(
+    ("field", "budget", "message"),
+    [
+        ("neural", 60, "--bytes-budget means nothing to --field neural"),
+        ("lossless", 60, "--bytes-budget means nothing to --field lossless"),
+        ("auto", 0.5, "--bytes-budget is 0.5; 1 or more"),
+        ("auto", math.nan, "--bytes-budget is nan; 1 or more"),
+    ],
+)
+def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: float, message: str) -> None:
+    with pytest.raises(ProgdfError, match=message):
+        settled(quick_options(folder, "budget", field=field, bytes_budget=budget))
+
+
+def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
+    result = train(quick_options(folder, "budget", steps=16, stages=2, bytes_budget=1.0), quiet=True)
+    assert not result.report["field"]["target_met"]
+    assert "fits into 1 bytes" in result.report["choice"]["why"]
+    least = result.report["field"]["bytes_per_gaussian"]
+    again = refit(FitOptions(result.folder.root, bytes_budget=least + 3, threads=1), quiet=True)
+    assert again.report["options"]["bytes_budget"] == least + 3
+    assert again.report["field"]["target_met"]
+    assert least < again.report["field"]["bytes_per_gaussian"] <= least + 3
+    assert again.report["field"]["psnr_worst"] > result.report["field"]["psnr_worst"]
+
+
 def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
     result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
     before = result.folder.trajectory.read_bytes()
     again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
     assert again.report["field"]["kind"] == "keyframes"
     assert load_gdf(again.gdf).field.kind == "keyframes"
+    tried = again.report["choice"]["tried"]
+    assert again.report["choice"]["chosen"] in [field["field"] for field in tried]
+    assert "the smallest of" in again.report["choice"]["why"]
     assert result.folder.trajectory.read_bytes() == before
     assert again.report["edit"] == result.report["edit"]
     for stage in ("optimise", "total"):

@@ -74,16 +74,19 @@ def finished(
             fitted = judged_field(trajectory, judge, network.field, options["target_psnr"])
         else:
             network = None
-            fitted = fit_field(trajectory, seen, judge, weights, choice, options["target_psnr"])
+            target, budget = options["target_psnr"], options.get("bytes_budget")
+            fitted = fit_field(trajectory, seen, judge, weights, choice, target, budget)
     field = fitted.chosen.field
-    why = f", the smallest of {fitted.tried} fields that serves" if network is None else ""
     log.say(
-        f"{fitted.chosen.label}{why}: "
+        f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
         f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
     )
     if not fitted.met:
-        log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
+        if (budget := options.get("bytes_budget")) is not None and network is None:
+            log.say(f"no field takes --bytes-budget {budget:g} or less; the smallest was kept")
+        else:
+            log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
     with log.stage("report"):
         clip = clip_course(judge, stand.held_out, field, texts(options))
         if clip.reason and (options.get("text_before") or options.get("text_after")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,15 +28,17 @@ class Fitted:
 
     Args:
         chosen: the field with its errors against the trajectory
-        met: whether it reaches the target
-        tried: how many fields were looked at
+        met: whether it reaches the target, or the budget
+        tried: the fields that were looked at
         baselines: keyframe fields by name
+        why: it was chosen, in words
     """
 
     chosen: Candidate
     met: bool
-    tried: int
+    tried: tuple[Candidate, ...]
     baselines: Mapping[str, Candidate]
+    why: str
 
 
 def fit_field(
@@ -45,8 +48,9 @@ def fit_field(
     weights: Tensor,
     kind: Kind,
     target_psnr: float,
+    budget: float | None = None,
 ) -> Fitted:
-    """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target.
+    """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target, or the best one.
 
     Args:
         trajectory: what was recorded
@@ -55,14 +59,17 @@ def fit_field(
         weights: how visible each member is. [M]
         kind: "auto" tries separable and keyframe fields, the others only their kind
         target_psnr: dB; where none reaches it, the best is kept and `met` is false
+        budget: bytes a member; the best field within it is kept, whatever the target is
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
     errors = FieldJudge(trajectory.s, offsets, judge.counted)
+    target = target_psnr if budget is None else math.inf
     choice = choose_field(
-        trajectory.s, offsets, seen.counted, weights, kind, target_psnr, judge=errors, recorded=ticks
+        trajectory.s, offsets, seen.counted, weights, kind, target, budget, judge=errors, recorded=ticks
     )
-    return Fitted(choice.best, choice.met, len(choice.tried), _baselines(trajectory, offsets, errors))
+    baselines = _baselines(trajectory, offsets, errors)
+    return Fitted(choice.best, choice.met, choice.tried, baselines, choice.why)
 
 
 def judged_field(trajectory: Trajectory, judge: Judge, field: BakedField, target_psnr: float) -> Fitted:
@@ -70,7 +77,8 @@ def judged_field(trajectory: Trajectory, judge: Judge, field: BakedField, target
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     errors = FieldJudge(trajectory.s, offsets, judge.counted)
     judged = errors.candidate(field, field.kind)
-    return Fitted(judged, judged.worst >= target_psnr, 1, _baselines(trajectory, offsets, errors))
+    baselines = _baselines(trajectory, offsets, errors)
+    return Fitted(judged, judged.worst >= target_psnr, (judged,), baselines, "a network was asked for")
 
 
 def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldJudge) -> dict[str, Candidate]:
@@ -93,6 +101,20 @@ def field_figures(candidate: Candidate) -> dict[str, Any]:
         "psnr_mean": round(candidate.mean, 2),
         "psnr_worst": round(candidate.worst, 2),
     }
+
+
+def choice_figures(fitted: Fitted) -> dict[str, Any]:
+    """What was tried and why the chosen field was, as report.json has it."""
+    tried = [
+        {
+            "field": candidate.label,
+            "bytes_per_gaussian": round(candidate.field.bytes_per_member, 1),
+            "psnr_mean": round(candidate.mean, 2),
+            "psnr_worst": round(candidate.worst, 2),
+        }
+        for candidate in fitted.tried
+    ]
+    return {"chosen": fitted.chosen.label, "why": fitted.why, "tried": tried}
 
 
 def visibility(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Tensor:

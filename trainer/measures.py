@@ -14,7 +14,7 @@ from progdf.field import BakedField
 from progdf.field.judge import sample_strengths
 from progdf.slider_statistics import SliderStatistics, slider_statistics
 from trainer.clip import Clip, direction, load_clip
-from trainer.fit import Fitted, field_figures
+from trainer.fit import Fitted, choice_figures, field_figures
 from trainer.judge import Judge
 from trainer.losses import Perceptual
 from trainer.trajectory import Trajectory
@@ -169,6 +169,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             "outside_change": outside_change,
             "target_met": fitted.met,
         },
+        "choice": choice_figures(fitted),
         "baselines": {name: field_figures(errors) for name, errors in fitted.baselines.items()},
         "slider": {
             "monotone": slider.monotone,

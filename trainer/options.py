@@ -21,7 +21,7 @@ Preset = Literal["default", "paper"]
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
 DETECTOR, OUTLINER = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
-FieldKind = Literal["auto", "separable", "keyframes", "neural"]
+FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
 
 NETWORK_OPTIONS: Mapping[str, Any] = {
     "fit": "after",
@@ -134,7 +134,8 @@ class TrainOptions:
     slider: Slider = "stages"
     """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
     field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr."""
+    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
+    keeps every recording."""
     fit: Literal["after", "alongside"] = NETWORK_OPTIONS["fit"]
     """neural: trained on the finished recording, or step by step while it is made (paper); what it sees is
     then --inputs position."""
@@ -151,6 +152,9 @@ class TrainOptions:
     """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
+    bytes_budget: float | None = None
+    """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
+    PSNR. Not for neural."""
     quick: bool = False
     """A draft in a third of the time: 240 steps in 4 stages, 12 views."""
     seed: int = 0
@@ -177,7 +181,8 @@ class FitOptions:
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
     field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr."""
+    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
+    keeps every recording."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     inputs: Inputs = NETWORK_OPTIONS["inputs"]
@@ -191,6 +196,9 @@ class FitOptions:
     """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
+    bytes_budget: float | None = None
+    """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
+    PSNR. Not for neural."""
     scene: Path | None = None
     """Where the scene is now, if it has moved since the run."""
     text_before: str = ""
@@ -292,7 +300,7 @@ def _check_editor_options(options: TrainOptions) -> None:
 
 
 def check_network_options(options: TrainOptions | FitOptions) -> None:
-    """Options of the neural field that make sense, and only where there is one.
+    """Options of the field that make sense, and those of a network only where there is one.
 
     Raises:
         ProgdfError: one does not.
@@ -301,6 +309,11 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
         option = "--" + name.replace("_", "-")
         if options.field != "neural" and getattr(options, name, default) != default:
             raise ProgdfError(f"{option} means nothing to --field {options.field}; add --field neural")
+    if options.bytes_budget is not None:
+        if options.field in ("neural", "lossless"):
+            raise ProgdfError(f"--bytes-budget means nothing to --field {options.field}; leave one out")
+        if not 1 <= options.bytes_budget < math.inf:
+            raise ProgdfError(f"--bytes-budget is {options.bytes_budget:g}; 1 or more bytes would be right")
     if not 0 <= options.code <= 64:
         raise ProgdfError(f"--code is {options.code}; 0 to 64 would be right")
     if not 0 <= options.picture_loss < math.inf:

@@ -17,10 +17,16 @@ from torch import Tensor
 
 from progdf.field.baked import BakedField
 from progdf.field.judge import Candidate, FieldJudge, sample_strengths
-from progdf.field.keyframes import fit_keyframes
+from progdf.field.keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
 from progdf.field.ranks import emphasised_modes, expected_worst, grown_ranks
-from progdf.field.rendered import Render, RenderedCourses, rendered_courses
-from progdf.field.separable import channel_weights, check_trajectory, leading_modes, stored_attribute
+from progdf.field.rendered import Render, RenderedCourses, picture_gram, rendered_courses
+from progdf.field.separable import (
+    channel_weights,
+    check_trajectory,
+    leading_modes,
+    moving_attributes,
+    stored_attribute,
+)
 
 __all__ = [
     "Candidate",
@@ -32,7 +38,7 @@ __all__ = [
     "separable_within",
 ]
 
-Kind = Literal["auto", "separable", "keyframes"]
+Kind = Literal["auto", "separable", "keyframes", "lossless"]
 
 MOST_BYTES = 400.0
 """Bytes a member beyond which a separable field is not grown; nine keyframes of 14 numbers take 448."""
@@ -45,11 +51,19 @@ KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen, whether it meets the target, and everything that was tried."""
+    """What was chosen and why.
+
+    Args:
+        best: the field
+        met: whether it reaches what was asked of it: the target, or the budget where there is no target
+        tried: everything that was looked at
+        why: in words, as "the smallest of 6 that reach 40 dB"
+    """
 
     best: Candidate
     met: bool
     tried: tuple[Candidate, ...]
+    why: str = ""
 
 
 def choose_field(
@@ -63,15 +77,15 @@ def choose_field(
     judge: FieldJudge | None = None,
     recorded: Sequence[float] | None = None,
 ) -> Choice:
-    """The smallest field whose worst PSNR against the trajectory reaches the target.
+    """The smallest field whose worst PSNR against the trajectory reaches the target, or the best in a budget.
 
     Args:
         strengths: of the snapshots, ascending from 0 to 1. [T]
         offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
         render: of a few views and their interesting pixels; the ranks are chosen on it
         weights: how much an error of each number shows: visibility [M] or [M,C]; None is evenly
-        kind: "auto" tries both kinds
-        target: least PSNR over the slider, dB
+        kind: "auto" tries separable and keyframe fields; "lossless" is every snapshot, whatever it takes
+        target: least PSNR over the slider, dB; infinite asks for the best in the budget
         budget: most bytes a member; None is as many as it takes
         judge: has the last word, best on views that `render` does not show; None judges on `render`
         recorded: strengths for the slider's ticks; `strengths` when None
@@ -85,18 +99,39 @@ def choose_field(
     check_trajectory(strengths, offsets)
     judge = judge or FieldJudge(strengths, offsets, render)
     tried: list[Candidate] = []
+    if kind == "lossless":
+        everything = fit_lossless(strengths, offsets, recorded)
+        found = judge.candidate(everything, f"all {len(strengths)} snapshots")
+        fits = budget is None or everything.bytes_per_member <= budget
+        met = fits and (not math.isfinite(target) or found.worst >= target)
+        return Choice(found, met, (found,), "nothing is left out")
     if kind in ("auto", "separable"):
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
         seen = rendered_courses(offsets, spread, render)
         tried += _grown(seen, strengths, target, budget, judge, recorded)
     if kind in ("auto", "keyframes"):
         limit = min([budget or math.inf, *(c.field.bytes_per_member for c in tried if c.worst >= target)])
-        tried += _keyframes(strengths, offsets, target, limit, judge, recorded)
-    allowed = [c for c in tried if budget is None or c.field.bytes_per_member <= budget] or tried[:1]
-    good = [candidate for candidate in allowed if candidate.worst >= target]
+        gram = picture_gram(offsets, render)
+        tried += _keyframes(strengths, offsets, gram, target, limit, judge, recorded, curves=kind != "auto")
+    return _chosen(tuple(tried), target, budget)
+
+
+def _chosen(tried: tuple[Candidate, ...], target: float, budget: float | None) -> Choice:
+    """The smallest that reaches the target, else the best; of those that the budget allows, if any."""
+    looked = f"{len(tried)} fields"
+    allowed = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]
+    if not allowed:
+        least = min(tried, key=lambda c: (c.field.bytes_per_member, -c.worst))
+        return Choice(least, False, tried, f"the smallest of {looked}; none fits into {budget:g} bytes")
+    good = [c for c in allowed if c.worst >= target]
+    within = "" if budget is None else f" within {budget:g} bytes"
     if good:
-        return Choice(min(good, key=lambda c: (c.field.bytes_per_member, -c.worst)), True, tuple(tried))
-    return Choice(max(allowed, key=lambda c: c.worst), False, tuple(tried))
+        best = min(good, key=lambda c: (c.field.bytes_per_member, -c.worst))
+        return Choice(best, True, tried, f"the smallest of {looked}{within} that reaches {target:g} dB")
+    best = max(allowed, key=lambda c: (c.worst, -c.field.bytes_per_member))
+    if math.isfinite(target):
+        return Choice(best, False, tried, f"the best of {looked}{within}; none reaches {target:g} dB")
+    return Choice(best, True, tried, f"the best of {looked}{within}")
 
 
 def separable_within(
@@ -175,22 +210,31 @@ def _separable(
 def _keyframes(
     strengths: Tensor,
     offsets: Tensor,
+    gram: Tensor,
     target: float,
     most_bytes: float,
     judge: FieldJudge,
     recorded: Sequence[float] | None,
+    curves: bool,
 ) -> list[Candidate]:
     """Keyframe fields: ever more of them until the target is met, or from the most bytes down while it is."""
+    width = sum(columns.stop - columns.start for columns in moving_attributes(offsets).values())
     counts = [count for count in KEYFRAMES if count <= len(strengths)]
-    fields = {count: fit_keyframes(strengths, offsets, count, recorded, torch.int8) for count in counts}
     bounded = math.isfinite(most_bytes)
-    if bounded:
-        counts = [count for count in counts if fields[count].bytes_per_member <= most_bytes][::-1] or counts[
-            :1
-        ]
+    if bounded:  # int8 beside the end in float32
+        counts = [c for c in counts if (4 + c - 2) * width <= most_bytes][::-1] or counts[:1]
     tried: list[Candidate] = []
     for count in counts:
-        tried.append(judge.candidate(fields[count], f"{count} keyframes"))
-        if (tried[-1].worst >= target) != bounded:
+        kept = bending_snapshots(strengths, gram, count)
+        forms: tuple[Between, ...] = ("linear", "cubic") if curves and count > 2 else ("linear",)
+        here = [
+            judge.candidate(
+                fit_keyframes(strengths, offsets, count, recorded, torch.int8, kept, between),
+                f"{count} keyframes" + (", cubic" if between == "cubic" else ""),
+            )
+            for between in forms
+        ]
+        tried += here
+        if (max(c.worst for c in here) >= target) != bounded:
             break
     return tried

@@ -24,7 +24,6 @@ Render = Callable[[Tensor], Tensor]
 MOST_PIXELS = 40_000
 """Pixels kept of each render; of more, evenly spread ones."""
 
-
 UNSEEN = 0.1
 """Say of the bare numbers beside the pictures, for members that these views do not show."""
 
@@ -86,7 +85,7 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
     with torch.no_grad():
         for t in range(1, snapshots - 1):
             pixels = render(offsets[t])
-            stride = max(1, -(-len(pixels) // MOST_PIXELS))
+            stride = _stride(pixels)
             for i, (name, columns) in enumerate(attributes.items()):
                 straight = offsets[t].clone()
                 straight[:, columns] = courses[name].lead[t] * offsets[-1, :, columns]
@@ -99,3 +98,17 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
     products = (rows @ rows.T).double().reshape(len(attributes), inner, len(attributes), inner)
     gram[:, 1:-1, :, 1:-1] = products
     return RenderedCourses(courses, gram, max(1, rows.shape[1]), offsets.shape[2])
+
+
+def picture_gram(offsets: Tensor, render: Render) -> Tensor:
+    """Inner products of what the snapshots change in the pictures. [T,M,C] -> [T,T] float64"""
+    with torch.no_grad():
+        original = render(offsets[0])
+        stride = _stride(original)
+        rows = torch.stack([(render(row) - original)[::stride].flatten() for row in offsets])
+    gram: Tensor = (rows @ rows.T).double()
+    return gram
+
+
+def _stride(pixels: Tensor) -> int:
+    return max(1, -(-len(pixels) // MOST_PIXELS))
