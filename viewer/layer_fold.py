@@ -54,8 +54,8 @@ def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContex
         tip(f"How much of the change of {kind} comes through; right click: all of it (Tab, then arrows)")
     else:
         tip(f"This edit does not change the {kind}")
-    # unchanged, imgui still rounds to float32
-    return stack.dialled(layer, kind, new) if changed else layer
+    # unchanged, imgui still rounds to float32; changed, what it shows is what it means
+    return stack.dialled(layer, kind, round(new, 2)) if changed else layer
 
 
 def value_at(curve: Sequence[float], strength: float) -> float:
