@@ -1,9 +1,11 @@
-"""One slider moved from 0 to 1: as an animation, as a contact sheet; two sliders: as a grid."""
+"""Pictures of moving sliders: animations, films of a timeline, contact sheets of one slider and of two."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,15 +78,67 @@ def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
         path: a .gif file
         frames: from one end of the slider to the other. [H,W,3] each
     """
+    indexed = _indexed(frames)
+    shown = indexed + indexed[-2:0:-1]
+    rests = {0, len(indexed) - 1}
+    _save_gif(path, shown, [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))])
+
+
+def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
+    """Frames as they come, each for the same time: .gif, endless, or .mp4.
+
+    A .gif counts in hundredths of a second, so its frames take turns in being a little longer and shorter; no
+    frame is shorter than 2, as programs slow such down.
+    """
+    if path.suffix.lower() == ".mp4":
+        _encode_mp4(path, frames, frames_per_second)
+        return
+    indexed = _indexed(frames)
+    ends = [round(100 * (i + 1) / frames_per_second) for i in range(len(indexed))]
+    hundredths = [end - start for start, end in zip([0, *ends], ends, strict=False)]
+    _save_gif(path, indexed, [10 * max(2, each) for each in hundredths])
+
+
+def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
+    """Frames as frame_0000.png, frame_0001.png, …: the folder appears when all are written.
+
+    Raises:
+        ProgdfError: see `check_sequence`.
+    """
+    check_sequence(folder)
+    beside = Path(tempfile.mkdtemp(dir=folder.absolute().parent, prefix=f".{folder.name}."))
+    try:
+        for number, frame in enumerate(frames):
+            Image.fromarray(frame).save(beside / f"frame_{number:04d}.png")
+        beside.chmod(0o755)
+        if folder.exists():
+            folder.rmdir()  # it is empty; some systems rename onto nothing
+        beside.rename(folder)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def check_sequence(folder: Path) -> None:
+    """Raises ProgdfError where no folder of frames can be made: its place is taken, or its parent missing."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ProgdfError(f"{folder} exists and is not an empty folder; give a new name for the frames")
+    if not folder.absolute().parent.is_dir():
+        raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; make it first")
+
+
+def _indexed(frames: Iterable[Pixels]) -> list[Image.Image]:
+    """Frames in one palette."""
     there = [Image.fromarray(frame) for frame in frames]
     few = there[:: max(1, len(there) // 4)]
     mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in few]))
     palette = _with_exact_background(mosaic, mosaic.quantize(256, method=Image.Quantize.MEDIANCUT))
-    indexed = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
-    shown = indexed + indexed[-2:0:-1]
-    rests = {0, len(indexed) - 1}
-    durations = [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))]
-    shown[0].save(path, save_all=True, append_images=shown[1:], duration=durations, loop=0, disposal=1)
+    return [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
+
+
+def _save_gif(path: Path, indexed: Sequence[Image.Image], durations: Sequence[int]) -> None:
+    indexed[0].save(
+        path, save_all=True, append_images=indexed[1:], duration=list(durations), loop=0, disposal=1
+    )
 
 
 def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
@@ -106,19 +160,28 @@ def check_encoder(path: Path) -> None:
 
 def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20) -> None:
     """A film there and back again, H.264; the codec wants even sides, so an odd last row is doubled."""
-    import imageio_ffmpeg  # an extra, see check_encoder
-
-    there = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames]
+    there = list(frames)
     hold = round(HOLD_MS * frames_per_second / 1000)
     shown = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (there[0].shape[1], there[0].shape[0]),
-        fps=frames_per_second,
-        quality=8,
-        macro_block_size=2,
-    )
-    writer.send(None)
-    for frame in shown:
-        writer.send(np.ascontiguousarray(frame))
-    writer.close()
+    _encode_mp4(path, shown, frames_per_second)
+
+
+def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
+    """H.264, frame by frame, so that a long film needs no memory."""
+    import imageio_ffmpeg  # an extra, see check_encoder
+
+    writer = None
+    for frame in frames:
+        even = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
+        if writer is None:
+            writer = imageio_ffmpeg.write_frames(
+                str(path),
+                (even.shape[1], even.shape[0]),
+                fps=frames_per_second,
+                quality=8,
+                macro_block_size=2,
+            )
+            writer.send(None)
+        writer.send(np.ascontiguousarray(even))
+    if writer is not None:
+        writer.close()

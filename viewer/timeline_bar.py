@@ -212,12 +212,12 @@ def _paint_numbers(
         if number != frame and abs(x - here) < 24.0 * scale:
             continue
         colour = u32(p.accent if number == frame else p.dim)
-        after = x + 7.0 * scale if number == frame else x + 3.0 * scale
-        if after + 8.0 * scale * len(text) > start + span + 8.0 * scale:  # the last number, left of its tick
-            after = x - (7.0 * len(text) + (6.0 if number == frame else 2.0)) * scale
-        canvas.add_text(
-            ui.fonts.regular, size, imgui.ImVec2(round(after), round(top - 4.0 * scale)), colour, text
-        )
+        # the playhead's number stands beside its handle, left of it at the end of the ruler
+        after = x - 3.2 * scale * len(text)
+        if number == frame:
+            after = x + 7.0 * scale if x < start + span - 20.0 * scale else x - (7 + 6.4 * len(text)) * scale
+        at = imgui.ImVec2(round(after), round(top - 4.0 * scale))
+        canvas.add_text(ui.fonts.regular, size, at, colour, text)
 
 
 def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, colour: int, easing: str) -> None:
