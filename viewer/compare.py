@@ -18,7 +18,7 @@ from PIL import ImageDraw, ImageFont
 from progdf.camera import Camera
 from progdf.metrics import psnr
 
-from .engine import Engine, FrameTimings
+from .engine import Engine, FrameTimings, drawn_size
 from .film import Pixels, to_pixels
 from .gl.present import Presenter
 from .painters import Image
@@ -48,26 +48,36 @@ class Comparer:
         self._texture: moderngl.Texture | None = None
         self._shown: float | None = None  # how much the difference in the texture is amplified
 
-    def needs_draw(self, view: ViewState, size: tuple[int, int]) -> bool:
-        """Whether splats have to be drawn for `view`, or a difference taken."""
-        if self.engine.needs_draw(view, size):
+    def needs_draw(self, view: ViewState, size: tuple[int, int], pixels: int = 1) -> bool:
+        """Whether splats have to be drawn for `view`, or a difference taken; arguments as for `draw`."""
+        drawn = size if view.compare.mode == "difference" else drawn_size(size, pixels)
+        if self.engine.needs_draw(view, drawn):
             return True
         if view.compare.mode == "off":
             return False
         apart = view.compare.mode == "difference" and self._shown != view.compare.amplify
-        return apart or self._second().needs_draw(_untouched(view), size)
+        return apart or self._second().needs_draw(_untouched(view), drawn)
 
-    def draw(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> FrameTimings:
+    def draw(
+        self,
+        view: ViewState,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int],
+        pixels: int = 1,
+    ) -> FrameTimings:
         """Show `view` in the lower left `size` pixels of `framebuffer`.
+
+        Args:
+            pixels: of the framebuffer that one drawn pixel fills, each way; a difference is drawn in full
 
         Raises:
             ProgdfError: a layer of `view` means nothing.
         """
         if view.compare.mode == "split":
-            return self._draw_split(view, framebuffer, size)
+            return self._draw_split(view, framebuffer, size, pixels)
         if view.compare.mode == "difference":
             return self._draw_difference(view, framebuffer, size)
-        return self.engine.draw(view, framebuffer, size)
+        return self.engine.draw(view, framebuffer, size, pixels)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
         """The same as an array, without labels. [H,W,3] float32, see `Engine.image`"""
@@ -93,13 +103,13 @@ class Comparer:
         return self._original
 
     def _draw_split(
-        self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]
+        self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
         at = column(view.compare, size[0])
-        edited = self.engine.draw(view, framebuffer, size)
+        edited = self.engine.draw(view, framebuffer, size, pixels)
         framebuffer.scissor = (0, 0, at, size[1])
         try:
-            original = self._second().draw(_untouched(view), framebuffer, size)
+            original = self._second().draw(_untouched(view), framebuffer, size, pixels)
         finally:
             framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
         return _together(edited, original)
@@ -150,7 +160,8 @@ def labelled(image: Image, compare: Comparison, decibels: float) -> Pixels:
     page = Pillow.fromarray(pixels)
     draw = ImageDraw.Draw(page, "RGBA")
     if compare.mode == "difference":
-        _tag(draw, page.width / 2, "m", told(compare, decibels), page.size)
+        line = told(compare, decibels).replace("×", "x")  # Pillow's own font has no ×
+        _tag(draw, page.width / 2, "m", line, page.size)
     else:
         at = column(compare, page.width)
         draw.line([(at, 0), (at, page.height)], (*_SHADE, 140), 3)

@@ -125,16 +125,16 @@ class CpuPainter:
         self._lent = True
         return self._picture().image
 
-    def show(self, framebuffer: moderngl.Framebuffer) -> None:
-        """Copy the picture to the framebuffer's lower left corner."""
+    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
+        """Fill the framebuffer's lower left `size` pixels with the picture; None: as many as it has."""
         assert self._ctx is not None, "nothing to show on without a context"
         assert self._presenter is not None
         image = self._picture().image
-        size = (image.shape[1], image.shape[0])
-        if self._texture is None or self._texture.size != size:
+        pixels = (image.shape[1], image.shape[0])
+        if self._texture is None or self._texture.size != pixels:
             if self._texture is not None:
                 self._texture.release()
-            self._texture, self._stale = self._ctx.texture(size, 3, dtype="f4"), None
+            self._texture, self._stale = self._ctx.texture(pixels, 3, dtype="f4"), None
         if self._stale is None:
             self._texture.write(image)
         else:
@@ -142,7 +142,7 @@ class CpuPainter:
                 part = np.ascontiguousarray(image[y0:y1, x0:x1])
                 self._texture.write(part, viewport=(x0, y0, x1 - x0, y1 - y0))
         self._stale = []
-        self._presenter.show(self._texture, framebuffer)
+        self._presenter.show(self._texture, framebuffer, size)
 
     def release(self) -> None:
         """Give back what it holds."""

@@ -126,14 +126,23 @@ class Engine:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
         return self._wanted(view, camera or to_camera(view.camera, *size)) != self._picture
 
-    def draw(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> FrameTimings:
+    def draw(
+        self,
+        view: ViewState,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int],
+        pixels: int = 1,
+    ) -> FrameTimings:
         """Bring the picture up to date and show it in the lower left `size` pixels of `framebuffer`.
+
+        Args:
+            pixels: of the framebuffer that one pixel of the picture fills, each way (see draft.py)
 
         Raises:
             ProgdfError: a layer of `view` means nothing; the last picture stays.
         """
-        self.timings = self._bring(view, to_camera(view.camera, *size))
-        self._painter.show(framebuffer)
+        self.timings = self._bring(view, to_camera(view.camera, *drawn_size(size, pixels)))
+        self._painter.show(framebuffer, size)
         return self.timings
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
@@ -216,6 +225,11 @@ class Engine:
                 f"a layer asks for edit {index + 1} of {len(self.gdfs)}; open its .gdf file too"
             )
         return self.gdfs[index]
+
+
+def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
+    """Width and height of a picture of which each pixel fills `pixels` of `size`, each way."""
+    return -(-size[0] // pixels), -(-size[1] // pixels)
 
 
 def _edits(view: ViewState) -> _Edits:

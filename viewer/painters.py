@@ -45,8 +45,8 @@ class Painter(Protocol):
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped. [H,W,3]"""
 
-    def show(self, framebuffer: moderngl.Framebuffer) -> None:
-        """Copy the picture to the framebuffer's lower left corner."""
+    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
+        """Fill the framebuffer's lower left `size` pixels with the picture; None: as many as it has."""
 
     def release(self) -> None:
         """Give back what it holds."""
@@ -82,8 +82,8 @@ class GlPainter:
         rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
-    def show(self, framebuffer: moderngl.Framebuffer) -> None:
-        self._presenter.show(_drawn(self._picture), framebuffer)
+    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
+        self._presenter.show(_drawn(self._picture), framebuffer, size)
 
     def release(self) -> None:
         self._presenter.release()

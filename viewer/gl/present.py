@@ -15,10 +15,17 @@ class Presenter:
         self._program = load_program(ctx, "present.vert", "present.frag")
         self._vao = ctx.vertex_array(self._program, [])
 
-    def show(self, picture: moderngl.Texture, framebuffer: moderngl.Framebuffer) -> None:
-        """Fill the lower left corner of `framebuffer` with `picture`, pixel by pixel."""
+    def show(
+        self,
+        picture: moderngl.Texture,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int] | None = None,
+    ) -> None:
+        """Fill the lower left `size` pixels of `framebuffer` with `picture`; pixel by pixel where it has as
+        many, which is so without `size`, and else smoothly."""
         framebuffer.use()
-        self.ctx.viewport = (0, 0, picture.width, picture.height)
+        self.ctx.viewport = (0, 0, *(size or picture.size))
+        self._program["shown_size"] = size or picture.size
         self.ctx.enable_only(moderngl.NOTHING)
         picture.use(0)
         self._program["picture"] = 0
