@@ -24,13 +24,14 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.load_report import counted
 from progdf.ply import GEOMETRY, load_ply, save_ply
 
-from . import arguments, film
+from . import arguments, film, session_arguments, timeline, timeline_file, timeline_film
+from . import document as documents
 from .compare import Comparer, labelled
 from .engine import Engine
 from .headless import headless_context
 from .layer_arguments import stack_of
 from .stack import shown
-from .state import LayerState, ViewState
+from .state import LayerState, ViewCamera, ViewState
 from .turntable import first_camera, to_camera
 
 Blend = Literal["normalised", "sum", "over"]
@@ -42,7 +43,7 @@ Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar=
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 DEFAULT_SIZE = (640, 480)
-ONE_OF = ("sweep", "sheet", "split", "difference")
+ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 """Options of `progdf render` that each say what the picture is."""
 _BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
 
@@ -52,7 +53,7 @@ class ViewOptions:
     """Open the window: the splats, one slider per edit."""
 
     scene: Scene
-    """The scene, a 3DGS .ply file."""
+    """The scene, a 3DGS .ply file; or a session saved with Ctrl+S, also as --session FILE."""
     gdfs: Edits = ()
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
@@ -74,9 +75,9 @@ class RenderOptions:
     """Write a picture of a scene under its edits, without a window."""
 
     scene: Scene
-    """The scene, a 3DGS .ply file."""
+    """The scene, a 3DGS .ply file; or a session saved with Ctrl+S, also as --session FILE."""
     out: Out
-    """The picture to write: .png, or with --sweep .gif or .mp4."""
+    """The picture to write: .png, with --sweep .gif or .mp4; with --timeline also a folder."""
     gdfs: Edits = ()
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
@@ -107,6 +108,8 @@ class RenderOptions:
     """The original beside the edited picture, which begins at this share of the width (0.5)."""
     difference: Annotated[str | None, tyro.conf.arg(metavar="[AMPLIFY]")] = None
     """What differs from the original, amplified (4), with the PSNR."""
+    timeline: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
+    """A film of the keys in this file (Ctrl+K in the window): .gif, .mp4, or a folder for .png frames."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,14 @@ class ExportOptions:
 def view(argv: Sequence[str]) -> int:
     """`progdf view`: open the window and stay until it is closed."""
     options = tyro.cli(ViewOptions, args=_joined(argv), prog="progdf view")
-    scene, gdfs = _load(options.scene, options.gdfs)
+    opened = session_arguments.from_session(options)
+    from .app import run  # imgui and glfw, which render and export do without
+
+    if opened is not None:
+        kept = opened.session
+        return run(kept.document, kept.view, session=opened.path, snapshots=kept.snapshots)
+    document = documents.load(options.scene, options.gdfs)
+    scene, gdfs = document.scene, document.gdfs
     state = ViewState(
         first_camera(scene),
         _layers(options, gdfs),
@@ -142,9 +152,7 @@ def view(argv: Sequence[str]) -> int:
         arguments.parse_background(options.background),
         overshoot=options.overshoot,
     )
-    from .app import Document, run  # imgui and glfw, which render and export do without
-
-    return run(Document(options.scene.name, scene, gdfs), state)
+    return run(document, state)
 
 
 def render(argv: Sequence[str]) -> int:
@@ -153,12 +161,26 @@ def render(argv: Sequence[str]) -> int:
     _check_output(options)
     size = None if options.size is None else arguments.parse_size(options.size)
     background = arguments.parse_background(options.background)
-    scene, gdfs = _load(options.scene, options.gdfs)
-    layers = _layers(options, gdfs)
+    opened = session_arguments.from_session(options)
+    if opened is None:
+        scene, gdfs = _load(options.scene, options.gdfs)
+        state = ViewState(layers=_layers(options, gdfs), blend=options.blend, background=background)
+    else:
+        document, state = opened.session.document, opened.session.view
+        scene, gdfs = document.scene, document.gdfs
+    layers = state.layers
     swept = _swept(options, gdfs)
-    camera = _camera(options, scene, size)
-    state = ViewState(layers=layers, blend=options.blend, background=background)
+    camera = _camera(options, scene, size, None if opened is None else state.camera)
     comparison = arguments.parse_comparison(options.split, options.difference)
+    if comparison.mode == "off":
+        comparison = state.compare
+    if options.timeline is not None:
+        keys = timeline_file.load(options.timeline, layers)
+        if timeline.camera_at(keys, 0) is not None and (options.camera or options.orbit):
+            raise ProgdfError(f"{options.timeline} moves the camera; leave out --camera and --orbit")
+        with _engine(scene, gdfs, options.engine) as engine:
+            print(timeline_film.write(options.out, keys, state, camera, engine))
+        return 0
     with _engine(scene, gdfs, options.engine) as engine, written_whole(options.out) as beside:
 
         def picture(wanted: ViewState) -> film.Pixels:
@@ -247,14 +269,17 @@ def _showing(name: str, options: RenderOptions, option: str) -> str:
     return name
 
 
-def _camera(options: RenderOptions, scene: Gaussians, size: tuple[int, int] | None) -> Camera:
+def _camera(
+    options: RenderOptions, scene: Gaussians, size: tuple[int, int] | None, saved: ViewCamera | None
+) -> Camera:
+    """The camera that was asked for; that of the session (`saved`); or one that frames the scene."""
     if options.camera is not None and options.orbit is not None:
         raise ProgdfError("--camera and --orbit were both given; give one of them")
     if options.camera is not None:
         camera = arguments.read_camera(options.camera)
         return camera if size is None else arguments.fitted(camera, size)
     width, height = size or DEFAULT_SIZE
-    framed = first_camera(scene, aspect=width / height)
+    framed = saved or first_camera(scene, aspect=width / height)
     if options.orbit is not None:
         framed = arguments.parse_orbit(options.orbit, framed)
     return to_camera(framed, width, height)
@@ -285,11 +310,14 @@ def _check_output(options: RenderOptions) -> None:
     given = [name for name in ONE_OF if getattr(options, name) is not None]
     if len(given) > 1:
         raise ProgdfError(f"--{given[0]} and --{given[1]} were both given; give one of them")
+    if options.timeline is not None:
+        timeline_film.check_output(options.out)
     if options.sweep is not None and suffix not in (".gif", ".mp4"):
         raise ProgdfError(f"{options.out} cannot hold an animation; --sweep writes a .gif or an .mp4")
-    if options.sweep is None and suffix in (".gif", ".mp4"):
+    moves = options.sweep is not None or options.timeline is not None
+    if not moves and suffix in (".gif", ".mp4"):
         raise ProgdfError(f"{options.out} holds an animation; say which slider moves with --sweep NAME")
-    if options.sweep is None and suffix != ".png":
+    if not moves and suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
     film.check_encoder(options.out)
     _check_not_an_input(options.out, (options.scene, *options.gdfs))
@@ -328,7 +356,7 @@ def _joined(argv: Sequence[str]) -> list[str]:
     `--split` and `--difference` without a number get theirs.
     """
     joined: list[str] = []
-    for argument in argv:
+    for argument in session_arguments.without_name(argv):
         if joined and joined[-1] == "--orbit":
             joined[-1] = f"--orbit={argument}"
         elif joined and joined[-1] in _BARE and arguments.is_number(argument):
