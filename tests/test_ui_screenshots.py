@@ -119,3 +119,14 @@ def test_the_timings_of_a_picture(screenshot: Compare) -> None:
         hand.stage.latencies_ms.extend([20.0, 21.0, 34.0])
         hand.frame()
         screenshot("ui_timings", hand.image()[:180, :240])
+
+
+def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Compare) -> None:
+    view = replace(first_view(bear(), 1.1, 0.5), overshoot=True, unfolded=(0,))
+    solo, locked = (
+        replace(layer, **{how: True}) for layer, how in zip(view.layers, ("solo", "locked"), strict=True)
+    )
+    with rig(replace(view, layers=(solo, locked)), SMALLEST) as hand:
+        hand.key("Tab")
+        hand.frame(3)
+        screenshot("ui_gains", hand.image())
