@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from progdf import session_file
 from progdf.camera_files import load_cameras
 from progdf.checkpoint import peek_gdf
 from progdf.errors import ProgdfError
@@ -22,7 +23,7 @@ from progdf.survey import survey
 
 @dataclass(frozen=True)
 class Options:
-    """Tell what a .ply scene, a .gdf edit or a camera file holds, an edit with its error report.
+    """Tell what a .ply scene, a .gdf edit, a session or a camera file holds, an edit with its error report.
 
     Args:
         file: the file; its content decides what it is, not its name
@@ -40,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """ "ply", "gdf" or "cameras", by content; by name where the content says nothing.
+    """ "ply", "gdf", "session" or "cameras", by content; by name where the content says nothing.
 
     Raises:
         ProgdfError: it cannot be read, or is nothing we know.
@@ -54,6 +55,8 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "ply"
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "gdf"
+    if start.lstrip()[:1] == b"{" and f'"{session_file.MARK}"'.encode() in start:
+        return "session"
     if start.lstrip()[:1] in (b"{", b"["):
         return "cameras"
     suffix = Path(path).suffix.lower().lstrip(".")
@@ -84,6 +87,22 @@ def _edit_lines(path: Path) -> Iterator[str]:
             yield f"{head}: {name} {value}"
 
 
+def _session_lines(path: Path) -> Iterator[str]:
+    session = session_file.read_session(path)
+    yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
+    for what, ref in (("scene", session.scene), *(("edit", edit) for edit in session.edits)):
+        file = ref.path(path.resolve().parent)
+        known = file.is_file() and session_file.sha256(file) == ref.sha256
+        state = "as it was saved" if known else "changed since" if file.is_file() else "missing"
+        yield f"{what}: {ref.file} ({state})"
+    layers = session.view.get("layers", [])
+    for layer in layers if isinstance(layers, list) else ():
+        if isinstance(layer, dict):
+            hidden = "" if layer.get("enabled", True) else ", hidden"
+            yield f"layer: {_shown(layer.get('name'))} at {_shown(layer.get('strength', 0.0))}{hidden}"
+    yield f"snapshots: {len(session.snapshots)}"
+
+
 def _form(field: BakedField) -> str:
     """What a field is made of."""
     if field.origin is None:
@@ -106,7 +125,12 @@ def _camera_lines(path: Path) -> Iterator[str]:
     yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
 
 
-_DESCRIBE = {"ply": _scene_lines, "gdf": _edit_lines, "cameras": _camera_lines}
+_DESCRIBE = {
+    "ply": _scene_lines,
+    "gdf": _edit_lines,
+    "session": _session_lines,
+    "cameras": _camera_lines,
+}
 
 
 def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:

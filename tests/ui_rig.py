@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stacks import Stack, bear_stack
 
 from viewer import panel
-from viewer.app import Document
+from viewer.document import Document
 from viewer.engine import Engine
 from viewer.gl.screen import read_rgb
 from viewer.headless import headless_context
@@ -31,10 +31,10 @@ def bear(size: int = 1500) -> Stack:
 
 
 def first_view(stack: Stack, *strengths: float) -> ViewState:
-    """The bear from the front, its edits at these strengths."""
+    """The bear from the front, its edits at these strengths; never coarse, however slow the machine is."""
     layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
     camera = first_camera(stack.scene, stack.demo.cameras)
-    return ViewState(camera=camera, layers=layers, background=stack.demo.background)
+    return ViewState(camera=camera, layers=layers, background=stack.demo.background, draft="off")
 
 
 class Rig:

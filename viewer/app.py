@@ -4,42 +4,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from imgui_bundle import imgui
 
-from progdf.checkpoint import Gdf, load_gdf
-from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
-from progdf.ply import load_ply
-
+from .desk import Desk
+from .document import Document
 from .engine import Engine
-from .layer_rows import layer_rows
+from .snapshots import Snapshot
 from .stage import Stage
-from .state import LayerState, ViewState
-from .turntable import bounds_of, first_camera
+from .state import ViewState
 from .window import Window, interruptible
-from .workspace import SceneFacts
 
 SIZE = (1280, 800)
 
 
-@dataclass(frozen=True)
-class Document:
-    """What is open: the scene and its edits, in the order of `LayerState.gdf`."""
-
-    title: str
-    scene: Gaussians
-    gdfs: tuple[Gdf, ...] = ()
-
-    def facts(self) -> SceneFacts:
-        """What the panel and the camera need to know of it."""
-        rows = layer_rows(self.scene, self.gdfs)
-        return SceneFacts(self.title, len(self.scene), bounds_of(self.scene), rows)
-
-
-def run(document: Document, state: ViewState, pictures: Path = Path(), size: tuple[int, int] = SIZE) -> int:
+def run(
+    document: Document,
+    state: ViewState,
+    pictures: Path = Path(),
+    size: tuple[int, int] = SIZE,
+    session: Path | None = None,
+    snapshots: tuple[Snapshot, ...] = (),
+) -> int:
     """Open the window and stay until it is closed.
 
     Args:
@@ -47,6 +34,8 @@ def run(document: Document, state: ViewState, pictures: Path = Path(), size: tup
         state: what to show first
         pictures: folder for saved pictures
         size: of the window, at 1×
+        session: the file it was opened from and is saved to
+        snapshots: kept states
 
     Returns:
         The exit status, 0.
@@ -56,7 +45,9 @@ def run(document: Document, state: ViewState, pictures: Path = Path(), size: tup
     """
     window = Window(_window_title(document.title), size)
     try:
-        app = App(window, document, state, pictures)
+        app = App(window, document, state, pictures, session)
+        app.stage.restart(state, snapshots)
+        app.desk.mention_autosave()
         try:
             with interruptible():
                 app.loop()
@@ -68,13 +59,23 @@ def run(document: Document, state: ViewState, pictures: Path = Path(), size: tup
 
 
 class App:
-    """One window with its stage and engine."""
+    """One window with its stage and engine; `desk` sees to its files."""
 
-    def __init__(self, window: Window, document: Document, state: ViewState, pictures: Path) -> None:
+    def __init__(
+        self,
+        window: Window,
+        document: Document,
+        state: ViewState,
+        pictures: Path,
+        session: Path | None = None,
+        memory: Path | None = None,
+    ) -> None:
         self.window, self.document = window, document
         self.context = window.context()
         self.engine = Engine(self.context, document.scene, document.gdfs)
         self.stage = Stage(self.context, self.engine, document.facts(), state, window.ui_scale, pictures)
+        self.desk = Desk(self, session, memory)
+        self._left = False
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
         self.last = time.perf_counter()
@@ -91,13 +92,18 @@ class App:
         imgui.backends.glfw_new_frame()
         self.stage.greet(self.context.screen)
         self.window.present()
-        while not self.window.closing:
-            self.window.wait(self.stage.patience())
+        while not self._left:
+            waits = [wait for wait in (self.stage.patience(), self._autosave()) if wait is not None]
+            self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
             for path in self._take_dropped():
                 self.open(path)
+            if self.window.closing and not self._left:
+                self.window.stay_open()
+                self.stage.request("quit")
             self.draw()
+        self.desk.closed()
 
     def draw(self) -> None:
         """One frame of the latest state; nothing while the window is minimised."""
@@ -112,11 +118,14 @@ class App:
         screen = self.context.screen
         self.stage.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
         self.window.present()
-        requests = self.stage.take_requests()
-        if "full_screen" in requests:
-            self.window.toggle_full_screen()
-        if "quit" in requests:
-            self.window.ask_to_close()
+        for request in self.stage.take_requests():
+            if request == "full_screen":
+                self.window.toggle_full_screen()
+            else:
+                self.desk.serve(request)
+
+    def _autosave(self) -> float | None:
+        return self.desk.autosave(time.perf_counter())
 
     def _redraw(self) -> None:
         try:
@@ -133,36 +142,21 @@ class App:
         return paths
 
     def open(self, path: Path) -> None:
-        """A dropped file, by what it is: a scene replaces all, an edit comes on top of the stack."""
-        try:
-            if path.suffix.lower() == ".gdf":
-                self._add_edit(load_gdf(path, self.document.scene))
-            elif path.suffix.lower() == ".ply":
-                self._open_scene(Document(path.name, load_ply(path)))
-            else:
-                raise ProgdfError(f"{path.name} is neither a scene nor an edit; drop a .ply or a .gdf file")
-        except ProgdfError as error:
-            self.stage.tell(str(error), error=True)
-        except OSError as error:
-            self.stage.tell(f"{path} cannot be read: {error.strerror}", error=True)
+        """A dropped or chosen file, by what it is."""
+        self.desk.open(path)
 
-    def _add_edit(self, gdf: Gdf) -> None:
-        """On top, at full strength, so that one sees what came; undo takes it off again."""
-        layer = LayerState(len(self.document.gdfs), gdf.name, strength=1.0)
-        self._replace_engine(replace(self.document, gdfs=(*self.document.gdfs, gdf)))
-        view = self.stage.work.view
-        self.stage.change(replace(view, layers=(*view.layers, layer)))
-
-    def _open_scene(self, document: Document) -> None:
-        self._replace_engine(document)
-        self.stage.restart(replace(self.stage.work.view, camera=first_camera(document.scene), layers=()))
-        self.window.rename(_window_title(document.title))
-
-    def _replace_engine(self, document: Document) -> None:
+    def show(self, document: Document) -> None:
+        """Draw another document from now on; the state is the caller's to change."""
         engine = Engine(self.context, document.scene, document.gdfs)
         self.engine.release()
         self.document, self.engine = document, engine
         self.stage.serve(engine, document.facts())
+        self.window.rename(_window_title(document.title))
+
+    def leave(self) -> None:
+        """Close the window, without a question."""
+        self.window.ask_to_close()
+        self._left = True
 
 
 def _window_title(name: str) -> str:

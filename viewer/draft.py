@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from .engine import FrameTimings
+if TYPE_CHECKING:
+    from .engine import FrameTimings
+    from .state import ViewState
 
 MODES = ("auto", "on", "off")
 """`ViewState.draft`: where it pays, always, never."""
@@ -64,6 +67,11 @@ def drawn(draft: Draft, timings: FrameTimings, turned: bool) -> Draft:
     if timings.share == 1.0:
         draft = replace(draft, camera_ms=timings.total_ms)
     return draft if turned else replace(draft, slider_ms=timings.total_ms)
+
+
+def switched(view: ViewState) -> ViewState:
+    """The next mode."""
+    return replace(view, draft=MODES[(MODES.index(view.draft) + 1) % len(MODES)])
 
 
 def patience(draft: Draft, now: float) -> float | None:

@@ -65,7 +65,7 @@ def undo(history: History, state: ViewState) -> tuple[History, ViewState]:
     if not history.past:
         return history, state
     *past, back = history.past
-    return History(back, tuple(past), (history.present, *history.future)), _restored(state, back)
+    return History(back, tuple(past), (history.present, *history.future)), restored(state, back)
 
 
 def redo(history: History, state: ViewState) -> tuple[History, ViewState]:
@@ -73,10 +73,11 @@ def redo(history: History, state: ViewState) -> tuple[History, ViewState]:
     if not history.future:
         return history, state
     ahead, *future = history.future
-    return History(ahead, (*history.past, history.present), tuple(future)), _restored(state, ahead)
+    return History(ahead, (*history.past, history.present), tuple(future)), restored(state, ahead)
 
 
-def _restored(state: ViewState, edit: Edit) -> ViewState:
+def restored(state: ViewState, edit: Edit) -> ViewState:
+    """`state` edited as in `edit`, seen from where it is."""
     return replace(
         state, layers=edit.layers, blend=edit.blend, overshoot=edit.overshoot, timeline=edit.timeline
     )

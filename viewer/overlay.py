@@ -37,7 +37,12 @@ class Area:
 
 
 def figures(
-    timings: FrameTimings, latencies_ms: Sequence[float], count: int, draws_with: str
+    timings: FrameTimings,
+    latencies_ms: Sequence[float],
+    count: int,
+    draws_with: str,
+    size: tuple[int, int],
+    pixels: int = 1,
 ) -> list[tuple[str, str]]:
     """Names and figures of a picture.
 
@@ -46,6 +51,8 @@ def figures(
         latencies_ms: from a slider's event to finished pixels, the last ones
         count: Gaussians in the scene
         draws_with: "gl" or "cpu"
+        size: of the picture as drawn: width, height
+        pixels: of the window that each of its pixels fills, each way; more than 1 while it is coarse
     """
     lines = [
         ("frame", f"{timings.total_ms:.1f} ms"),
@@ -53,6 +60,8 @@ def figures(
         ("  upload", f"{timings.upload_ms:.1f} ms"),
         ("  sort", f"{timings.sort_ms:.1f} ms"),
         ("  draw", f"{timings.draw_ms:.1f} ms"),
+        ("redrawn", f"{100 * timings.share:.0f} %"),
+        ("picture", f"{size[0]}×{size[1]}" + (", coarse" if pixels > 1 else "")),
     ]
     if latencies_ms:
         median, late = np.percentile(latencies_ms, (50, 95))

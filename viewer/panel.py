@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from . import compare, layer_cards, turntable
+from . import compare, layer_cards, snapshot_cards, turntable
 from .layer_rows import LayerRow
+from .snapshot_cards import SnapshotCard
 from .state import Vec3, ViewState
 from .ui_context import PALETTE, Icon, UiContext
 from .widgets import choice, elided, grouped, icon_button, label, right_edge, section, small, tip
@@ -34,6 +35,7 @@ class PanelInput:
         focus: the focused layer, an index into `state.layers`, or None
         undos, redos: how many entries there are either way
         reveal: scroll to the focused layer
+        snapshots: the original and what was kept
         dial: which of `stack.DIALS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
     """
@@ -47,6 +49,7 @@ class PanelInput:
     reveal: bool = False
     dial: str = "strength"
     renaming: int | None = None
+    snapshots: tuple[SnapshotCard, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
     state, focus, renaming = layer_cards.draw(state, cards, ui)
     state = _view(state, ui, actions)
+    snapshot_cards.draw(shown.snapshots, ui, actions)
     _end_body()
     _footer(shown, ui, actions)
     imgui.end()

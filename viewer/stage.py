@@ -21,6 +21,7 @@ from . import (
     compare_overlay,
     controls,
     dialogs,
+    draft,
     inputs,
     overlay,
     panel,
@@ -30,7 +31,8 @@ from . import (
     workspace,
 )
 from .compare import Comparer, labelled
-from .engine import Engine, FrameTimings
+from .dialogs import Dialog
+from .engine import Engine, FrameTimings, drawn_size
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
 from .pace import Pace
@@ -84,6 +86,8 @@ class Stage:
         self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
+        self._draft = draft.Draft()
+        self._last_shown: tuple[object, object] = ((), ())  # camera and size, edits
         self._pace = Pace()
         self.wake, self.rest = self._pace.wake, self._pace.rest
 
@@ -121,6 +125,8 @@ class Stage:
             waits.append(BLINK_S)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
+        sharpens = draft.patience(self._draft, self._clock)
+        waits += [] if sharpens is None else [sharpens]
         film = playback.patience(self.work.player, self.work.view.timeline)
         return self._pace.patience(waits if film is None else [*waits, film])
 
@@ -299,11 +305,23 @@ class Stage:
         view, size = self._shown(), self._picture_size()
         screen.use()
         screen.clear(*PALETTE.panel)
-        new = self.comparer.needs_draw(view, size)
-        timings = self.comparer.draw(view, screen, size)
+        aim, edits = (view.camera, size), (view.layers, view.blend, view.background)
+        turned, slid = aim != self._last_shown[0], edits != self._last_shown[1]
+        self._last_shown = aim, edits
+        mode = "off" if view.compare.mode == "difference" else view.draft
+        self._draft = draft.begun(self._draft, mode, self._held(), turned, slid, self._clock)
+        new = self.comparer.needs_draw(view, size, self._draft.pixels)
+        timings = self.comparer.draw(view, screen, size, self._draft.pixels)
         if new:
             self.timings = timings
             self.drawn += 1
+            self._draft = draft.drawn(self._draft, timings, turned)
+
+    def _held(self) -> bool:
+        """Whether a hand is on something that moves the picture, or a film plays."""
+        if self._drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
+            return True
+        return inputs.flying(self._keys) or inputs.repeating(self._keys) or self.work.player.playing
 
     def _cards(self) -> tuple[SnapshotCard, ...]:
         """The snapshots as the panel shows them; drawn one a frame."""
@@ -350,7 +368,19 @@ class Stage:
 
     def figures(self) -> list[tuple[str, str]]:
         """What the overlay shows of the picture on screen."""
-        return overlay.figures(self.timings, self.latencies_ms, self.facts.count, self.engine.draws_with)
+        drawn = drawn_size(self._picture_size(), self._draft.pixels)
+        count, by = self.facts.count, self.engine.draws_with
+        return overlay.figures(self.timings, self.latencies_ms, count, by, drawn, self._draft.pixels)
+
+    def ask(self, dialog: Dialog) -> None:
+        """Open a question over the picture."""
+        self.work = replace(self.work, dialog=dialog)
+        self.wake()
+
+    def request(self, request: str) -> None:
+        """One more thing for the window to do, after the next frame."""
+        self.work = replace(self.work, requests=(*self.work.requests, request))
+        self.wake()
 
     def take_requests(self) -> tuple[str, ...]:
         """What the window shall do now; asked for once each."""

@@ -111,6 +111,7 @@ class ViewState:
     Args:
         overshoot: sliders go on to `stack.OVERSHOOT`, which extrapolates
         unfolded: which edits (`LayerState.gdf`) show their gains and curve
+        draft: when the window draws coarsely while something moves, of `draft.MODES`; files never are
     """
 
     camera: ViewCamera = ViewCamera()
@@ -123,3 +124,4 @@ class ViewState:
     overshoot: bool = False
     unfolded: tuple[int, ...] = ()
     timeline: Timeline = Timeline()
+    draft: str = "auto"

@@ -180,3 +180,20 @@ def first_camera(
         if abs(c) > math.cos(math.radians(2.0)):
             x, y, z = (math.copysign(1.0, c) if j == i else 0.0 for j in range(3))
     return frame(ViewCamera(up=(x, y, z), azimuth=20.0, fov_y=fov_y), bounds_of(scene), aspect)
+
+
+def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:
+    """Where a pinhole camera stands and looks, upright, with its field of view; the pivot is in front of it.
+
+    Args:
+        camera: gives the up axis and the mode
+        seen: the pinhole camera
+        bounds: of the scene; the pivot is at the depth of its centre, where that is in front
+    """
+    world = torch.linalg.inv(seen.viewmat.double()).tolist()
+    position: Vec3 = (world[0][3], world[1][3], world[2][3])
+    ahead: Vec3 = (world[0][2], world[1][2], world[2][2])
+    depth = dot(along(bounds.centre, (-1.0, position)), ahead)
+    depth = depth if depth > 1e-3 * bounds.radius else bounds.radius
+    fov_y = math.degrees(2.0 * math.atan(seen.height / (2.0 * float(seen.K[1, 1]))))
+    return look_from(replace(camera, fov_y=fov_y), position, along(position, (depth, ahead)))

@@ -139,6 +139,10 @@ class Window:
     def ask_to_close(self) -> None:
         glfw.set_window_should_close(self.handle, True)
 
+    def stay_open(self) -> None:
+        """Take back a wish to close."""
+        glfw.set_window_should_close(self.handle, False)
+
     @property
     def closing(self) -> bool:
         return bool(glfw.window_should_close(self.handle))

@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 
 from progdf.layers import BLENDS
 
-from . import compare, controls, history, playback, stack, timeline, turntable
-from .history import History
+from . import compare, controls, draft, history, playback, snapshots, stack, timeline, turntable
+from .dialogs import Dialog
+from .history import Edit, History
 from .layer_rows import LayerRow
 from .playback import Player
+from .snapshots import Snapshot
 from .state import Comparison, ViewCamera, ViewState
 from .turntable import Bounds
 
@@ -58,7 +60,10 @@ class Workspace:
         renaming: the layer whose name is being typed, or None
         help: whether the list of bindings is shown
         message: the line at the bottom, or None
-        requests: what the window has still to do: "picture", "window_picture", "full_screen", "quit", …
+        snapshots: kept states, without the original
+        saved: what a session file holds of this; None where there is none
+        dialog: the question being asked, or None
+        requests: what the window has still to do, see `REQUESTS`
         player: the playhead of `view.timeline`
     """
 
@@ -70,13 +75,32 @@ class Workspace:
     renaming: int | None = None
     help: bool = False
     message: Message | None = None
+    snapshots: tuple[Snapshot, ...] = ()
+    saved: tuple[Edit, tuple[Snapshot, ...]] | None = None
+    dialog: Dialog | None = None
     requests: tuple[str, ...] = ()
     player: Player = Player()
 
 
-def opened(view: ViewState) -> Workspace:
+def opened(view: ViewState, kept: tuple[Snapshot, ...] = ()) -> Workspace:
     """A workspace on a fresh state; the first layer is focused."""
-    return Workspace(view, history.begin(view), view.camera, 0 if view.layers else None)
+    past, focus = history.begin(view), 0 if view.layers else None
+    return as_saved(Workspace(view, past, view.camera, focus, snapshots=kept))
+
+
+def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[Snapshot, ...]]:
+    """What it would be a pity to lose; where one looked from is not."""
+    return history.edit_of(workspace.view), workspace.snapshots
+
+
+def as_saved(workspace: Workspace) -> Workspace:
+    """The same, with nothing unsaved."""
+    return replace(workspace, saved=worth_saving(workspace))
+
+
+def unsaved(workspace: Workspace) -> bool:
+    """Whether closing now would lose something."""
+    return workspace.saved != worth_saving(workspace)
 
 
 def original(view: ViewState) -> ViewState:
@@ -115,7 +139,7 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     """
     name, _, argument = action.partition(":")
     if name in REQUESTS:
-        return replace(workspace, requests=(*workspace.requests, name))
+        return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
         return _framed(workspace, facts, aspect) if name == "frame" else _home(workspace)
     if name == "dial":
@@ -235,7 +259,27 @@ def _timed(name: str) -> Callable[[Workspace, str], Workspace]:
     return act
 
 
-REQUESTS = ("picture", "window_picture", "timeline_file", "full_screen", "quit")
+def _restore(workspace: Workspace, index: str) -> Workspace:
+    """Back to a snapshot, counted as the panel shows them: 0 is the original."""
+    kept = snapshots.shown(workspace.snapshots, workspace.view)
+    if not 0 <= int(index) < len(kept):
+        return workspace
+    return _with_layers_of(workspace, snapshots.back_to(workspace.view, kept[int(index)]))
+
+
+def _forget(workspace: Workspace, index: str) -> Workspace:
+    return replace(workspace, snapshots=snapshots.without(workspace.snapshots, int(index) - 1))
+
+
+def _snapshot(workspace: Workspace, _: str) -> Workspace:
+    return replace(workspace, snapshots=snapshots.taken(workspace.snapshots, workspace.view))
+
+
+REQUESTS = (
+    *("picture", "window_picture", "timeline_file", "full_screen", "quit"),
+    *("save", "save_as", "save_to", "open", "open_file", "discard"),
+)
+"""What only the window can do: `save_to:PATH`, `open_file:PATH`; `save:THEN` asks for THEN afterwards."""
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": lambda workspace, _: replace(workspace, focus=None),
@@ -250,12 +294,16 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "rename": lambda workspace, _: replace(workspace, renaming=workspace.focus),
     "blend": _blend,
     "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
+    "snapshot": _snapshot,
+    "restore": _restore,
+    "forget": _forget,
     "undo": _undo,
     "redo": _redo,
     "fly": _fly,
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "split": lambda w, _: replace(w, view=compare.switched(w.view, "split")),
     "difference": lambda w, _: replace(w, view=compare.switched(w.view, "difference")),
+    "draft": lambda w, _: replace(w, view=draft.switched(w.view)),
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
     **{name: _timed(name) for name in playback.ACTIONS},

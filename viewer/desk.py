@@ -1,0 +1,254 @@
+"""Files of the window: opened and dropped ones by their content, the session, its autosave, recent files.
+
+Everything that goes wrong here is one line in the window; the work stays as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from progdf.camera_files import load_cameras
+from progdf.checkpoint import load_gdf
+from progdf.errors import ProgdfError
+from progdf.info import kind_of
+from progdf.session_file import SUFFIX
+
+from . import document as documents
+from . import recent, session, workspace
+from .dialogs import Dialog
+from .document import Document
+from .session import Session
+from .stage import Stage
+from .state import LayerState
+from .turntable import first_camera, from_camera
+
+AUTOSAVE_S = 20.0
+"""Seconds from a change to its autosave."""
+
+
+class Shown(Protocol):
+    """What the desk needs of the application."""
+
+    document: Document
+    stage: Stage
+
+    def show(self, document: Document) -> None:
+        """Draw another document from now on."""
+
+    def leave(self) -> None:
+        """Close the window, without a question."""
+
+
+@dataclass(frozen=True)
+class _Due:
+    """An autosave to come: when, in seconds of the caller's clock, and of what."""
+
+    at: float
+    kept: object
+
+
+class Desk:
+    """Opens, saves and asks, for one window.
+
+    Args:
+        app: the window
+        path: the session's file, None before it has one
+        memory: folder of the list of recent files; the user's own if None
+    """
+
+    def __init__(self, app: Shown, path: Path | None = None, memory: Path | None = None) -> None:
+        self._app, self.path, self._memory = app, path, memory
+        self._due: _Due | None = None
+        self._autosaved: object = None  # what the autosave file holds
+        opened = app.document
+        files = (*opened.gdf_paths, *((opened.path,) if opened.path else ()), *((path,) if path else ()))
+        app.stage.recent = self._remember(*files)
+
+    def serve(self, request: str) -> None:
+        """One request of `workspace.REQUESTS` that is about files, or "quit"."""
+        name, _, argument = request.partition(":")
+        if name in ("save", "save_as"):
+            self._save_where(argument, ask=name == "save_as")
+        elif name == "save_to":
+            self._told(lambda: self.save(Path(argument).expanduser()))
+        elif name == "open":
+            self._app.stage.ask(Dialog("open"))
+        elif name == "open_file":
+            self.open(Path(argument).expanduser())
+        elif name == "discard":
+            self._app.stage.work = workspace.as_saved(self._app.stage.work)
+        elif name == "quit":
+            self._leave()
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether something would be lost that a session could keep."""
+        return self._app.document.path is not None and workspace.unsaved(self._app.stage.work)
+
+    def open(self, path: Path) -> None:
+        """A file by what it is: scenes and sessions replace all, an edit comes on top, a camera is taken."""
+        self._told(lambda: self._open(path, kind_of(path)))
+
+    def save(self, path: Path) -> None:
+        """Save the session there from now on.
+
+        Raises:
+            ProgdfError: see `session.save`.
+            OSError: it cannot be written.
+        """
+        path = path if path.suffix == ".json" else path.with_name(path.name + SUFFIX)
+        if path != self.path and path.is_file() and kind_of(path) != "session":
+            raise ProgdfError(f"{path} is another file, no session; choose another name")
+        session.save(path, self._session())
+        self._drop_autosave()
+        self.path = path
+        stage = self._app.stage
+        stage.work = workspace.as_saved(stage.work)
+        stage.recent = self._remember(path)
+        stage.tell(f"Saved {path.resolve()}")
+
+    def autosave(self, now: float) -> float | None:
+        """Write unsaved work beside the session once it is old enough.
+
+        Args:
+            now: seconds of any clock that does not go back
+
+        Returns:
+            Seconds until it has to be called again; None if nothing waits.
+        """
+        kept = workspace.worth_saving(self._app.stage.work)
+        if not self.unsaved or kept == self._autosaved:
+            self._due = None
+            return None
+        if self._due is None:
+            self._due = _Due(now + AUTOSAVE_S, kept)
+        if now < self._due.at:
+            return self._due.at - now
+        self._due, self._autosaved = None, kept
+        try:
+            session.save(self._autosave_path(), self._session())
+        except (ProgdfError, OSError) as error:
+            self._app.stage.tell(f"there is no autosave: {error}", error=True)
+        return None
+
+    def closed(self) -> None:
+        """The window closes, and nothing is lost: the autosave has done its work."""
+        self._drop_autosave()
+
+    def _open(self, path: Path, kind: str) -> None:
+        if kind == "cameras":
+            self._look_through(path)
+            return
+        if kind == "gdf":
+            self._add_edit(path)
+        elif self.unsaved:
+            self._app.stage.ask(Dialog("leave", then=f"open_file:{path}"))
+            return
+        elif kind == "session":
+            self._open_session(path)
+        else:
+            self._open_scene(path)
+        self._app.stage.recent = self._remember(path)
+
+    def _open_session(self, path: Path) -> None:
+        opened = session.open_session(path)
+        self._drop_autosave()
+        self._app.show(opened.document)
+        stage = self._app.stage
+        stage.restart(opened.view, opened.snapshots)
+        name = path.name.removesuffix(session.AUTOSAVE + SUFFIX)
+        if name != path.name:  # an autosave is unsaved work of the session beside it
+            self.path = path.with_name(name + SUFFIX)
+            stage.work = replace(stage.work, saved=None)
+            return
+        self.path = path
+        self.mention_autosave()
+
+    def mention_autosave(self) -> None:
+        """Say so where work was left unsaved the last time."""
+        left = self._autosave_path()
+        if self._app.document.path is not None and left.is_file():
+            self._app.stage.tell(f"Unsaved work was kept in {left.name}; Ctrl+O opens it")
+
+    def _open_scene(self, path: Path) -> None:
+        opened = documents.load(path)
+        self._drop_autosave()
+        self._app.show(opened)
+        self.path = None
+        stage = self._app.stage
+        stage.restart(replace(stage.work.view, camera=first_camera(opened.scene), layers=()))
+
+    def _add_edit(self, path: Path) -> None:
+        """On top, at full strength, so that one sees what came; undo takes it off again."""
+        opened = self._app.document
+        gdf = load_gdf(path, opened.scene)
+        layer = LayerState(len(opened.gdfs), _free_name(gdf.name, opened), strength=1.0)
+        paths = (*opened.gdf_paths, path) if len(opened.gdf_paths) == len(opened.gdfs) else ()
+        gdfs = (*opened.gdfs, replace(gdf, name=layer.name))
+        self._app.show(replace(opened, gdfs=gdfs, gdf_paths=paths))
+        stage = self._app.stage
+        stage.change(replace(stage.work.view, layers=(*stage.work.view.layers, layer)))
+
+    def _look_through(self, path: Path) -> None:
+        stage = self._app.stage
+        stage.work = workspace.with_camera(
+            stage.work, from_camera(stage.work.view.camera, load_cameras(path)[0], stage.facts.bounds)
+        )
+        stage.tell(f"Looking through the first camera of {path.name}")
+
+    def _session(self) -> Session:
+        work = self._app.stage.work
+        return Session(self._app.document, work.view, work.snapshots)
+
+    def _save_where(self, then: str, ask: bool) -> None:
+        if self.path is None or ask:
+            path = self.path or session.default_path(self._app.document)
+            self._app.stage.ask(Dialog("save", str(path), then))
+            return
+        path = self.path
+        if self._told(lambda: self.save(path)) and then:
+            self._app.stage.request(then)
+
+    def _leave(self) -> None:
+        if self.unsaved:
+            self._app.stage.ask(Dialog("leave", then="quit"))
+        else:
+            self._app.leave()
+
+    def _told(self, act: Callable[[], None]) -> bool:
+        """Do it; what goes wrong is a line in the window. Whether it went well."""
+        try:
+            act()
+        except ProgdfError as error:
+            self._app.stage.tell(str(error), error=True)
+        except OSError as error:
+            name = error.filename or "the file"
+            self._app.stage.tell(f"{name} cannot be read or written: {error.strerror}", error=True)
+        else:
+            return True
+        return False
+
+    def _autosave_path(self) -> Path:
+        return session.autosave_path(self.path, self._app.document)
+
+    def _drop_autosave(self) -> None:
+        """Take away what this window has autosaved."""
+        if self._autosaved is not None:
+            self._autosave_path().unlink(missing_ok=True)
+        self._autosaved, self._due = None, None
+
+    def _remember(self, *paths: Path) -> tuple[Path, ...]:
+        if not paths:
+            return recent.read(self._memory)
+        return recent.remember(paths, self._memory)
+
+
+def _free_name(name: str, opened: Document) -> str:
+    """The edit's name, with a number where another edit has it."""
+    taken, free, number = {gdf.name for gdf in opened.gdfs}, name, 2
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free

@@ -1,0 +1,155 @@
+"""Questions over the picture: where to save, what to open, what becomes of unsaved changes.
+
+All of it goes by keys too: Enter takes the marked button, Escape leaves all as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from imgui_bundle import imgui
+
+from .ui_context import PALETTE, SMALL_PX, UiContext
+from .widgets import elided
+
+WIDTH_PX = 520.0  # at 1×
+_POPUP = "##dialog"
+_NAMES = {"save": "Save the session", "open": "Open", "leave": "There are unsaved changes"}
+_HINTS = {
+    "save": "A .session.json file; the scene and its edits stay where they are.",
+    "open": "A scene (.ply), an edit (.gdf), a session or cameras, told apart by content.",
+    "leave": "Save them in the session first?",
+}
+
+
+@dataclass(frozen=True)
+class Dialog:
+    """A question that is being asked.
+
+    Args:
+        kind: "save", "open" or "leave"
+        text: what stands in the path field
+        then: the request that was put off for this, "" for none
+    """
+
+    kind: str
+    text: str = ""
+    then: str = ""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The dialog as it is now, None once it is over, and the requests that come of it."""
+
+    dialog: Dialog | None
+    requests: tuple[str, ...] = ()
+
+
+def draw(
+    dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, middle: tuple[float, float]
+) -> Answer:
+    """Draw the question and take its answer.
+
+    Args:
+        recent: files opened before, the last one first
+        pressed: chords that went down in this frame
+        middle: of the dialog, window pixels
+    """
+    if not imgui.is_popup_open(_POPUP):
+        imgui.open_popup(_POPUP)
+    imgui.set_next_window_pos(imgui.ImVec2(*middle), 0, imgui.ImVec2(0.5, 0.5))
+    room = imgui.get_io().display_size.x - 16.0 * ui.scale
+    imgui.set_next_window_size(imgui.ImVec2(min(WIDTH_PX * ui.scale, room), 0.0))
+    flags = imgui.WindowFlags_
+    fixed = flags.no_move.value | flags.no_nav.value
+    shown = flags.no_decoration.value | flags.no_saved_settings.value | fixed
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(16.0 * ui.scale, 14.0 * ui.scale))
+    imgui.push_style_color(imgui.Col_.modal_window_dim_bg, imgui.ImVec4(0.0, 0.0, 0.0, 0.45))
+    answer = Answer(dialog)
+    if imgui.begin_popup_modal(_POPUP, None, shown)[0]:
+        answer = _content(dialog, recent, pressed, ui)
+        if answer.dialog is None:
+            imgui.close_current_popup()
+        imgui.end_popup()
+    imgui.pop_style_color()
+    imgui.pop_style_var(2)
+    return answer
+
+
+def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext) -> Answer:
+    imgui.push_font(ui.fonts.bold, 0.0)
+    imgui.text(_NAMES[dialog.kind])
+    imgui.pop_font()
+    imgui.push_font(None, SMALL_PX)
+    imgui.text_colored(imgui.ImVec4(*PALETTE.dim), _HINTS[dialog.kind])
+    imgui.pop_font()
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    if "Escape" in pressed:
+        return Answer(None)
+    if dialog.kind == "leave":
+        return _leaving(dialog, pressed, ui)
+    if imgui.is_window_appearing():
+        imgui.set_keyboard_focus_here()
+    imgui.set_next_item_width(-1.0)
+    _, text = imgui.input_text("##path", dialog.text)
+    dialog = replace(dialog, text=text)
+    if dialog.kind == "open":
+        chosen = _recent(recent, ui)
+        if chosen is not None:
+            return Answer(None, (f"open_file:{chosen}",))
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    name = {"save": "Save", "open": "Open"}[dialog.kind]
+    button = _buttons((name, "Cancel"), ui)
+    if button == "Cancel":
+        return Answer(None)
+    path = text.strip().strip("\"'")
+    if path and (button == name or "Enter" in pressed):
+        request = {"save": "save_to", "open": "open_file"}[dialog.kind]
+        then = (dialog.then,) if dialog.then else ()
+        return Answer(None, (f"{request}:{path}", *then))
+    return Answer(dialog)
+
+
+def _leaving(dialog: Dialog, pressed: Sequence[str], ui: UiContext) -> Answer:
+    button = _buttons(("Save", "Discard", "Cancel"), ui)
+    if button == "Cancel":
+        return Answer(None)
+    if button == "Discard" or "D" in pressed:
+        return Answer(None, ("discard", dialog.then))
+    if button == "Save" or "Enter" in pressed or "S" in pressed:
+        return Answer(None, (f"save:{dialog.then}",))
+    return Answer(dialog)
+
+
+def _recent(recent: Sequence[Path], ui: UiContext) -> Path | None:
+    """The list of files opened before; the one that was clicked."""
+    chosen = None
+    for i, path in enumerate(recent):
+        room = imgui.get_content_region_avail().x
+        if imgui.selectable(f"{elided(path.name, 0.4 * room)}##{i}", False)[0]:
+            chosen = path
+        imgui.same_line(0.42 * room)
+        imgui.push_font(None, SMALL_PX)
+        imgui.text_disabled(elided(str(path.parent), 0.56 * room))
+        imgui.pop_font()
+    return chosen
+
+
+def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
+    """Buttons at the right, the first one marked; the name of the pressed one."""
+    wide, gap = 92.0 * ui.scale, 8.0 * ui.scale
+    start = imgui.get_content_region_avail().x - len(names) * wide - (len(names) - 1) * gap
+    imgui.set_cursor_pos_x(imgui.get_cursor_pos_x() + max(start, 0.0))
+    pressed = None
+    for i, name in enumerate(names):
+        if i:
+            imgui.same_line(0.0, gap)
+        colour = PALETTE.field if i else PALETTE.accent_dark
+        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*colour))
+        if imgui.button(name, imgui.ImVec2(wide, 0.0)):
+            pressed = name
+        imgui.pop_style_color()
+    return pressed

@@ -1,0 +1,50 @@
+"""What is open: a scene and its edits, with the files they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from progdf.checkpoint import Gdf
+from progdf.gaussians import Gaussians
+from progdf.ply import load_ply
+
+from . import arguments
+from .layer_rows import layer_rows
+from .turntable import bounds_of
+from .workspace import SceneFacts
+
+
+@dataclass(frozen=True)
+class Document:
+    """The scene and its edits, in the order of `LayerState.gdf`.
+
+    Args:
+        title: the scene's name
+        scene: the original
+        gdfs: its edits
+        path: the scene's file; None where there is none, and so no session can be saved
+        gdf_paths: the edits' files, one for each where there are any
+    """
+
+    title: str
+    scene: Gaussians
+    gdfs: tuple[Gdf, ...] = ()
+    path: Path | None = None
+    gdf_paths: tuple[Path, ...] = ()
+
+    def facts(self) -> SceneFacts:
+        """What the panel and the camera need to know of it."""
+        rows = layer_rows(self.scene, self.gdfs)
+        return SceneFacts(self.title, len(self.scene), bounds_of(self.scene), rows)
+
+
+def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
+    """Read a scene and its edits.
+
+    Raises:
+        ProgdfError: a file is missing or broken, or an edit was made for another scene.
+    """
+    gaussians = load_ply(scene)
+    return Document(scene.name, gaussians, arguments.load_edits(gdfs, gaussians, scene), scene, tuple(gdfs))
