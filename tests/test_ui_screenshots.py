@@ -123,10 +123,9 @@ def test_the_timings_of_a_picture(screenshot: Compare) -> None:
 
 def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Compare) -> None:
     view = replace(first_view(bear(), 1.1, 0.5), overshoot=True, unfolded=(0,))
-    solo, locked = (
-        replace(layer, **{how: True}) for layer, how in zip(view.layers, ("solo", "locked"), strict=True)
-    )
-    with rig(replace(view, layers=(solo, locked)), SMALLEST) as hand:
+    first, second = view.layers
+    layers = (replace(first, solo=True), replace(second, locked=True))
+    with rig(replace(view, layers=layers), SMALLEST) as hand:
         hand.key("Tab")
         hand.frame(3)
         screenshot("ui_gains", hand.image())
