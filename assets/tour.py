@@ -1,0 +1,121 @@
+"""Takes the README's tour: the real interface on a real scene, drawn without a window.
+
+usage: python assets/tour.py NAME SCENE.ply EDIT.gdf... -o OUT.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from ui_rig import Rig, rig
+
+from progdf.checkpoint import Gdf
+from progdf.ply import load_ply
+from viewer.arguments import load_edits
+from viewer.dialogs import Dialog
+from viewer.state import LayerState, ViewState
+from viewer.turntable import first_camera
+
+SIZE = (1280, 800)
+
+
+def layers(hand: Rig) -> None:
+    """Two edits, gains and curve of the first unfolded, its colour held back."""
+    hand.wheel(490.0, 400.0, 1.0)
+    hand.key("G")
+    hand.key("Tab")
+    for _ in range(2):
+        hand.key("Shift+Left")
+
+
+def compare(hand: Rig) -> None:
+    """The original beside the edited scene, the divider in the hand."""
+    _whole(hand)
+    _wheel_in(hand)
+    hand.key("Y")
+    hand.move(490.0, 300.0)
+    hand.frame(3)
+
+
+def difference(hand: Rig) -> None:
+    """What differs, four times as bright, with the PSNR."""
+    _whole(hand)
+    _wheel_in(hand)
+    hand.key("Shift+Y")
+
+
+def session(hand: Rig) -> None:
+    """Snapshots in the panel, and the question before changes are lost."""
+    _wheel_in(hand)
+    for chord in ("1", *["Shift+Right"] * 2, "F3", *["Shift+Left"] * 5, "F3", "2", *["Shift+Left"] * 9, "F3"):
+        hand.key(chord)
+    hand.frame(8)
+    hand.wheel(1130.0, 600.0, -100.0)
+    hand.stage.ask(Dialog("leave", "playbot.session.json", "quit"))
+    hand.settle()
+
+
+def _whole(hand: Rig) -> None:
+    """All edits at full strength."""
+    view = hand.stage.work.view
+    full = tuple(replace(layer, strength=1.0) for layer in view.layers)
+    hand.stage.change(replace(view, layers=full))
+    hand.settle()
+
+
+def _wheel_in(hand: Rig) -> None:
+    """Nearer to the focused layer."""
+    hand.key("F")
+    hand.wheel(490.0, 400.0, -6.5)
+
+
+SHOTS: dict[str, Callable[[Rig], None]] = {
+    "layers": layers,
+    "compare": compare,
+    "difference": difference,
+    "session": session,
+}
+"""What a hand does before the picture is taken."""
+
+
+def first_state(gdfs: tuple[Gdf, ...], strengths: tuple[float, ...] = (0.8, 0.6, 0.5, 0.4)) -> ViewState:
+    """Every edit part of the way."""
+    stack = tuple(LayerState(i, gdf.name, strengths[i % 4]) for i, gdf in enumerate(gdfs))
+    return ViewState(layers=stack, background=(0.75, 0.82, 0.88))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("name", choices=sorted(SHOTS))
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("gdfs", type=Path, nargs="+")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    asked = parser.parse_args()
+    scene = load_ply(asked.scene)
+    gdfs = load_edits(asked.gdfs, scene, asked.scene)
+    view = replace(first_state(gdfs), camera=first_camera(scene, aspect=980 / 800))
+    with rig(view, SIZE, stack=_Opened(scene, gdfs)) as hand:
+        hand.stage.facts = replace(hand.stage.facts, title=asked.scene.name)
+        SHOTS[asked.name](hand)
+        hand.frame(3)
+        picture = Image.fromarray(hand.image())
+    # no dithering: it would grain the interface's flat colours
+    picture.quantize(256, kmeans=3, dither=Image.Dither.NONE).save(asked.out, optimize=True)
+
+
+class _Opened:
+    """What the rig needs of a scene and its edits."""
+
+    def __init__(self, scene: object, gdfs: tuple[Gdf, ...]) -> None:
+        self.scene, self.gdfs = scene, gdfs
+
+
+if __name__ == "__main__":
+    main()
