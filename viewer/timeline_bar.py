@@ -209,7 +209,7 @@ def _paint_numbers(
     numbers = range(0, timeline.length + 1, step) if timeline.keys else ()
     for number in (*(n for n in numbers if n != frame), frame):
         x, text = place(timeline, number, start, span), str(number)
-        if number != frame and abs(x - here) < 24.0 * scale:
+        if number != frame and -16.0 * scale < x - here < 36.0 * scale:
             continue
         colour = u32(p.accent if number == frame else p.dim)
         # the playhead's number stands beside its handle, left of it at the end of the ruler
