@@ -52,6 +52,34 @@ def mark_cells(
     _mark(cells, means, quats, scales, opacities, rows, viewmat, intrinsics, size, near)
 
 
+@kernel()
+def _cells_of(
+    px: float, py: float, wide: float, high: float, width: float, height: float
+) -> tuple[int, int, int, int]:
+    """First column and row of the cells of a box around px, py, and one past the last; 0, 0, 0, 0 outside."""
+    left, right = px - wide - _MARGIN, px + wide + _MARGIN
+    top, bottom = py - high - _MARGIN, py + high + _MARGIN
+    if right < 0.0 or left >= width or bottom < 0.0 or top >= height:
+        return 0, 0, 0, 0
+    if not abs(left) + abs(right) + abs(top) + abs(bottom) < np.inf:  # beyond numbers: anywhere
+        left, right, top, bottom = 0.0, width, 0.0, height
+    return (
+        int(max(left, 0.0)) // CELL,
+        int(max(top, 0.0)) // CELL,
+        int(min(right, width - 1.0)) // CELL + 1,
+        int(min(bottom, height - 1.0)) // CELL + 1,
+    )
+
+
+@kernel()
+def _all_marked(cells: Array, x0: int, y0: int, x1: int, y1: int) -> bool:
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            if not cells[y, x]:
+                return False
+    return True
+
+
 @kernel(contract=True, cache=True)
 def _mark(
     cells: Array, means: Array, quats: Array, scales: Array, opacities: Array, rows: Array, viewmat: Array,
@@ -66,21 +94,27 @@ def _mark(
         total = abs(mean[0]) + abs(mean[1]) + abs(mean[2]) + abs(scale[0]) + abs(scale[1]) + abs(scale[2])
         if not (z > near and opacity >= ALPHA_MIN and total + opacity < np.inf):
             continue
+        inv_z = 1.0 / z
+        px = lens.fx * (dot(lens.rows[0], mean) + lens.shift[0]) * inv_z + lens.cx
+        py = lens.fy * (dot(lens.rows[1], mean) + lens.shift[1]) * inv_z + lens.cy
+        reach2 = 2.0 * math.log(opacity / ALPHA_MIN)
+        # first a bound that needs no covariance, as in `projection.cull`: most land where others did
+        tan_x = min(max((px - lens.cx) / lens.fx, lens.low_x), lens.high_x)
+        tan_y = min(max((py - lens.cy) / lens.fy, lens.low_y), lens.high_y)
+        largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2]))) * inv_z
+        jx, jy = lens.fx * largest, lens.fy * largest
+        wide = math.sqrt(1.001 * reach2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION))
+        high = math.sqrt(1.001 * reach2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION))
+        x0, y0, x1, y1 = _cells_of(px, py, wide, high, width, height)
+        if _all_marked(cells, x0, y0, x1, y1):
+            continue
         seen = footprint(
             lens, mean, np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]),
             np.float64(quats[i, 3]), scale,
         )  # fmt: skip
-        px, py = lens.fx * seen.x * seen.inv_z + lens.cx, lens.fy * seen.y * seen.inv_z + lens.cy
-        reach2 = 2.0 * math.log(opacity / ALPHA_MIN)
-        wide = math.sqrt(max(0.0, reach2 * (seen.a + DILATION))) + _MARGIN
-        high = math.sqrt(max(0.0, reach2 * (seen.c + DILATION))) + _MARGIN
-        left, right, top, bottom = px - wide, px + wide, py - high, py + high
-        if right < 0.0 or left >= width or bottom < 0.0 or top >= height:
-            continue
-        if not abs(left) + abs(right) + abs(top) + abs(bottom) < np.inf:  # as far as numbers go: anywhere
-            left, right, top, bottom = 0.0, width, 0.0, height
-        x0, x1 = int(max(left, 0.0)) // CELL, int(min(right, width - 1.0)) // CELL
-        y0, y1 = int(max(top, 0.0)) // CELL, int(min(bottom, height - 1.0)) // CELL
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
+        wide = math.sqrt(max(0.0, reach2 * (seen.a + DILATION)))
+        high = math.sqrt(max(0.0, reach2 * (seen.c + DILATION)))
+        x0, y0, x1, y1 = _cells_of(px, py, wide, high, width, height)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
                 cells[y, x] = True

@@ -12,8 +12,11 @@ class Presenter:
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
+        # two programs: software GL would pay for both ways in every pixel of one
         self._program = load_program(ctx, "present.vert", "present.frag")
+        self._stretch = load_program(ctx, "present.vert", "stretch.frag")
         self._vao = ctx.vertex_array(self._program, [])
+        self._stretch_vao = ctx.vertex_array(self._stretch, [])
 
     def show(
         self,
@@ -21,16 +24,21 @@ class Presenter:
         framebuffer: moderngl.Framebuffer,
         size: tuple[int, int] | None = None,
     ) -> None:
-        """Fill the lower left `size` pixels of `framebuffer` with `picture`; pixel by pixel where it has as
-        many, which is so without `size`, and else smoothly."""
+        """Fill the lower left `size` pixels of `framebuffer` with `picture`: pixel by pixel where it has as
+        many (which is what None means), else smoothly."""
+        size = size or picture.size
         framebuffer.use()
-        self.ctx.viewport = (0, 0, *(size or picture.size))
-        self._program["shown_size"] = size or picture.size
+        self.ctx.viewport = (0, 0, *size)
         self.ctx.enable_only(moderngl.NOTHING)
         picture.use(0)
-        self._program["picture"] = 0
-        self._vao.render(moderngl.TRIANGLES, vertices=3)
+        if size == picture.size:
+            self._program["picture"] = 0
+            self._vao.render(moderngl.TRIANGLES, vertices=3)
+        else:
+            picture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            self._stretch["picture"], self._stretch["shown_size"] = 0, size
+            self._stretch_vao.render(moderngl.TRIANGLES, vertices=3)
 
     def release(self) -> None:
-        self._vao.release()
-        self._program.release()
+        for held in (self._vao, self._program, self._stretch_vao, self._stretch):
+            held.release()
