@@ -19,9 +19,9 @@ from ui_rig import Rig, rig
 from progdf.checkpoint import Gdf
 from progdf.ply import load_ply
 from viewer.arguments import load_edits
-from viewer.dialogs import Dialog
 from viewer.state import LayerState, ViewState
 from viewer.turntable import first_camera
+from viewer.workspace import Dialog
 
 SIZE = (1280, 800)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from viewer.engine import FrameTimings
 from viewer.headless import headless_context, is_software
 from viewer.inputs import Keys
 from viewer.state import LayerState, ViewState
+from viewer.workspace import Dialog
 
 Compare = Callable[[str, np.ndarray], None]
 
@@ -129,3 +131,29 @@ def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Com
         hand.key("Tab")
         hand.frame(3)
         screenshot("ui_gains", hand.image())
+
+
+def test_the_original_beside_the_edited(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
+        hand.key("Y")
+        hand.move(362.0, 250.0)
+        hand.frame(3)
+        screenshot("ui_split", hand.image())
+
+
+def test_the_difference_from_the_original(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
+        hand.key("Shift+Y")
+        screenshot("ui_difference", hand.image())
+
+
+def test_snapshots_and_a_question(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
+        for chord in ("F3", *["Shift+Left"] * 5, "F3"):
+            hand.key(chord)
+        hand.frame(5)
+        hand.wheel(900.0, 400.0, -100.0)
+        hand.stage.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+        hand.stage.ask(Dialog("open"))
+        hand.frame(3)
+        screenshot("ui_snapshots", hand.image())

@@ -18,12 +18,12 @@ from progdf.session_file import SUFFIX
 
 from . import document as documents
 from . import recent, session, workspace
-from .dialogs import Dialog
 from .document import Document
 from .session import Session
 from .stage import Stage
 from .state import LayerState
 from .turntable import first_camera, from_camera
+from .workspace import Dialog
 
 AUTOSAVE_S = 20.0
 """Seconds from a change to its autosave."""
@@ -145,7 +145,7 @@ class Desk:
         if kind == "gdf":
             self._add_edit(path)
         elif self.unsaved:
-            self._app.stage.ask(Dialog("leave", then=f"open_file:{path}"))
+            self._app.stage.ask(self._leaving(f"open_file:{path}"))
             return
         elif kind == "session":
             self._open_session(path)
@@ -214,9 +214,12 @@ class Desk:
 
     def _leave(self) -> None:
         if self.unsaved:
-            self._app.stage.ask(Dialog("leave", then="quit"))
+            self._app.stage.ask(self._leaving("quit"))
         else:
             self._app.leave()
+
+    def _leaving(self, then: str) -> Dialog:
+        return Dialog("leave", str(self.path or session.default_path(self._app.document)), then)
 
     def _told(self, act: Callable[[], None]) -> bool:
         """Do it; what goes wrong is a line in the window. Whether it went well."""

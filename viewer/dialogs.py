@@ -11,8 +11,10 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
+from .overlay import Area
 from .ui_context import PALETTE, SMALL_PX, UiContext
-from .widgets import elided
+from .widgets import elided, section
+from .workspace import Dialog
 
 WIDTH_PX = 520.0  # at 1×
 _POPUP = "##dialog"
@@ -20,23 +22,8 @@ _NAMES = {"save": "Save the session", "open": "Open", "leave": "There are unsave
 _HINTS = {
     "save": "A .session.json file; the scene and its edits stay where they are.",
     "open": "A scene (.ply), an edit (.gdf), a session or cameras, told apart by content.",
-    "leave": "Save them in the session first?",
+    "leave": "Save them in {} first?",
 }
-
-
-@dataclass(frozen=True)
-class Dialog:
-    """A question that is being asked.
-
-    Args:
-        kind: "save", "open" or "leave"
-        text: what stands in the path field
-        then: the request that was put off for this, "" for none
-    """
-
-    kind: str
-    text: str = ""
-    then: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,20 +34,19 @@ class Answer:
     requests: tuple[str, ...] = ()
 
 
-def draw(
-    dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, middle: tuple[float, float]
-) -> Answer:
+def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, area: Area) -> Answer:
     """Draw the question and take its answer.
 
     Args:
         recent: files opened before, the last one first
         pressed: chords that went down in this frame
-        middle: of the dialog, window pixels
+        area: the picture; the question stands in its upper part
     """
     if not imgui.is_popup_open(_POPUP):
         imgui.open_popup(_POPUP)
-    imgui.set_next_window_pos(imgui.ImVec2(*middle), 0, imgui.ImVec2(0.5, 0.5))
-    room = imgui.get_io().display_size.x - 16.0 * ui.scale
+    middle = imgui.ImVec2(area.width / 2, 0.25 * area.height)
+    imgui.set_next_window_pos(middle, 0, imgui.ImVec2(0.5, 0.5))
+    room = area.width - 16.0 * ui.scale
     imgui.set_next_window_size(imgui.ImVec2(min(WIDTH_PX * ui.scale, room), 0.0))
     flags = imgui.WindowFlags_
     fixed = flags.no_move.value | flags.no_nav.value
@@ -84,7 +70,7 @@ def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui:
     imgui.text(_NAMES[dialog.kind])
     imgui.pop_font()
     imgui.push_font(None, SMALL_PX)
-    imgui.text_colored(imgui.ImVec4(*PALETTE.dim), _HINTS[dialog.kind])
+    imgui.text_colored(imgui.ImVec4(*PALETTE.dim), _HINTS[dialog.kind].format(Path(dialog.text).name))
     imgui.pop_font()
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
@@ -127,6 +113,8 @@ def _leaving(dialog: Dialog, pressed: Sequence[str], ui: UiContext) -> Answer:
 def _recent(recent: Sequence[Path], ui: UiContext) -> Path | None:
     """The list of files opened before; the one that was clicked."""
     chosen = None
+    if recent:
+        section("Recent", ui)
     for i, path in enumerate(recent):
         room = imgui.get_content_region_avail().x
         if imgui.selectable(f"{elided(path.name, 0.4 * room)}##{i}", False)[0]:

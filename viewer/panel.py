@@ -164,7 +164,7 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     background = (red, green, blue) if changed else state.background
     shown = compare.MODES.index(state.compare.mode)
     label("Compare", column)
-    chosen = choice("compare", ("Off", "Split", "Difference"), shown, ui)
+    chosen = choice("compare", ("Off", "Split", "Diff"), shown, ui)
     tip("With the original: beside each other (Y), or what differs (Shift+Y)")
     comparison = state.compare if chosen is None else replace(state.compare, mode=compare.MODES[chosen])
     if comparison.mode == "difference":

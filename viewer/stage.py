@@ -31,7 +31,6 @@ from . import (
     workspace,
 )
 from .compare import Comparer, labelled
-from .dialogs import Dialog
 from .engine import Engine, FrameTimings, drawn_size
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
@@ -44,7 +43,7 @@ from .state import ViewCamera, ViewState
 from .thumbnails import Thumbnails
 from .turntable import to_camera
 from .ui_context import PALETTE, UiContext
-from .workspace import Message, SceneFacts
+from .workspace import Dialog, Message, SceneFacts
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
 MESSAGE_S, ERROR_S = 6.0, 15.0
@@ -338,10 +337,9 @@ class Stage:
         """The question that is open, if one is."""
         if self.work.dialog is None:
             return
-        area, display = self._area(), imgui.get_io().display_size
+        area = self._area()
         pressed = [press.chord for press in self._keys.pressed]
-        middle = (display.x / 2, 0.45 * area.height)
-        answer = dialogs.draw(self.work.dialog, self.recent, pressed, self.ui, middle)
+        answer = dialogs.draw(self.work.dialog, self.recent, pressed, self.ui, area)
         if answer.dialog is None:
             self.wake()
         requests = (*self.work.requests, *answer.requests)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from progdf.layers import BLENDS
 
-from . import compare, controls, draft, history, playback, snapshots, stack, timeline, turntable
-from .dialogs import Dialog
+from . import compare, controls, draft, history, paint, playback, snapshots, stack, timeline, turntable
 from .history import Edit, History
 from .layer_rows import LayerRow
 from .playback import Player
@@ -45,6 +47,21 @@ class Message:
     text: str
     until: float
     error: bool = False
+
+
+@dataclass(frozen=True)
+class Dialog:
+    """A question that is being asked.
+
+    Args:
+        kind: "save", "open" or "leave"
+        text: what stands in the path field; for "leave" the session's file
+        then: the request that was put off for this, "" for none
+    """
+
+    kind: str
+    text: str = ""
+    then: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,6 +159,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
         return _framed(workspace, facts, aspect) if name == "frame" else _home(workspace)
+    if name in ("paint_clear", "paint_fill"):
+        return _repainted(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
     if name == "dial":
         return _dialled(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
@@ -212,6 +231,21 @@ def _lock(workspace: Workspace, _: str) -> Workspace:
         return stack.changed(view, index, lambda layer: replace(layer, locked=not layer.locked))
 
     return _on_focused(workspace, turned)
+
+
+def _brushed(workspace: Workspace, **changes: Any) -> Workspace:
+    view = workspace.view
+    return replace(workspace, view=replace(view, brush=replace(view.brush, **changes)))
+
+
+def _repainted(workspace: Workspace, facts: SceneFacts, weight: float) -> Workspace:
+    """The focused layer painted evenly, unless it is locked."""
+
+    def even(view: ViewState, index: int) -> ViewState:
+        count = facts.rows[view.layers[index].gdf].count
+        return stack.with_paint(view, index, paint.encoded(np.full(count, weight, np.float32)))
+
+    return _on_focused(workspace, even)
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:
@@ -293,6 +327,11 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "fold": lambda workspace, _: _on_focused(workspace, stack.folded),
     "rename": lambda workspace, _: replace(workspace, renaming=workspace.focus),
     "blend": _blend,
+    "brush": lambda w, _: _brushed(w, active=not w.view.brush.active),
+    "brush_mode": lambda w, _: _brushed(w, mode=paint.next_mode(w.view.brush.mode)),
+    "brush_through": lambda w, _: _brushed(w, through=not w.view.brush.through),
+    "brush_radius": lambda w, by: _brushed(w, radius=paint.radius(w.view.brush.radius * float(by))),
+    "brush_softness": lambda w, by: _brushed(w, softness=paint.softness(w.view.brush.softness + float(by))),
     "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": _snapshot,
     "restore": _restore,
