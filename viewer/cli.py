@@ -17,7 +17,7 @@ from plyfile import PlyData
 
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
-from progdf.compose import Layer, compose
+from progdf.compose import compose
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
@@ -30,6 +30,7 @@ from .compare import Comparer, labelled
 from .engine import Engine
 from .headless import headless_context
 from .layer_arguments import stack_of
+from .paint import layer_of
 from .stack import shown
 from .state import LayerState, ViewCamera, ViewState
 from .turntable import first_camera, to_camera
@@ -216,7 +217,7 @@ def export(argv: Sequence[str]) -> int:
     _check_not_an_input(options.out, (options.scene, *options.gdfs))
     scene, gdfs = _load(options.scene, options.gdfs)
     states = shown(ViewState(layers=_layers(options, gdfs)))
-    layers = [Layer(gdfs[state.gdf], state.strength, gains=state.gains) for state in states]
+    layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
     edited = compose(scene, layers, options.blend)
     with written_whole(options.out) as beside:
         save_ply(beside, edited)

@@ -89,6 +89,11 @@ def soloed(view: ViewState, index: int) -> ViewState:
     return changed(view, index, lambda layer: replace(layer, solo=not layer.solo))
 
 
+def with_paint(view: ViewState, index: int, paint: str) -> ViewState:
+    """One layer under other painted weights, unless it is locked."""
+    return changed(view, index, lambda layer: layer if layer.locked else replace(layer, paint=paint))
+
+
 def all_shown(view: ViewState) -> ViewState:
     """Every eye open, no layer alone."""
     layers = tuple(replace(layer, enabled=True, solo=False) for layer in view.layers)

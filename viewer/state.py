@@ -44,6 +44,7 @@ class LayerState:
         gains: how much of each kind of change comes through, 0..1
         solo: only soloed layers are shown while there are any
         locked: strength, gains and paint stay as they are
+        paint: a weight per member, as `paint.encoded` writes it; empty is 1 everywhere
     """
 
     gdf: int
@@ -53,6 +54,26 @@ class LayerState:
     gains: Gains = Gains()
     solo: bool = False
     locked: bool = False
+    paint: str = ""
+
+
+@dataclass(frozen=True)
+class Brush:
+    """What paints the strength of the focused layer.
+
+    Args:
+        active: whether the left mouse button paints
+        radius: pixels at 1×
+        softness: the part of the radius over which its touch fades, 0..1
+        mode: of `paint.MODES`
+        through: also behind the front surface
+    """
+
+    active: bool = False
+    radius: float = 40.0
+    softness: float = 0.5
+    mode: str = "erase"
+    through: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,6 +132,7 @@ class ViewState:
     Args:
         overshoot: sliders go on to `stack.OVERSHOOT`, which extrapolates
         unfolded: which edits (`LayerState.gdf`) show their gains and curve
+        brush: what paints
         draft: when the window draws coarsely while something moves, of `draft.MODES`; files never are
     """
 
@@ -123,5 +145,6 @@ class ViewState:
     compare: Comparison = Comparison()
     overshoot: bool = False
     unfolded: tuple[int, ...] = ()
+    brush: Brush = Brush()
     timeline: Timeline = Timeline()
     draft: str = "auto"

@@ -59,6 +59,7 @@ class Icon:
     LOCKED = icons.ICON_FA_LOCK
     UNLOCKED = icons.ICON_FA_LOCK_OPEN
     GAINS = icons.ICON_FA_SLIDERS
+    BRUSH = icons.ICON_FA_PAINTBRUSH
 
 
 @dataclass(frozen=True)

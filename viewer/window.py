@@ -30,9 +30,11 @@ _NAMES = {
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
     **{
         getattr(glfw, f"KEY_{name.upper()}"): name
-        for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Space", "Delete")
+        for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete")
     },
     glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
+    glfw.KEY_LEFT_BRACKET: "[",
+    glfw.KEY_RIGHT_BRACKET: "]",
     glfw.KEY_COMMA: ",",
     glfw.KEY_PERIOD: ".",
 }

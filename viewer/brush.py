@@ -1,0 +1,95 @@
+"""The brush in the window: its ring at the cursor, its controls in the panel, its strokes on the picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from imgui_bundle import imgui
+
+from . import paint, stack
+from .engine import Engine
+from .paint import Stroke
+from .state import ViewState
+from .turntable import to_camera
+from .ui_context import PALETTE, Icon, UiContext, u32
+from .widgets import choice, icon_button, label, tip
+
+DRAG = "brush"
+"""What a left drag does while the brush is active, beside those of `controls.DRAGS`."""
+
+NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
+_ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
+
+
+def obstacle(view: ViewState, focus: int | None) -> str:
+    """Why the brush cannot paint now, one line; empty where it can."""
+    if focus is None or focus >= len(view.layers):
+        return "no layer is focused; click the one to paint, or press 1–9"
+    layer = view.layers[focus]
+    if layer.locked:
+        return f"{layer.name} is locked; L unlocks it"
+    if layer not in stack.shown(view):
+        return f"{layer.name} is hidden; H shows it"
+    return ""
+
+
+def begin(view: ViewState, focus: int, engine: Engine, size: tuple[int, int]) -> Stroke:
+    """A stroke on the focused layer, in a picture of this size (width, height in pixels)."""
+    layer, scene = view.layers[focus], engine.gaussians(view)
+    return paint.begun(
+        layer.paint, engine.gdfs[layer.gdf], scene, to_camera(view.camera, *size), view.brush.through
+    )
+
+
+def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewState, str]:
+    """The brush's controls; the changed state and an action of `controls.KEYS` asked for, or ""."""
+    column, brush, action = 82.0 * ui.scale, view.brush, ""
+    label("Brush", column)
+    mode = choice("brush mode", tuple(NAMES[m] for m in paint.MODES), paint.MODES.index(brush.mode), ui)
+    tip("X")
+    if mode is not None:
+        brush = replace(brush, mode=paint.MODES[mode])
+    for name, value, least, most, form, keys in (
+        ("radius", brush.radius, paint.SMALLEST_PX, paint.LARGEST_PX, "%.0f px", "[ ]"),
+        ("softness", brush.softness, 0.0, 1.0, "%.2f", "Shift+[ ]"),
+    ):
+        label(name.capitalize(), column)
+        imgui.set_next_item_width(-1.0)
+        logarithmic = imgui.SliderFlags_.logarithmic.value if name == "radius" else 0
+        changed, new = imgui.slider_float(f"##{name}", value, least, most, form, _ALWAYS_CLAMP | logarithmic)
+        tip(keys)
+        brush = replace(brush, **{name: round(new, 2)}) if changed else brush
+    label("Acts on", column)
+    depth = choice("depth", ("Front", "Through"), int(brush.through), ui)
+    tip("The front surface only, or all that lies under the brush (Shift+B)")
+    if depth is not None:
+        brush = replace(brush, through=bool(depth))
+    label("All of it", column)
+    imgui.begin_disabled(focus is None or view.layers[focus].locked)
+    half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
+    for text, asks, keys in (("None", "paint_clear", "Backspace"), ("Full", "paint_fill", "Shift+Backspace")):
+        if imgui.button(f"{text}##{asks}", imgui.ImVec2(half, 0.0)):
+            action = asks
+        tip(keys)
+        imgui.same_line(0.0, 6.0 * ui.scale)
+    imgui.end_disabled()
+    imgui.new_line()
+    return replace(view, brush=brush), action
+
+
+def toggle(view: ViewState, ui: UiContext) -> bool:
+    """The button that takes the brush up and puts it down; True when pressed."""
+    pressed = icon_button("brush", Icon.BRUSH, ui, dim=not view.brush.active)
+    tip("Paint the strength of the focused layer (B)")
+    return pressed
+
+
+def ring(view: ViewState, ui: UiContext) -> None:
+    """The brush at the cursor: its edge, and inside which its touch is full."""
+    brush, mouse = view.brush, imgui.get_mouse_pos()
+    canvas, radius = imgui.get_background_draw_list(), brush.radius * ui.scale
+    inner = radius * (1.0 - brush.softness)
+    for size, alpha in ((radius, 1.0), (inner, 0.45)):
+        if size > 2.0 * ui.scale:
+            canvas.add_circle(mouse, size, u32((0.0, 0.0, 0.0, 0.5 * alpha)), 0, 3.0 * ui.scale)
+            canvas.add_circle(mouse, size, u32((*PALETTE.handle[:3], alpha)), 0, 1.25 * ui.scale)
