@@ -18,6 +18,7 @@ Array = NDArray[Any]
 CELL = 8
 """Pixels of a cell's side; a cell spans whole rows of the rasteriser's tiles."""
 
+_REACH2 = 1.001 * 2.0 * math.log(1.0 / ALPHA_MIN)  # 1.001: a rotation is one only within rounding
 _MARGIN = 1.0  # px on each side: far more than rounding, far less than a cell
 
 
@@ -97,14 +98,14 @@ def _mark(
         inv_z = 1.0 / z
         px = lens.fx * (dot(lens.rows[0], mean) + lens.shift[0]) * inv_z + lens.cx
         py = lens.fy * (dot(lens.rows[1], mean) + lens.shift[1]) * inv_z + lens.cy
-        reach2 = 2.0 * math.log(opacity / ALPHA_MIN)
         # first a bound that needs no covariance, as in `projection.cull`: most land where others did
         tan_x = min(max((px - lens.cx) / lens.fx, lens.low_x), lens.high_x)
         tan_y = min(max((py - lens.cy) / lens.fy, lens.low_y), lens.high_y)
         largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2]))) * inv_z
         jx, jy = lens.fx * largest, lens.fy * largest
-        wide = math.sqrt(1.001 * reach2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION))
-        high = math.sqrt(1.001 * reach2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION))
+        reach2 = _REACH2 if opacity <= 1.0 else 1.001 * 2.0 * math.log(opacity / ALPHA_MIN)
+        wide = math.sqrt(reach2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION))
+        high = math.sqrt(reach2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION))
         x0, y0, x1, y1 = _cells_of(px, py, wide, high, width, height)
         if _all_marked(cells, x0, y0, x1, y1):
             continue
@@ -112,6 +113,7 @@ def _mark(
             lens, mean, np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]),
             np.float64(quats[i, 3]), scale,
         )  # fmt: skip
+        reach2 = 2.0 * math.log(opacity / ALPHA_MIN)
         wide = math.sqrt(max(0.0, reach2 * (seen.a + DILATION)))
         high = math.sqrt(max(0.0, reach2 * (seen.c + DILATION)))
         x0, y0, x1, y1 = _cells_of(px, py, wide, high, width, height)

@@ -18,6 +18,7 @@ from progdf.rasterize import Crop, rasterize
 from .gl.layout import SPLATS_PER_ROW
 from .gl.present import Presenter
 from .gl.scene_textures import row_runs
+from .sort import NEAR
 from .state import Vec3
 from .touched import area, boxes
 
@@ -26,7 +27,7 @@ Image = NDArray[np.float32]
 WORTH_DRAWING_APART = 0.8
 """Share of the picture beyond which all of it is drawn."""
 
-_FLOOR, _PIXELS_PER_GAUSSIAN = 4096, 1 / 6
+_FLOOR, _PIXELS_PER_GAUSSIAN = 4096, 1 / 3
 """Pixels that take as long as another call of the rasteriser, and as its look at one more Gaussian."""
 
 
@@ -56,12 +57,13 @@ class CpuPainter:
 
     Args:
         ctx: where pictures are shown; None where they are only read
+        near: depth at and below which nothing is drawn, world units
     """
 
     wants_order = False
 
-    def __init__(self, ctx: moderngl.Context | None = None) -> None:
-        self._ctx = ctx
+    def __init__(self, ctx: moderngl.Context | None = None, near: float = NEAR) -> None:
+        self._ctx, self._near = ctx, near
         self._presenter = None if ctx is None else Presenter(ctx)
         self._texture: moderngl.Texture | None = None
         self._stale: list[Crop] | None = None  # where the texture is behind the picture; None is everywhere
@@ -79,7 +81,7 @@ class CpuPainter:
         self._kept = self._cells = self._last = None
         nobody = np.zeros(0, np.int64)  # compiled now, and not under the first touch of a slider
         camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
-        mark_cells(no_cells(1, 1), *self._shapes(), nobody, camera)
+        mark_cells(no_cells(1, 1), *self._shapes(), nobody, camera, self._near)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         names = tuple(attributes)
@@ -119,6 +121,10 @@ class CpuPainter:
             self._last = None
         self._cells = no_cells(camera.width, camera.height)
         return share
+
+    def forget(self) -> None:
+        """Draw the next picture as a whole, whatever the last one was."""
+        self._kept = self._cells = self._last = None
 
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped; it stays as it is when the next one is drawn. [H,W,3]"""
@@ -164,6 +170,7 @@ class CpuPainter:
                 camera.width,
                 camera.height,
                 background,
+                self._near,
                 sh_degree=self._degree,
                 crop=crop,
             )
@@ -179,7 +186,7 @@ class CpuPainter:
         camera = self._picture().camera
         if self._last is None or self._last[0] is not rows:
             cells = no_cells(camera.width, camera.height)
-            mark_cells(cells, *self._shapes(), rows, camera)
+            mark_cells(cells, *self._shapes(), rows, camera, self._near)
             self._last = rows, cells
         return self._last[1]
 

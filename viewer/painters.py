@@ -42,6 +42,9 @@ class Painter(Protocol):
             The share of its pixels that had to be drawn, 0..1.
         """
 
+    def forget(self) -> None:
+        """Draw the next picture as a whole, whatever the last one was."""
+
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped. [H,W,3]"""
 
@@ -76,6 +79,9 @@ class GlPainter:
         self._picture = self._renderer.draw(camera, background)
         self._ctx.finish()
         return 1.0
+
+    def forget(self) -> None:
+        pass  # as it does every time
 
     def pixels(self) -> Image:
         picture = _drawn(self._picture)
