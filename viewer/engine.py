@@ -20,15 +20,16 @@ from progdf.checkpoint import Gdf
 from progdf.composer import Composer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.layers import Gains, Layer
+from progdf.layers import Gains
 
 from .cpu_painter import CpuPainter
 from .headless import is_software
+from .paint import layer_of
 from .painters import GlPainter, Image, Painter
-from .sort import back_to_front
+from .sort import back_to_front, near_plane
 from .stack import shown
 from .state import ViewState
-from .turntable import to_camera
+from .turntable import bounds_of, to_camera
 
 DRAWS = ("auto", "gl", "cpu")
 
@@ -64,7 +65,7 @@ class FrameTimings:
 class _Edits:
     """What decides the attributes: the layers that do something, and how they go together."""
 
-    layers: tuple[tuple[int, float, Gains], ...] = ()
+    layers: tuple[tuple[int, float, Gains, str], ...] = ()
     blend: str = ""
 
 
@@ -109,6 +110,8 @@ class Engine:
         self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
         self.timings = FrameTimings()
         """Of the last picture."""
+        self.near = near_plane(bounds_of(scene).radius)
+        """Depth at and below which nothing is drawn, world units."""
         self._composer = Composer(scene, self.gdfs)
         self._edits = _Edits()
         self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
@@ -119,7 +122,7 @@ class Engine:
             assert ctx is not None
             self._painter = GlPainter(ctx)
         else:
-            self._painter = CpuPainter(ctx)
+            self._painter = CpuPainter(ctx, self.near)
         self._painter.upload(self._composer.gaussians)
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
@@ -167,6 +170,11 @@ class Engine:
         self._compose(_edits(view))
         return self._composer.gaussians
 
+    def forget(self) -> None:
+        """Draw the next picture as a whole, though only a part of the last one has changed."""
+        self._picture = None
+        self._painter.forget()
+
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
         self._painter.release()
@@ -188,7 +196,7 @@ class Engine:
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
         started = time.perf_counter()
         if self._painter.wants_order and self._ordered_for != wanted.viewmat:
-            self._order = back_to_front(self._composer.gaussians.means.numpy(), camera)
+            self._order = back_to_front(self._composer.gaussians.means.numpy(), camera, self.near)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
         share = self._painter.draw(camera, view.background, self._order)
@@ -209,7 +217,7 @@ class Engine:
         if edits == self._edits:
             return 0.0, 0.0, 0
         started = time.perf_counter()
-        layers = [Layer(self._gdf(index), strength, True, gains) for index, strength, gains in edits.layers]
+        layers = [layer_of(self._gdf(l[0]), *l[1:]) for l in edits.layers]
         change = self._composer.update(layers, edits.blend or "normalised")
         composed = time.perf_counter()
         self._edits, self._picture = edits, None
@@ -234,5 +242,5 @@ def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
 
 def _edits(view: ViewState) -> _Edits:
     """Layers that are not shown or at strength 0 do not count, so that touching them does no work."""
-    layers = tuple((l.gdf, l.strength, l.gains) for l in shown(view) if l.strength != 0.0)
+    layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in shown(view) if l.strength != 0.0)
     return _Edits(layers, view.blend) if layers else _Edits()

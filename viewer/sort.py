@@ -1,4 +1,11 @@
-"""Depth order on the CPU: exact, ties by index, fast enough for every frame (1 ms at 100k, 12 ms at 1M)."""
+"""Depth order on the CPU: exact, ties by index, fast enough for every frame (1 ms at 100k, 12 ms at 1M).
+
+No order is kept once a centre has moved, however little. Measured on the playbot with its 31k Gaussians at
+640×480, the order of before against the exact one when 2931 centres have moved by a share of the scene's
+radius in random directions: 1e-5 97 dB, 1e-4 65 dB with pixels off by 0.14, 1e-3 53 dB by 0.37, 1e-2 44 dB by
+0.57. A threshold that shows no error would spare next to no sorts, and a sort is 0.8 ms of the 65 and more
+that software OpenGL takes for this picture.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +16,14 @@ from progdf.camera import Camera
 
 NEAR = 0.01
 """Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
+
+
+def near_plane(radius: float) -> float:
+    """Least depth for a scene whose bulk has this radius, both in world units.
+
+    `NEAR`, as trainings draw, down to a radius of 1; smaller scenes would vanish before it.
+    """
+    return NEAR * min(1.0, radius)
 
 
 def back_to_front(means: NDArray[np.float32], camera: Camera, near: float = NEAR) -> NDArray[np.uint32]:
