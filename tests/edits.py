@@ -9,6 +9,7 @@ from torch import Tensor
 
 from progdf.checkpoint import Gdf, fingerprint
 from progdf.field import BakedField, fit_separable
+from progdf.field.rendered import Render
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.region import Region
 
@@ -50,6 +51,16 @@ def curved_field(
 def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
     """The field's offsets at these strengths. [T,M,C]"""
     return torch.stack([field.offsets(float(s)) for s in strengths])
+
+
+def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
+    """A stand-in for a renderer: shows colour well, geometry little, half of the members not at all."""
+    rng = torch.Generator().manual_seed(seed)
+    shown = torch.randn(90, members, channels, generator=rng) / (members * channels) ** 0.5
+    shown[:, ::2] = 0.0
+    for name, size in (("means", 0.02), ("log_scales", 0.02), ("quats", 0.0), ("sh0", 0.2)):
+        shown[:, :, attribute_slices(channels)[name]] *= size
+    return lambda offsets: (shown.flatten(1) @ offsets.flatten()).reshape(30, 3)
 
 
 def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "shirt") -> Gdf:

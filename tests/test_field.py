@@ -6,29 +6,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from edits import at_snapshots, curved_field, curved_trajectory
+from edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from progdf.field import AttributeBases, BakedField, FieldJudge, choose_field, fit_keyframes, fit_separable
 from progdf.field.choose import separable_within
-from progdf.field.rendered import Render, rendered_courses
+from progdf.field.rendered import rendered_courses
 from progdf.field.separable import channel_weights, stored_bases
 from progdf.gaussians import ATTRIBUTES, attribute_slices
 
 EVERYTHING = dict.fromkeys(ATTRIBUTES, 2)
 REST_TYPES = [torch.int8, torch.float16, torch.float32]
-
-
-def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
-    """A stand-in for a renderer: shows colour well, geometry little, half of the members not at all."""
-    rng = torch.Generator().manual_seed(seed)
-    shown = torch.randn(90, members, channels, generator=rng) / (members * channels) ** 0.5
-    shown[:, ::2] = 0.0
-    for name, size in (("means", 0.02), ("log_scales", 0.02), ("quats", 0.0), ("sh0", 0.2)):
-        shown[:, :, attribute_slices(channels)[name]] *= size
-    return lambda offsets: (shown.flatten(1) @ offsets.flatten()).reshape(30, 3)
 
 
 # ---- both kinds

@@ -144,6 +144,8 @@ def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
 def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: float, message: str) -> None:
     with pytest.raises(ProgdfError, match=message):
         settled(quick_options(folder, "budget", field=field, bytes_budget=budget))
+    with pytest.raises(ProgdfError, match="--refine means nothing to --field keyframes"):
+        settled(quick_options(folder, "budget", field="keyframes", refine=True))
 
 
 def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
@@ -151,7 +153,8 @@ def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
     assert not result.report["field"]["target_met"]
     assert "fits into 1 bytes" in result.report["choice"]["why"]
     least = result.report["field"]["bytes_per_gaussian"]
-    again = refit(FitOptions(result.folder.root, bytes_budget=least + 3, threads=1), quiet=True)
+    again = refit(FitOptions(result.folder.root, bytes_budget=least + 3, refine=True, threads=1), quiet=True)
+    assert "; refining it gains" in again.report["choice"]["why"]
     assert again.report["options"]["bytes_budget"] == least + 3
     assert again.report["field"]["target_met"]
     assert least < again.report["field"]["bytes_per_gaussian"] <= least + 3

@@ -75,7 +75,8 @@ def finished(
         else:
             network = None
             target, budget = options["target_psnr"], options.get("bytes_budget")
-            fitted = fit_field(trajectory, seen, judge, weights, choice, target, budget)
+            refine = options.get("refine", False)
+            fitted = fit_field(trajectory, seen, judge, weights, choice, target, budget, refine)
     field = fitted.chosen.field
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "

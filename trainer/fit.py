@@ -49,6 +49,7 @@ def fit_field(
     kind: Kind,
     target_psnr: float,
     budget: float | None = None,
+    refine: bool = False,
 ) -> Fitted:
     """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target, or the best one.
 
@@ -60,13 +61,23 @@ def fit_field(
         kind: "auto" tries separable and keyframe fields, the others only their kind
         target_psnr: dB; where none reaches it, the best is kept and `met` is false
         budget: bytes a member; the best field within it is kept, whatever the target is
+        refine: see `choose_field`
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
     errors = FieldJudge(trajectory.s, offsets, judge.counted)
     target = target_psnr if budget is None else math.inf
     choice = choose_field(
-        trajectory.s, offsets, seen.counted, weights, kind, target, budget, judge=errors, recorded=ticks
+        trajectory.s,
+        offsets,
+        seen.counted,
+        weights,
+        kind,
+        target,
+        budget,
+        judge=errors,
+        recorded=ticks,
+        refine=refine,
     )
     baselines = _baselines(trajectory, offsets, errors)
     return Fitted(choice.best, choice.met, choice.tried, baselines, choice.why)
@@ -118,7 +129,16 @@ def choice_figures(fitted: Fitted) -> dict[str, Any]:
 
 
 def visibility(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Tensor:
-    """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]"""
+    """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]
+
+    Members are weighted by it, numbers by nothing: bases are mixed from the snapshots by what pictures show,
+    and weighting each number by the gradient of pictures on top of that costs up to 3 dB (scarf at 72 bytes
+    46.8 dB instead of 48.9, hands at 65 bytes 52.8 instead of 56.2; a robot at 162 bytes 38.5 both ways).
+
+    Members that no picture shows stay in the region. To be dropped with no pixel changing by 1/510, there are
+    0 of 2931 on a robot, 1 of 7937 on a bear, 36 of 1164 on its scarf, 7 of 7365 on a rug: at most 3 % of the
+    bytes, for members that would keep their old colour where nobody looked.
+    """
     total = torch.zeros(len(members))
     for view in views:
         total += alpha_weights(scene, view.camera, torch.ones_like(view.mask))[members, 2].float()

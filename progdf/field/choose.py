@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -19,6 +19,7 @@ from progdf.field.baked import BakedField
 from progdf.field.judge import Candidate, FieldJudge, sample_strengths
 from progdf.field.keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
 from progdf.field.ranks import emphasised_modes, expected_worst, grown_ranks
+from progdf.field.refine import refined
 from progdf.field.rendered import Render, RenderedCourses, picture_gram, rendered_courses
 from progdf.field.separable import (
     channel_weights,
@@ -76,6 +77,7 @@ def choose_field(
     budget: float | None = None,
     judge: FieldJudge | None = None,
     recorded: Sequence[float] | None = None,
+    refine: bool = False,
 ) -> Choice:
     """The smallest field whose worst PSNR against the trajectory reaches the target, or the best in a budget.
 
@@ -89,6 +91,7 @@ def choose_field(
         budget: most bytes a member; None is as many as it takes
         judge: has the last word, best on views that `render` does not show; None judges on `render`
         recorded: strengths for the slider's ticks; `strengths` when None
+        refine: try what `refine.refined` makes of a separable choice, and keep it if that is better
 
     Returns:
         The choice; where nothing reaches the target within the budget, the best there is, with `met` false.
@@ -113,7 +116,17 @@ def choose_field(
         limit = min([budget or math.inf, *(c.field.bytes_per_member for c in tried if c.worst >= target)])
         gram = picture_gram(offsets, render)
         tried += _keyframes(strengths, offsets, gram, target, limit, judge, recorded, curves=kind != "auto")
-    return _chosen(tuple(tried), target, budget)
+    choice = _chosen(tuple(tried), target, budget)
+    if not refine or choice.best.field.kind != "separable":
+        return choice
+    label = f"{choice.best.label}, refined"
+    better = judge.candidate(refined(choice.best.field, offsets, render), label)
+    tried.append(better)
+    if better.worst <= choice.best.worst:
+        return replace(choice, tried=tuple(tried), why=f"{choice.why}; refining it gains nothing")
+    met = choice.met or (better.worst >= target and better.field.bytes_per_member <= (budget or math.inf))
+    gain = better.worst - choice.best.worst
+    return Choice(better, met, tuple(tried), f"{choice.why}; refining it gains {gain:.1f} dB")
 
 
 def _chosen(tried: tuple[Candidate, ...], target: float, budget: float | None) -> Choice:
