@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 from progdf.errors import ProgdfError
 
 from . import (
+    brush,
     compare_overlay,
     controls,
     dialogs,
     draft,
     inputs,
     overlay,
+    paint,
     panel,
     playback,
+    stack,
     timeline_bar,
     timeline_file,
     workspace,
@@ -35,6 +38,7 @@ from .engine import Engine, FrameTimings, drawn_size
 from .gl.screen import read_rgb
 from .inputs import NO_KEYS, Keys
 from .pace import Pace
+from .paint import Stroke
 from .pick import layer_at, seen_at, surface_point
 from .pictures import free_path, save_picture
 from .snapshot_cards import SnapshotCard
@@ -82,6 +86,7 @@ class Stage:
         self.timings = FrameTimings()  # of the picture on screen
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
         self._drag: str | None = None
+        self._stroke: Stroke | None = None  # of the brush, while `_drag` is brush.DRAG
         self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
@@ -201,8 +206,9 @@ class Stage:
         return max(round(area.width * density.x), 1), max(round(area.height * density.y), 1)
 
     def _handle_input(self, seconds: float) -> None:
-        for action in inputs.actions_pressed(self._keys) if self.work.dialog is None else ():
-            self._perform(action)
+        for action in inputs.actions_pressed(self._keys):
+            if self.work.dialog is None or action in ("picture", "window_picture"):
+                self._perform(action)
         if inputs.flying(self._keys):
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
@@ -247,6 +253,8 @@ class Stage:
         dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
         if self._drag == compare_overlay.DIVIDER:
             self.work = replace(self.work, view=compare_overlay.moved(self.work.view, self._area()))
+        elif self._drag == brush.DRAG:
+            self._paint()
         elif self._drag and (dx or dy):
             # also where the button went up within this frame: a slow frame must not lose the end of a drag
             camera = controls.drag(camera, self._drag, dx, dy, self._area().height / scale, radius)
@@ -260,6 +268,9 @@ class Stage:
                 if imgui.is_mouse_clicked(0):
                     self._drag = compare_overlay.DIVIDER
                     return camera
+            if self.work.view.brush.active and imgui.is_mouse_clicked(0):
+                self._begin_stroke()
+                return camera
             if imgui.is_mouse_double_clicked(0):
                 return self._pivot_picked(camera)
             self._drag = inputs.drag_begun(camera.mode) or self._drag
@@ -272,6 +283,28 @@ class Stage:
             return self._drag == compare_overlay.DIVIDER
         over = imgui.get_io().want_capture_mouse
         return not over and compare_overlay.near(self.work.view, self._area(), self.ui)
+
+    def _begin_stroke(self) -> None:
+        """The brush comes down on the focused layer, or says why it cannot."""
+        work = self.work
+        reason = brush.obstacle(work.view, work.focus)
+        if reason or work.focus is None:
+            self.tell(f"Nothing to paint: {reason}", error=True)
+            return
+        self._drag = brush.DRAG
+        layer, camera = work.view.layers[work.focus], to_camera(work.view.camera, *self._picture_size())
+        scene, through = self.engine.gaussians(work.view), work.view.brush.through
+        self._stroke = paint.begun(layer.paint, self.engine.gdfs[layer.gdf], scene, camera, through)
+        self._paint()
+
+    def _paint(self) -> None:
+        """The brush moves to the cursor; what it has painted so far is shown at once."""
+        density = imgui.get_io().display_framebuffer_scale.x * self.ui.scale
+        view, focus = self.work.view, self.work.focus
+        if self._stroke is not None and focus is not None:
+            self._stroke = paint.drawn_to(self._stroke, *self._cursor(), view.brush, density)
+            painted = paint.painted(self._stroke, view.brush.mode)
+            self.work = replace(self.work, view=stack.with_paint(view, focus, painted))
 
     def _dragged(self) -> bool:
         """Whether the left button moved between its press and its release, by more than a hand trembles."""
@@ -286,14 +319,21 @@ class Stage:
     def _focus_picked(self, camera: ViewCamera) -> None:
         """A click on the picture: the layer there, if there is one, is focused."""
         view = self._shown()
-        seen = seen_at(self.engine.gaussians(view), to_camera(camera, *self._picture_size()), *self._cursor())
+        seen = seen_at(
+            self.engine.gaussians(view),
+            to_camera(camera, *self._picture_size()),
+            *self._cursor(),
+            self.engine.near,
+        )
         layer = None if seen is None else layer_at(view, self.engine.gdfs, seen)
         if layer is not None:
             self._perform(f"focus:{layer + 1}")
 
     def _pivot_picked(self, camera: ViewCamera) -> ViewCamera:
         scene = self.engine.gaussians(self._shown())
-        point = surface_point(scene, to_camera(camera, *self._picture_size()), *self._cursor())
+        point = surface_point(
+            scene, to_camera(camera, *self._picture_size()), *self._cursor(), self.engine.near
+        )
         return camera if point is None else controls.pivot_on(camera, point, self.facts.bounds.radius)
 
     def _shown(self) -> ViewState:
@@ -348,6 +388,8 @@ class Stage:
     def _draw_overlays(self) -> None:
         self._ask()
         area, work = self._area(), self.work
+        if work.view.brush.active and not imgui.get_io().want_capture_mouse:
+            brush.ring(work.view, self.ui)
         if inputs.holds_original(self._keys):
             overlay.banner("Original", area, self.ui)
         else:

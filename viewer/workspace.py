@@ -172,10 +172,10 @@ def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
 
 
 def _framed(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
-    if workspace.focus is None:
-        return _home(workspace)
-    layer = workspace.view.layers[workspace.focus]
-    bounds = facts.rows[layer.gdf].bounds
+    """The focused layer, or all, as large as the picture allows; the direction stays."""
+    bounds = facts.bounds
+    if workspace.focus is not None:
+        bounds = facts.rows[workspace.view.layers[workspace.focus].gdf].bounds
     return with_camera(workspace, turntable.frame(workspace.view.camera, bounds, aspect))
 
 
