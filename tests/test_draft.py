@@ -20,34 +20,45 @@ PART = FrameTimings(draw_ms=5.0, share=0.1)
 MIDDLE = (170.0, 270.0)
 
 
+def twice(known: Draft, timings: FrameTimings, turned: bool) -> Draft:
+    return draft.drawn(draft.drawn(known, timings, turned), timings, turned)
+
+
 def test_a_slow_picture_is_coarse_while_the_camera_is_held() -> None:
-    known = draft.drawn(Draft(), SLOW, turned=True)
+    known = twice(Draft(), SLOW, turned=True)
     moving = draft.begun(known, "auto", held=True, turned=True, slid=False, now=1.0)
     assert moving.pixels == COARSE
     assert draft.patience(moving, 1.0) == pytest.approx(REST_S)
 
 
 def test_a_quick_picture_never_is() -> None:
-    known = draft.drawn(Draft(), QUICK, turned=True)
+    known = twice(Draft(), QUICK, turned=True)
     assert draft.begun(known, "auto", held=True, turned=True, slid=True, now=1.0).pixels == 1
 
 
+def test_one_slow_picture_among_quick_ones_changes_nothing() -> None:
+    """The first one of all waits for the kernels."""
+    known = draft.drawn(Draft(), SLOW, turned=True)
+    for then in (known, draft.drawn(draft.drawn(known, QUICK, turned=True), SLOW, turned=True)):
+        assert draft.begun(then, "auto", held=True, turned=True, slid=False, now=1.0).pixels == 1
+
+
 def test_a_slider_that_touches_little_stays_sharp_in_a_slow_scene() -> None:
-    known = draft.drawn(draft.drawn(Draft(), SLOW, turned=True), PART, turned=False)
+    known = twice(twice(Draft(), SLOW, turned=True), PART, turned=False)
     assert draft.begun(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels == 1
 
 
-def test_a_slider_whose_first_step_was_slow_goes_on_coarse() -> None:
+def test_a_slider_whose_first_steps_were_slow_goes_on_coarse() -> None:
     first = draft.begun(Draft(), "auto", held=True, turned=False, slid=True, now=1.0)
     assert first.pixels == 1, "nothing is known of it yet"
-    second = draft.drawn(first, SLOW, turned=False)
+    second = twice(first, SLOW, turned=False)
     assert draft.begun(second, "auto", held=True, turned=False, slid=True, now=1.1).pixels == COARSE
     let_go = draft.begun(second, "auto", held=False, turned=False, slid=False, now=1.1)
     assert draft.begun(let_go, "auto", held=True, turned=False, slid=True, now=1.2).pixels == 1
 
 
 def test_one_click_is_drawn_sharp_at_once() -> None:
-    known = draft.drawn(Draft(), SLOW, turned=True)
+    known = twice(Draft(), SLOW, turned=True)
     assert draft.begun(known, "on", held=False, turned=True, slid=True, now=1.0).pixels == 1
 
 
@@ -61,12 +72,12 @@ def test_it_stays_coarse_between_two_steps_of_a_hand_and_is_sharp_at_rest() -> N
 
 
 def test_what_a_coarse_picture_took_is_not_remembered() -> None:
-    moving = draft.begun(Draft(camera_ms=90.0), "auto", held=True, turned=True, slid=False, now=1.0)
-    assert draft.drawn(moving, QUICK, turned=True).camera_ms == 90.0
+    moving = draft.begun(Draft(camera_ms=(90.0, 90.0)), "auto", held=True, turned=True, slid=False, now=1.0)
+    assert draft.drawn(moving, QUICK, turned=True).camera_ms == (90.0, 90.0)
 
 
 def test_off_is_off() -> None:
-    moving = Draft(pixels=COARSE, rest_at=2.0, camera_ms=500.0)
+    moving = Draft(pixels=COARSE, rest_at=2.0, camera_ms=(500.0, 500.0))
     assert draft.begun(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
 
 

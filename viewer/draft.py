@@ -29,14 +29,14 @@ class Draft:
     Args:
         pixels: of the window that one pixel drawn covers, each way: 1 or `COARSE`
         rest_at: when to draw in full, seconds on the stage's clock; None while the picture is in full
-        camera_ms: what the last whole picture in full took
-        slider_ms: what the last step of a slider in full took, within this grip; 0 before there was one
+        camera_ms: what the last two whole pictures in full took; one alone may have waited for something
+        slider_ms: the same of the last two steps of a slider, within this grip
     """
 
     pixels: int = 1
     rest_at: float | None = None
-    camera_ms: float = 0.0
-    slider_ms: float = 0.0
+    camera_ms: tuple[float, ...] = ()
+    slider_ms: tuple[float, ...] = ()
 
 
 def begun(draft: Draft, mode: str, held: bool, turned: bool, slid: bool, now: float) -> Draft:
@@ -49,13 +49,12 @@ def begun(draft: Draft, mode: str, held: bool, turned: bool, slid: bool, now: fl
         slid: whether what is drawn is another
         now: seconds on the stage's clock
     """
-    draft = draft if held else replace(draft, slider_ms=0.0)
+    draft = draft if held else replace(draft, slider_ms=())
     full = replace(draft, pixels=1, rest_at=None)
     if mode == "off":
         return full
     if turned or slid:
-        expected = draft.camera_ms if turned else draft.slider_ms
-        pays = mode == "on" or draft.pixels > 1 or expected > SLOW_MS
+        pays = mode == "on" or draft.pixels > 1 or _slow(draft.camera_ms if turned else draft.slider_ms)
         return replace(draft, pixels=COARSE, rest_at=now + REST_S) if held and pays else full
     return full if draft.rest_at is None or now >= draft.rest_at else draft
 
@@ -65,8 +64,12 @@ def drawn(draft: Draft, timings: FrameTimings, turned: bool) -> Draft:
     if draft.pixels > 1:
         return draft
     if timings.share == 1.0:
-        draft = replace(draft, camera_ms=timings.total_ms)
-    return draft if turned else replace(draft, slider_ms=timings.total_ms)
+        draft = replace(draft, camera_ms=(*draft.camera_ms[-1:], timings.total_ms))
+    return draft if turned else replace(draft, slider_ms=(*draft.slider_ms[-1:], timings.total_ms))
+
+
+def _slow(pictures_ms: tuple[float, ...]) -> bool:
+    return len(pictures_ms) == 2 and min(pictures_ms) > SLOW_MS
 
 
 def switched(view: ViewState) -> ViewState:
