@@ -83,7 +83,8 @@ def _edit_lines(path: Path) -> Iterator[str]:
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
-        for name, value in _flat(content):
+        given = {name: value for name, value in content.items() if head == "report" or value is not None}
+        for name, value in _flat(given):
             yield f"{head}: {name} {value}"
 
 

@@ -20,6 +20,7 @@ from torch.nn.functional import interpolate, normalize, pad
 
 from progdf.errors import ProgdfError
 from trainer.options import CLIP_MODEL
+from trainer.weights import BROKEN
 
 EXTRA = "pip install progdf-studio[clip]"
 
@@ -77,14 +78,14 @@ def load_clip(model: str = CLIP_MODEL) -> Clip:
     speaks.disable_progress_bar()
     try:
         config = AutoConfig.from_pretrained(model, local_files_only=True)
-    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+    except BROKEN as error:
         raise ProgdfError(_missing(model)) from error
     if config.model_type != "clip":
         raise ProgdfError(f"{model} is a {config.model_type} model, no CLIP; give --clip-model {CLIP_MODEL}")
     try:
         network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
         tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
-    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+    except BROKEN as error:
         raise ProgdfError(_missing(model)) from error
     return Clip(network.float().eval(), tokenizer, int(config.vision_config.image_size), _name(model))
 

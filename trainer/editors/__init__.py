@@ -30,7 +30,7 @@ EDITORS: dict[str, Factory] = {
 """Kind of editor → its factory, given what stands behind the colon, the scene, the region, the views
 and the settings of learned editors."""
 
-VIEW_BY_VIEW = ("folder", "style", "instruct")
+VIEW_BY_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
 
 EXAMPLES = (
@@ -40,6 +40,7 @@ EXAMPLES = (
     "darken:0.7",
     "night",
     "folder:DIR",
+    "photographs:DIR",
     "style:14",
 )
 

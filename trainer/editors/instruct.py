@@ -32,6 +32,7 @@ from trainer.editors.adapters import ADAPTERS, DEFAULT_MODEL, Adapter
 from trainer.editors.base import EditKind, EditorSettings
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.views import View
+from trainer.weights import BROKEN
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
 
@@ -138,7 +139,7 @@ def pipeline_class(model: str) -> str:
         ) from error
     try:
         kind = DiffusionPipeline.load_config(model, local_files_only=True)["_class_name"]
-    except (OSError, ValueError, KeyError) as error:
+    except BROKEN as error:
         raise _missing(model) from error
     if kind not in ADAPTERS:
         raise ProgdfError(f"{model} is a {kind}, which edits no pictures here; use one of {_models()}")
@@ -171,7 +172,7 @@ def load_pipeline(model: str, kind: str) -> Any:
             use_safetensors=True,  # the other kind of weights can run code
             **adapter.loading,
         )
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
+    except BROKEN as error:
         raise _missing(model) from error
     pipeline.set_progress_bar_config(disable=True)
     return pipeline.to("cuda" if gpu else "cpu")

@@ -11,16 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.pictures import to_picture
 from trainer.options import DETECTOR, OUTLINER
 from trainer.segmenters.base import SegmenterSettings
-
-_BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
-"""What transformers raises for a model that is not there, not whole, or another's."""
+from trainer.weights import BROKEN
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
             )
         except ProgdfError:
             raise
-        except _BROKEN as error:
+        except BROKEN as error:
             raise ProgdfError(_missing(model, option)) from error
 
     finder = loaded(
