@@ -208,7 +208,7 @@ def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> No
     toggle(hand, "fold", 1)
     before = hand.stage.engine.gaussians(hand.stage.work.view).sh0.clone()
     y = 249.0 + CARD_PX  # the first gain
-    hand.drag((POINTS[0] - 30, y), (LEFT + 90, y))
+    hand.drag((POINTS[0] - 76, y), (LEFT + 90, y))
     assert layers(hand)[1].gains == Gains(geometry=0.0)
     assert len(hand.stage.work.past.past) == 1
     after = hand.stage.engine.gaussians(hand.stage.work.view)

@@ -1,4 +1,4 @@
-"""The brush in the window: its ring at the cursor, its controls in the panel, its strokes on the picture."""
+"""The brush in the window: its controls in the panel, its ring at the cursor, what keeps it from painting."""
 
 from __future__ import annotations
 
@@ -7,18 +7,15 @@ from dataclasses import replace
 from imgui_bundle import imgui
 
 from . import paint, stack
-from .engine import Engine
-from .paint import Stroke
 from .state import ViewState
-from .turntable import to_camera
 from .ui_context import PALETTE, Icon, UiContext, u32
-from .widgets import choice, icon_button, label, tip
+from .widgets import choice, icon_button, label, tip, value_slider
+from .widgets import section as heading
 
 DRAG = "brush"
 """What a left drag does while the brush is active, beside those of `controls.DRAGS`."""
 
 NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
-_ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
 
 
 def obstacle(view: ViewState, focus: int | None) -> str:
@@ -33,32 +30,23 @@ def obstacle(view: ViewState, focus: int | None) -> str:
     return ""
 
 
-def begin(view: ViewState, focus: int, engine: Engine, size: tuple[int, int]) -> Stroke:
-    """A stroke on the focused layer, in a picture of this size (width, height in pixels)."""
-    layer, scene = view.layers[focus], engine.gaussians(view)
-    return paint.begun(
-        layer.paint, engine.gdfs[layer.gdf], scene, to_camera(view.camera, *size), view.brush.through
-    )
-
-
 def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewState, str]:
     """The brush's controls; the changed state and an action of `controls.KEYS` asked for, or ""."""
     column, brush, action = 82.0 * ui.scale, view.brush, ""
+    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
+    heading("Paint", ui)
     label("Brush", column)
     mode = choice("brush mode", tuple(NAMES[m] for m in paint.MODES), paint.MODES.index(brush.mode), ui)
     tip("X")
     if mode is not None:
         brush = replace(brush, mode=paint.MODES[mode])
-    for name, value, least, most, form, keys in (
-        ("radius", brush.radius, paint.SMALLEST_PX, paint.LARGEST_PX, "%.0f px", "[ ]"),
-        ("softness", brush.softness, 0.0, 1.0, "%.2f", "Shift+[ ]"),
-    ):
-        label(name.capitalize(), column)
-        imgui.set_next_item_width(-1.0)
-        logarithmic = imgui.SliderFlags_.logarithmic.value if name == "radius" else 0
-        changed, new = imgui.slider_float(f"##{name}", value, least, most, form, _ALWAYS_CLAMP | logarithmic)
-        tip(keys)
-        brush = replace(brush, **{name: round(new, 2)}) if changed else brush
+    label("Radius", column)
+    radius = value_slider("##radius", brush.radius, (paint.SMALLEST_PX, paint.LARGEST_PX), "%.0f px", ui)
+    tip("[ ]")
+    label("Softness", column)
+    softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", ui)
+    tip("Shift+[ ]")
+    brush = replace(brush, radius=radius, softness=softness)
     label("Acts on", column)
     depth = choice("depth", ("Front", "Through"), int(brush.through), ui)
     tip("The front surface only, or all that lies under the brush (Shift+B)")

@@ -11,11 +11,10 @@ from .change_curve import STEPS
 from .layer_rows import LayerRow
 from .state import LayerState
 from .ui_context import PALETTE, SMALL_PX, UiContext, u32
-from .widgets import label, tip
+from .widgets import label, tip, value_slider
 
 CURVE_PX = 52.0  # at 1×
 GAINS = stack.DIALS[1:]
-_ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
 
 
 def draw(layer: LayerState, row: LayerRow, dial: str | None, most: float, ui: UiContext) -> LayerState:
@@ -43,19 +42,17 @@ def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContex
     label(kind.capitalize(), 84.0 * ui.scale)
     if dialled:
         imgui.pop_style_color()
-    imgui.set_next_item_width(-1.0)
     imgui.begin_disabled(not moves)
     value = stack.dial_value(layer, kind)
-    changed, new = imgui.slider_float(f"##{kind}", value, 0.0, 1.0, "%.2f", _ALWAYS_CLAMP)
+    new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", ui)
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
-        changed, new = True, 1.0
+        new = 1.0
     imgui.end_disabled()
     if moves:
         tip(f"How much of the change of {kind} comes through; right click: all of it (Tab, then arrows)")
     else:
         tip(f"This edit does not change the {kind}")
-    # unchanged, imgui still rounds to float32; changed, what it shows is what it means
-    return stack.dialled(layer, kind, round(new, 2)) if changed else layer
+    return layer if new == value else stack.dialled(layer, kind, new)
 
 
 def value_at(curve: Sequence[float], strength: float) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from . import compare, layer_cards, snapshot_cards, turntable
+from . import brush, compare, layer_cards, snapshot_cards, turntable
 from .layer_rows import LayerRow
 from .snapshot_cards import SnapshotCard
 from .state import Vec3, ViewState
@@ -93,10 +93,13 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     state = layer_cards.heading(state, ui)
     cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
     state, focus, renaming = layer_cards.draw(state, cards, ui)
+    if state.brush.active:
+        state, asked = brush.section(state, focus, ui)
+        actions += [asked] if asked else []
     state = _view(state, ui, actions)
     snapshot_cards.draw(shown.snapshots, ui, actions)
     _end_body()
-    _footer(shown, ui, actions)
+    _footer(state, shown, ui, actions)
     imgui.end()
     return PanelResult(state, focus, tuple(actions), renaming)
 
@@ -191,7 +194,7 @@ _ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
 _LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
 
 
-def _footer(shown: PanelInput, ui: UiContext, actions: list[str]) -> None:
+def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
     right = right_edge()
     for action, icon, help_, usable in (
@@ -204,6 +207,8 @@ def _footer(shown: PanelInput, ui: UiContext, actions: list[str]) -> None:
         imgui.end_disabled()
         tip(help_)
         imgui.same_line()
+    if state.layers and brush.toggle(state, ui):
+        actions.append("brush")
     side = imgui.get_frame_height()
     imgui.same_line(right - 2 * side - 6.0 * ui.scale)
     if icon_button("picture", Icon.PICTURE, ui):

@@ -74,6 +74,28 @@ def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -
     return pressed
 
 
+def value_slider(name: str, value: float, ends: tuple[float, float], form: str, ui: UiContext) -> float:
+    """A slider to the end of the line, its number beside it where no handle hides it; Ctrl+click types.
+
+    A range over orders of magnitude is logarithmic. The value is as before, or what the number shows.
+    """
+    room = 44.0 * ui.scale
+    imgui.set_next_item_width(imgui.get_content_region_avail().x - room)
+    flags = imgui.SliderFlags_.always_clamp.value
+    if ends[0] > 0.0:
+        flags |= imgui.SliderFlags_.logarithmic.value
+    alpha = 1.0 if imgui.get_io().want_text_input else 0.0
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.text[:3], alpha))
+    changed, new = imgui.slider_float(name, value, *ends, form, flags)
+    imgui.pop_style_color()
+    low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
+    number = form % (new if changed else value)
+    wide = imgui.calc_text_size(number).x
+    at = imgui.ImVec2(round(high.x + room - wide), round(low.y + imgui.get_style().frame_padding.y))
+    imgui.get_window_draw_list().add_text(at, imgui.get_color_u32(imgui.Col_.text), number)
+    return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
+
+
 def choice(name: str, options: Sequence[str], current: int | None, ui: UiContext) -> int | None:
     """A row of joined buttons; the index that was pressed, or None."""
     gap = 2.0 * ui.scale
