@@ -62,6 +62,29 @@ def session(hand: Rig) -> None:
     hand.settle()
 
 
+def timeline(hand: Rig) -> None:
+    """A film of three keys: the edits come while the camera goes around; the playhead on the way."""
+    start = hand.stage.work.view
+    bare = tuple(replace(layer, strength=0.0) for layer in start.layers)
+    camera = replace(start.camera, distance=0.62 * start.camera.distance)
+    hand.stage.change(replace(start, layers=bare, camera=camera))
+    hand.key("K")
+    for frames, turn, first in ((32, 40.0, 1.0), (30, 30.0, 0.0)):
+        for _ in range(frames):
+            hand.key(".")
+        view = hand.stage.work.view
+        layers = tuple(
+            replace(layer, strength=first if i == 0 else 1.0 - 0.5 * first)
+            for i, layer in enumerate(view.layers)
+        )
+        turned = replace(view.camera, azimuth=view.camera.azimuth + turn)
+        hand.stage.change(replace(view, layers=layers, camera=turned))
+        hand.key("K")
+    for _ in range(38):
+        hand.key(",")
+    hand.frame(3)
+
+
 def _whole(hand: Rig) -> None:
     """All edits at full strength."""
     view = hand.stage.work.view
@@ -81,6 +104,7 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
     "compare": compare,
     "difference": difference,
     "session": session,
+    "timeline": timeline,
 }
 """What a hand does before the picture is taken."""
 

@@ -1,4 +1,4 @@
-"""The camera never breaks, in pictures: any size of scene, up axis and window, poles, the inside of things."""
+"""The camera never breaks, in pictures: any size, up axis and window, poles, the inside of things."""
 
 from __future__ import annotations
 
