@@ -16,7 +16,7 @@ from viewer import panel
 from viewer.engine import FrameTimings
 from viewer.headless import headless_context, is_software
 from viewer.inputs import Keys
-from viewer.state import LayerState, ViewState
+from viewer.state import Brush, LayerState, ViewState
 from viewer.workspace import Dialog
 
 Compare = Callable[[str, np.ndarray], None]
@@ -117,10 +117,10 @@ def test_a_value_being_typed(screenshot: Compare) -> None:
 def test_the_timings_of_a_picture(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("F10")
-        hand.stage.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500)
+        hand.stage.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500, share=0.03)
         hand.stage.latencies_ms.extend([20.0, 21.0, 34.0])
         hand.frame()
-        screenshot("ui_timings", hand.image()[:180, :240])
+        screenshot("ui_timings", hand.image()[:210, :240])
 
 
 def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Compare) -> None:
@@ -157,3 +157,11 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
         hand.stage.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())
+
+
+def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:
+    view = replace(first_view(bear(), 1.0, 0.5), brush=Brush(active=True, radius=25.0))
+    with rig(view, SMALLEST) as hand:
+        hand.drag((350.0, 235.0), (375.0, 275.0))
+        hand.frame(3)
+        screenshot("ui_paint", hand.image())
