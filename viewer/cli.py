@@ -38,6 +38,7 @@ from .turntable import first_camera, to_camera
 Blend = Literal["normalised", "sum", "over"]
 Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
 Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
+Paint = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FILE.npy"), tyro.conf.UseAppendAction]
 Solo = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction]
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.ply")]
 Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
@@ -63,6 +64,8 @@ class ViewOptions:
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
     solo: Solo = ()
     """Show this edit alone. Repeat it for several edits."""
+    paint: Paint = ()
+    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: bool = False
     """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend = "normalised"
@@ -95,6 +98,8 @@ class RenderOptions:
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
     solo: Solo = ()
     """Show this edit alone. Repeat it for several edits."""
+    paint: Paint = ()
+    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: bool = False
     """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend = "normalised"
@@ -129,6 +134,8 @@ class ExportOptions:
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
     solo: Solo = ()
     """Show this edit alone. Repeat it for several edits."""
+    paint: Paint = ()
+    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: bool = False
     """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend = "normalised"
@@ -247,7 +254,7 @@ def _compare(engine: Engine, view: ViewState, camera: Camera, path: Path) -> flo
 def _layers(
     options: ViewOptions | RenderOptions | ExportOptions, gdfs: Sequence[Gdf]
 ) -> tuple[LayerState, ...]:
-    return stack_of(gdfs, options.set, options.gain, options.solo, options.overshoot)
+    return stack_of(gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint)
 
 
 def _swept(options: RenderOptions, gdfs: Sequence[Gdf]) -> list[str]:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from progdf.checkpoint import Gdf
 from progdf.errors import ProgdfError
 
 from . import stack
 from .arguments import known_edit, layers_of
+from .paint import encoded
 from .state import LayerState
 
 
@@ -20,6 +25,7 @@ def stack_of(
     gains: Sequence[str] = (),
     solo: Sequence[str] = (),
     overshoot: bool = False,
+    paint: Sequence[str] = (),
 ) -> tuple[LayerState, ...]:
     """One layer per edit.
 
@@ -29,6 +35,7 @@ def stack_of(
         gains: `NAME:KIND=G`, with geometry, opacity or colour for KIND
         solo: names of the edits that alone are shown
         overshoot: whether strengths go to `stack.OVERSHOOT`
+        paint: `NAME=WEIGHTS.npy`, a weight 0..1 per member, or per Gaussian of the scene
 
     Raises:
         ProgdfError: there is no such edit or kind, or a number is outside its range.
@@ -40,7 +47,36 @@ def stack_of(
     for name in solo:
         known_edit(name, gdfs, "--solo")
         layers[name] = replace(layers[name], solo=True)
+    for text in paint:
+        name, equals, file = text.partition("=")
+        if not equals or not file:
+            raise ProgdfError(f"--paint {text} has no NAME=FILE; write NAME=WEIGHTS.npy")
+        known_edit(name, gdfs, "--paint")
+        gdf = next(gdf for gdf in gdfs if gdf.name == name)
+        layers[name] = replace(layers[name], paint=encoded(_weights(Path(file), gdf)))
     return tuple(layers.values())
+
+
+def _weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
+    """Weights of the members, from a file that has them or those of the whole scene. [M]"""
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (OSError, ValueError):
+        raise ProgdfError(
+            f"--paint: {path} is no .npy file of numbers; save weights with numpy.save"
+        ) from None
+    members, count = gdf.region.members.numpy(), gdf.scene.count
+    if not isinstance(found, np.ndarray) or found.shape not in ((len(members),), (count,)):
+        shape = list(getattr(found, "shape", ()))
+        raise ProgdfError(
+            f"--paint: {path} has the shape {shape}; [{len(members)}] or [{count}] would be right"
+        )
+    if found.dtype.kind not in "fiub" or not ((found >= 0) & (found <= 1)).all():
+        raise ProgdfError(f"--paint: {path} has a number outside 0 to 1")
+    weights: NDArray[np.float32] = (found if len(found) == len(members) else found[members]).astype(
+        np.float32
+    )
+    return weights
 
 
 def _gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
