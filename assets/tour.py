@@ -64,10 +64,10 @@ def session(hand: Rig) -> None:
 
 def timeline(hand: Rig) -> None:
     """A film of three keys: the edits come while the camera goes around; the playhead on the way."""
+    _wheel_in(hand)
     start = hand.stage.work.view
     bare = tuple(replace(layer, strength=0.0) for layer in start.layers)
-    camera = replace(start.camera, distance=0.62 * start.camera.distance)
-    hand.stage.change(replace(start, layers=bare, camera=camera))
+    hand.stage.change(replace(start, layers=bare))
     hand.key("K")
     for frames, turn, first in ((32, 40.0, 1.0), (30, 30.0, 0.0)):
         for _ in range(frames):
@@ -99,12 +99,24 @@ def _wheel_in(hand: Rig) -> None:
     hand.wheel(490.0, 400.0, -6.5)
 
 
+def timings(hand: Rig) -> None:
+    """A slider in the hand: only its part of the picture is drawn, and the figures say so."""
+    _wheel_in(hand)
+    hand.key("F10")
+    first = hand.strengths[0]
+    hand.move(*hand.slider(0, first))
+    hand.press()
+    for step in range(1, 25):
+        hand.move(*hand.slider(0, first - 0.01 * step))
+
+
 SHOTS: dict[str, Callable[[Rig], None]] = {
     "layers": layers,
     "compare": compare,
     "difference": difference,
     "session": session,
     "timeline": timeline,
+    "timings": timings,
 }
 """What a hand does before the picture is taken."""
 

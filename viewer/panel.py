@@ -210,7 +210,11 @@ def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[st
     if state.layers and brush.toggle(state, ui):
         actions.append("brush")
     side = imgui.get_frame_height()
-    imgui.same_line(right - 2 * side - 6.0 * ui.scale)
+    imgui.same_line(right - 3 * side - 12.0 * ui.scale)
+    if icon_button("timeline", Icon.FILM, ui):
+        actions.append("timeline")
+    tip("The timeline: keys of camera and strengths, played and filmed (T)")
+    imgui.same_line(0.0, 6.0 * ui.scale)
     if icon_button("picture", Icon.PICTURE, ui):
         actions.append("picture")
     tip("Save the picture as PNG (F2)")

@@ -54,6 +54,7 @@ class Icon:
     REDO = icons.ICON_FA_ROTATE_RIGHT
     PICTURE = icons.ICON_FA_CAMERA
     HELP = icons.ICON_FA_QUESTION
+    FILM = icons.ICON_FA_FILM
     HOME = icons.ICON_FA_HOUSE
     FRAME = icons.ICON_FA_EXPAND
     LOCKED = icons.ICON_FA_LOCK
