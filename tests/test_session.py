@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from ui_rig import bear, first_view
+from ui_rig import bear, first_view, rig
 
 from progdf.__main__ import main
 from progdf.camera_files import save_cameras
@@ -21,7 +23,7 @@ from progdf.layers import Gains
 from progdf.ply import save_ply
 from progdf.session_file import read_session, sha256
 from viewer import app as application
-from viewer import desk, document, plain, recent, session, snapshots, workspace
+from viewer import desk, document, paint, plain, recent, session, snapshots, workspace
 from viewer.inputs import Keys, Press
 from viewer.session import Session
 from viewer.state import Comparison, Keyframe, Timeline, ViewState
@@ -31,8 +33,10 @@ from viewer.turntable import eye, from_camera, to_camera
 def full_view() -> ViewState:
     """A view in which nothing is as it is by default."""
     view = first_view(bear(), 0.25, 0.75)
+    ears = bear().gdfs[1].region
+    painted = paint.encoded(np.linspace(0, 1, len(ears)))
     layers = (
-        replace(view.layers[1], name="ears → gold", gains=Gains(0.5, 0.25, 0.125), solo=True),
+        replace(view.layers[1], name="ears → gold", gains=Gains(0.5, 0.25, 0.125), solo=True, paint=painted),
         replace(view.layers[0], enabled=False),
     )
     camera = replace(view.camera, azimuth=33.5, mode="fly")
@@ -114,6 +118,9 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("view", "layers", 0, "strength"), "1", "strength"),
     (("view", "layers", 0, "enabled"), 1, "enabled"),
     (("view", "layers", 0, "gains", "colour"), -1.0, "gains"),
+    (("view", "layers", 0, "paint"), "AAAA", "paint"),
+    (("view", "brush", "mode"), "spray", "spray"),
+    (("view", "brush", "radius"), 0.0, "radius"),
     (("view", "blend"), "multiply", "multiply"),
     (("view", "compare", "mode"), "blink", "blink"),
     (("view", "compare", "amplify"), 1e9, "amplify"),
@@ -454,14 +461,25 @@ def test_saving_never_writes_over_another_kind_of_file(window: application.App, 
 
 
 @pytest.mark.gl
-def test_a_click_on_a_small_picture_goes_back_to_its_snapshot(window: application.App) -> None:
-    press(window, "F3", "Shift+Left", "Shift+Left", "F3")
-    assert len(window.stage.work.snapshots) == 2
-    assert window.stage.patience() is not None or window.stage.thumbnails.bring((), window.stage.work.view)
-    press(window, "Escape")
-    window.stage._perform("restore:1")
-    window.draw()
-    assert window.stage.work.view.layers[0].strength == 0.5
+def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_a_right_click_forgets_it() -> None:
+    with rig(first_view(bear(), 0.5, 0.5), (1024, 640)) as hand:
+        first = hand.picture()
+        for chord in ("F3", "Shift+Left", "Shift+Left", "F3"):
+            hand.key(chord)
+        hand.wheel(900.0, 400.0, -100.0)
+        hand.frame(5)
+        assert hand.stage.patience() is None, "the small pictures are there"
+        entries, drawn = len(hand.stage.work.past.past), hand.image()[515:565, 745:1005]
+        assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
+        hand.move(874.0, 540.0)
+        hand.press()
+        hand.release()
+        assert hand.strengths == [0.5, 0.5]
+        assert np.array_equal(hand.picture(), first)
+        assert len(hand.stage.work.past.past) == entries + 1
+        hand.press(1)
+        hand.release(1)
+        assert [kept.name for kept in hand.stage.work.snapshots] == ["2"]
 
 
 def test_a_pinhole_camera_becomes_the_windows_camera() -> None:
@@ -470,3 +488,9 @@ def test_a_pinhole_camera_becomes_the_windows_camera() -> None:
     again = from_camera(view, seen, application.Document("b", bear().scene).facts().bounds)
     assert eye(again) == pytest.approx(eye(view), abs=1e-4)
     assert again.fov_y == pytest.approx(view.fov_y, abs=1e-3)
+
+
+def test_what_draws_without_a_window_needs_no_interface_library() -> None:
+    code = "import sys, viewer.cli; print([m for m in sys.modules if 'imgui' in m or m == 'glfw'])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"

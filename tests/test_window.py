@@ -21,6 +21,7 @@ from progdf.checkpoint import save_gdf
 from progdf.ply import save_ply
 from viewer import app as application
 from viewer import controls, panel
+from viewer.session import open_session
 
 PATIENCE_S = 60.0
 WIDTH, HEIGHT = application.SIZE
@@ -45,7 +46,7 @@ class Desktop:
     def until(self, what: str, happened: Callable[[], object]) -> None:
         end = time.monotonic() + PATIENCE_S
         while not happened():
-            assert self.process.poll() is None, f"the window closed: {self.process.communicate()}"
+            assert not self.process.poll(), f"the window closed: {self.process.communicate()}"
             assert time.monotonic() < end, f"waited in vain for {what}"
             time.sleep(0.05)
 
@@ -274,3 +275,23 @@ def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
         assert name in message.text
         assert "\n" not in message.text
         assert opened.stage.work.view == before
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_closing_the_real_window_with_unsaved_changes_asks_and_saves(desktop: Desktop) -> None:
+    first = desktop.shot()
+    desktop.xdotool("key", "shift+Left")
+    desktop.xdotool("key", "ctrl+q")
+    # the picture is dimmed behind a question
+    desktop.until("the question", lambda: changed(first, desktop.shot()) > 100_000)
+    desktop.xdotool("key", "Escape")
+    desktop.until("the picture", lambda: changed(first, desktop.shot()) < 100_000)
+    desktop.xdotool("key", "ctrl+q")
+    desktop.until("the question", lambda: changed(first, desktop.shot()) > 100_000)
+    desktop.xdotool("key", "s")
+    desktop.until("the field", lambda: not desktop.xdotool("key", "Return") and desktop.process.poll() == 0)
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+    assert desktop.process.communicate() == ("", "")
+    saved = open_session(desktop.folder / "bear.session.json")
+    assert saved.view.layers[0].strength == pytest.approx(0.4)

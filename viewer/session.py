@@ -12,7 +12,7 @@ from progdf.errors import ProgdfError
 from progdf.layers import BLENDS
 from progdf.session_file import SUFFIX, SessionFile, read_session, reference, verified, write_session
 
-from . import document, draft, plain, timeline_file
+from . import document, draft, paint, plain, timeline_file
 from .compare import MODES, MOST_AMPLIFIED
 from .document import Document
 from .history import Edit
@@ -65,7 +65,10 @@ def open_session(path: Path) -> Session:
     file = read_session(path)
     view, snapshots = _states(path.name, file)
     scene, gdfs = verified(path, file)
-    return Session(document.load(scene, gdfs), view, snapshots)
+    opened = document.load(scene, gdfs)
+    for layer in (*view.layers, *(layer for kept in snapshots for layer in kept.edit.layers)):
+        paint.decoded(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
+    return Session(opened, view, snapshots)
 
 
 def default_path(opened: Document) -> Path:
@@ -96,6 +99,9 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ..
         _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)
         _among("view.compare.mode", view.compare.mode, MODES)
         _among("view.draft", view.draft, draft.MODES)
+        _among("view.brush.mode", view.brush.mode, paint.MODES)
+        _check("view.brush.radius", [view.brush.radius], paint.SMALLEST_PX, paint.LARGEST_PX)
+        _check("view.brush.softness", [view.brush.softness], 0.0, 1.0)
         timeline_file.check(view.timeline, "view.timeline.keys")
         for i, snapshot in enumerate(snapshots):
             _check_camera(f"snapshots[{i}].camera", snapshot.camera)
