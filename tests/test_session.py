@@ -241,6 +241,7 @@ def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original(
     entries = len(work.past.past)
     back = act(work, "restore:1")
     assert [layer.strength for layer in back.view.layers] == [0.5, 0.5]
+    assert back.view.blend == work.view.blend
     assert len(back.past.past) == entries + 1
     assert act(back, "undo").view == work.view
     assert [layer.strength for layer in act(work, "restore:0").view.layers] == [0.0, 0.0]
