@@ -165,6 +165,7 @@ def key_help() -> tuple[tuple[str, str], ...]:
         "Ctrl+Right": "Ctrl+← →",
         "Escape": "Esc",
         "Alt+Down": "Alt+↑ ↓",
+        "]": "[ ]",
         ".": ", .",
         "Shift+.": "Shift+, .",
     }
