@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,9 @@ from progdf.files import open_failure
 from progdf.load_report import counted, file_size, grouped
 from progdf.ply import load_ply_with_report
 from progdf.survey import survey
+
+TIMELINE_MARK = "progdf_timeline"
+"""The first key of every timeline file of the window, by which its kind is told."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """ "ply", "gdf", "session" or "cameras", by content; by name where the content says nothing.
+    """ "ply", "gdf", "session", "timeline" or "cameras", by content; by name where the content says nothing.
 
     Raises:
         ProgdfError: it cannot be read, or is nothing we know.
@@ -57,6 +61,8 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "gdf"
     if start.lstrip()[:1] == b"{" and f'"{session_file.MARK}"'.encode() in start:
         return "session"
+    if start.lstrip()[:1] == b"{" and f'"{TIMELINE_MARK}"'.encode() in start:
+        return "timeline"
     if start.lstrip()[:1] in (b"{", b"["):
         return "cameras"
     suffix = Path(path).suffix.lower().lstrip(".")
@@ -104,6 +110,16 @@ def _session_lines(path: Path) -> Iterator[str]:
     yield f"snapshots: {len(session.snapshots)}"
 
 
+def _timeline_lines(path: Path) -> Iterator[str]:
+    try:
+        timeline = json.loads(path.read_bytes())
+        keys = [key["frame"] for key in timeline.get("keys", [])]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ProgdfError(f"{path} is a damaged timeline; save it anew with Ctrl+K in the window") from None
+    yield f"{path.name}: a timeline of the window, {counted(len(keys), 'key')}"
+    yield f"keys at frames: {_shown(keys)}"
+
+
 def _form(field: BakedField) -> str:
     """What a field is made of."""
     if field.origin is None:
@@ -130,6 +146,7 @@ _DESCRIBE = {
     "ply": _scene_lines,
     "gdf": _edit_lines,
     "session": _session_lines,
+    "timeline": _timeline_lines,
     "cameras": _camera_lines,
 }
 

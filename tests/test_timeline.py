@@ -12,6 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from progdf.errors import ProgdfError
+from progdf.info import kind_of
 from viewer import controls, history, playback, timeline, timeline_file, tween, workspace
 from viewer.layer_rows import LayerRow
 from viewer.playback import Player
@@ -273,7 +274,8 @@ def test_a_timeline_in_a_file_comes_back_whole_under_its_edits_names(tmp_path: P
     swapped = (replace(LAYERS[0], gdf=1), replace(LAYERS[1], gdf=0))
     other = timeline_file.load(tmp_path / "film.json", swapped)
     assert dict(other.keys[1].strengths) == {1: 1.0, 0: 0.5}
-    assert next(iter(json.loads((tmp_path / "film.json").read_text()))) == timeline_file.MARK
+    assert next(iter(json.loads((tmp_path / "film.json").read_text()))) == "progdf_timeline"
+    assert kind_of(tmp_path / "film.json") == "timeline"
 
 
 def test_a_file_written_by_hand_needs_only_frames_and_strengths(tmp_path: Path) -> None:

@@ -20,8 +20,9 @@ from ui_rig import bear, first_view
 from progdf.checkpoint import save_gdf
 from progdf.ply import save_ply
 from viewer import app as application
-from viewer import controls, panel
+from viewer import controls, panel, timeline_file
 from viewer.session import open_session
+from viewer.state import Keyframe, Timeline
 
 PATIENCE_S = 60.0
 WIDTH, HEIGHT = application.SIZE
@@ -245,6 +246,24 @@ def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, 
     assert [(layer.name, layer.strength) for layer in layers] == [("scarf", 0.5), ("ears", 1.0)]
     assert [row.count for row in opened.stage.facts.rows] == [len(g.region) for g in bear().gdfs]
     assert len(opened.stage.work.past.past) == 1
+
+
+@pytest.mark.gl
+def test_a_dropped_timeline_is_ready_to_play_and_can_be_undone(
+    opened: application.App, tmp_path: Path
+) -> None:
+    layers = opened.stage.work.view.layers
+    keys = (Keyframe(0, ((0, 0.0),)), Keyframe(9, ((0, 1.0),)))
+    timeline_file.save(tmp_path / "film.json", Timeline(keys, 9), layers)
+    opened.open(tmp_path / "film.json")
+    opened.draw()
+    assert opened.stage.work.view.timeline.keys == keys
+    assert opened.stage.work.player.shown
+    assert len(opened.stage.work.past.past) == 1
+    save_ply(tmp_path / "half.ply", bear().scene[:700])
+    opened.stage.restart(opened.stage.work.view)
+    opened.open(tmp_path / "half.ply")
+    assert opened.stage.work.view.timeline == Timeline()
 
 
 @pytest.mark.gl

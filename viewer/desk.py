@@ -17,11 +17,12 @@ from progdf.info import kind_of
 from progdf.session_file import SUFFIX
 
 from . import document as documents
-from . import recent, session, workspace
+from . import recent, session, timeline_file, workspace
 from .document import Document
+from .playback import Player
 from .session import Session
 from .stage import Stage
-from .state import LayerState
+from .state import LayerState, Timeline
 from .turntable import first_camera, from_camera
 from .workspace import Dialog
 
@@ -142,6 +143,9 @@ class Desk:
         if kind == "cameras":
             self._look_through(path)
             return
+        if kind == "timeline":
+            self._take_timeline(path)
+            return
         if kind == "gdf":
             self._add_edit(path)
         elif self.unsaved:
@@ -152,6 +156,14 @@ class Desk:
         else:
             self._open_scene(path)
         self._app.stage.recent = self._remember(path)
+
+    def _take_timeline(self, path: Path) -> None:
+        """Its keys take the place of those there are; undo brings them back."""
+        stage = self._app.stage
+        view = stage.work.view
+        stage.change(replace(view, timeline=timeline_file.load(path, view.layers)))
+        stage.work = replace(stage.work, player=Player(shown=True))
+        stage.tell(f"Opened {path.name}; Space plays it")
 
     def _open_session(self, path: Path) -> None:
         opened = session.open_session(path)
@@ -179,7 +191,9 @@ class Desk:
         self._app.show(opened)
         self.path = None
         stage = self._app.stage
-        stage.restart(replace(stage.work.view, camera=first_camera(opened.scene), layers=()))
+        stage.restart(
+            replace(stage.work.view, camera=first_camera(opened.scene), layers=(), timeline=Timeline())
+        )
 
     def _add_edit(self, path: Path) -> None:
         """On top, at full strength, so that one sees what came; undo takes it off again."""

@@ -94,6 +94,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ..
         count = len(file.edits)
         _check_camera("view.camera", view.camera)
         _check_edit("view", Edit(view.layers, view.blend), count)
+        timeline_file.check(view.timeline, "view.timeline.keys")
         _check("view.background", view.background, 0.0, 1.0)
         _check("view.compare.divider", [view.compare.divider], 0.0, 1.0)
         _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
+from progdf.info import TIMELINE_MARK as MARK
 
 from . import plain, timeline
 from .plain import NotPlainError
@@ -30,8 +31,6 @@ from .stack import OVERSHOOT
 from .state import Keyframe, LayerState, Timeline, ViewCamera
 from .turntable import FARTHEST
 
-MARK = "progdf_timeline"
-"""The first key of every timeline file, by which its kind is told."""
 VERSION = 1
 _LARGEST = 16 << 20  # bytes
 
