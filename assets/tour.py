@@ -110,8 +110,16 @@ def timings(hand: Rig) -> None:
         hand.move(*hand.slider(0, first - 0.01 * step))
 
 
+def painted(hand: Rig) -> None:
+    """The first edit rubbed away in a band, the brush still there."""
+    hand.wheel(490.0, 400.0, 1.0)
+    hand.key("B")
+    hand.drag((470.0, 210.0), (500.0, 330.0))
+
+
 SHOTS: dict[str, Callable[[Rig], None]] = {
     "layers": layers,
+    "paint": painted,
     "compare": compare,
     "difference": difference,
     "session": session,
