@@ -28,6 +28,9 @@ BENCHES: dict[str, str] = {
     "viewer": "viewer.bench:tables",
 }
 
+RECORDED = "trainer.bench_runs:recorded_course"
+"""Reads a run folder for the benchmark of fields, which lies on a lower floor."""
+
 
 def _usage() -> str:
     lines = ["usage: progdf COMMAND …   (progdf COMMAND --help tells its options)", ""]

@@ -9,7 +9,7 @@ import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -55,11 +55,15 @@ class Options:
         what: rasterize, field, viewer; all of them when none is named
         json: also write the tables to this JSON file
         readme: also put the tables between their markers in this Markdown file
+        runs: finished run folders whose recorded edits `field` measures beside the bear's
+        plot: `field` also draws its errors into this PNG file
     """
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     json: Path | None = None
     readme: Path | None = None
+    runs: tuple[Path, ...] = ()
+    plot: Path | None = None
 
 
 def machine() -> str:
@@ -76,18 +80,21 @@ def machine() -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Run the named benchmarks. Raises ProgdfError for a name that does not exist."""
-    from progdf.__main__ import BENCHES  # the front door is the one file that knows all floors
+    from progdf.__main__ import BENCHES, RECORDED  # the front door is the one file that knows all floors
 
     options = tyro.cli(Options, args=list(argv), prog="progdf bench")
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(f"there is no benchmark '{name}'; try one of {', '.join(BENCHES)}")
+    if (options.runs or options.plot) and options.what and "field" not in options.what:
+        raise ProgdfError("--runs and --plot are for fields; say progdf bench field")
+    given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
+    if options.runs:
+        given["field"]["recorded"] = [_named(RECORDED)(run) for run in options.runs]
     tables: list[Table] = []
     print(f"{machine()}\n")
     for name in options.what or tuple(BENCHES):
-        module, function = BENCHES[name].split(":")
-        measure: Callable[[], list[Table]] = getattr(importlib.import_module(module), function)
-        for table in measure():
+        for table in _named(BENCHES[name])(**given.get(name, {})):
             tables.append(table)
             print(table.markdown() + "\n", flush=True)
     if options.json:
@@ -99,6 +106,13 @@ def main(argv: Sequence[str]) -> int:
         with written_whole(options.readme) as beside:
             beside.write_text(filled, encoding="utf-8")
     return 0
+
+
+def _named(path: str) -> Callable[..., Any]:
+    """The function of a floor that this one does not know, by "module:name"."""
+    module, function = path.split(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found
 
 
 def put_tables(text: str, tables: Sequence[Table]) -> str:

@@ -1,4 +1,4 @@
-"""Edits of the bear whose true course is known, ready for fields to be fitted, judged and timed."""
+"""Edits whose course is known, by formula or as recorded, for fields to be fitted, judged and timed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -15,12 +15,18 @@ from progdf.camera import Camera
 from progdf.checkpoint import Gdf, fingerprint
 from progdf.composer import Composer
 from progdf.field import BakedField, FieldJudge
+from progdf.field.judge import Field
+from progdf.field.ranks import decibels
 from progdf.field.rendered import Render
 from progdf.gaussians import Gaussians, pack
 from progdf.layers import Layer
-from progdf.rasterize import alpha_weights, render
+from progdf.rasterize import alpha_weights, render, set_threads
+from progdf.rasterize.threads import threads
 from progdf.region import from_mask
 from progdf.scenes import AnalyticEdit
+
+AT_SNAPSHOTS = 6
+"""Snapshots at which fields are judged beside the strengths between them."""
 
 
 @dataclass(frozen=True)
@@ -28,24 +34,53 @@ class KnownCourse:
     """An edit's true course.
 
     Args:
+        name: of the edit
+        scene: the original
+        members: that the edit changes, ascending. [M] int64
         strengths: of the snapshots that fields are fitted to. [T]
         offsets: [T,M,C]
         truth: the offsets at any strength. [M,C]
         judge: errors against the truth, in views that `look` does not show, over the pixels that change
         look: pixels on which fields may be chosen
         weights: visibility of the members. [M]
+        unseen: the judge's pixels
     """
 
+    name: str
+    scene: Gaussians
+    members: Tensor
     strengths: Tensor
     offsets: Tensor
     truth: Callable[[float], Tensor]
     judge: FieldJudge
     look: Render
     weights: Tensor
+    unseen: Render
+
+    @cached_property
+    def _shown(self) -> list[tuple[float, Tensor]]:
+        inner = range(1, len(self.strengths) - 1)
+        some = inner[:: max(1, len(inner) // AT_SNAPSHOTS)][:AT_SNAPSHOTS]
+        with torch.no_grad():
+            return [(float(self.strengths[t]), self.unseen(self.offsets[t])) for t in some]
+
+    def worst_at_snapshots(self, field: Field) -> float:
+        """Least PSNR at some snapshots that a field was fitted to, dB, where `judge` looks between them."""
+        with torch.no_grad():
+            errors = [
+                float((self.unseen(field.offsets(s)) - shown).double().square().mean())
+                for s, shown in self._shown
+            ]
+        return min((decibels(error) for error in errors), default=decibels(0.0))
 
 
 def known_course(
-    scene: Gaussians, edit: AnalyticEdit, members: Tensor, cameras: Sequence[Camera], snapshots: int
+    name: str,
+    scene: Gaussians,
+    edit: AnalyticEdit,
+    members: Tensor,
+    cameras: Sequence[Camera],
+    snapshots: int,
 ) -> KnownCourse:
     """Everything of an edit that a benchmark of fields needs."""
     with_sh = bool((edit.apply(scene, members, 1.0).shN != scene.shN).any())
@@ -56,8 +91,9 @@ def known_course(
 
     strengths = torch.linspace(0, 1, snapshots)
     offsets = torch.stack([truth(float(s)) for s in strengths])
-    seen, unseen = cameras[::11][:3], cameras[5::10][:3]
-    judge = FieldJudge(strengths, offsets, _changed_pixels(scene, members, offsets, unseen), truth)
+    seen, unseen = cameras[::11][:3], cameras[5::10][:2]
+    shown = _changed_pixels(scene, members, offsets, unseen)
+    judge = FieldJudge(strengths, offsets, shown, truth)
     visible = sum(
         (
             alpha_weights(scene, camera, torch.ones(camera.height, camera.width))[members, 2].float()
@@ -67,7 +103,7 @@ def known_course(
     )
     weights = visible / visible.mean() + 1e-3
     look = _changed_pixels(scene, members, offsets, seen)
-    return KnownCourse(strengths, offsets, truth, judge, look, weights)
+    return KnownCourse(name, scene, members, strengths, offsets, truth, judge, look, weights, shown)
 
 
 def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras: Sequence[Camera]) -> Render:
@@ -82,11 +118,22 @@ def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras:
     return lambda moved: torch.cat([p[c] for p, c in zip(pictures(moved), counts, strict=True)])
 
 
-def step_ms(scene: Gaussians, edit: Gdf) -> float:
-    """A slider step of the composer, median, ms."""
+def step_ms(scene: Gaussians, edit: Gdf) -> tuple[float, float]:
+    """A slider step of the composer with one thread and with two, medians, ms."""
     composer = Composer(scene, [edit])
     layers = [Layer(edit, s / 20) for s in range(1, 20)]
-    return statistics.median(milliseconds(partial(composer.update, [layer])) for layer in layers)
+    before = threads()
+
+    def step(count: int, layer: Layer) -> float:
+        set_threads(count)
+        return milliseconds(partial(composer.update, [layer]))
+
+    try:
+        one = [step(1, layer) for layer in layers]
+        two = [step(2, layer) for layer in layers]
+    finally:
+        set_threads(before)
+    return statistics.median(one), statistics.median(two)
 
 
 def milliseconds(work: Callable[[], object]) -> float:

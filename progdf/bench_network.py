@@ -1,71 +1,70 @@
-"""`progdf bench field`, its neural part: the paper's field and ours, as trained and as baked."""
+"""`progdf bench field`, its neural part: networks as trained, and what the paper's size takes."""
 
 from __future__ import annotations
 
 import statistics
 import time
+from dataclasses import replace
 from functools import partial
 
-from torch import Tensor
+import torch
 
-from progdf.bench import Table
-from progdf.bench_course import KnownCourse, edit_of, milliseconds, step_ms
-from progdf.field import NeuralSettings, baked_neural, fit_neural, position_floor
-from progdf.gaussians import Gaussians, pack
+from progdf.bench_course import KnownCourse, milliseconds
+from progdf.bench_forms import Form
+from progdf.field import NeuralField, NeuralSettings, fit_neural
+from progdf.field.neural_fit import NeuralFit
+from progdf.field.separable import moving_attributes
+from progdf.gaussians import pack
+
+STEPS = 600
+"""Of training, a tenth of what `progdf fit --field neural` takes."""
 
 NETWORKS = (
-    ("position alone, 6 M (paper), a minute", NeuralSettings("paper", "position", steps=150, batch=512)),
-    ("position alone, .5 M", NeuralSettings("small", "position")),
-    ("position alone, hard bins", NeuralSettings("tiny", "position", bins="hard")),
-    ("position alone", NeuralSettings("tiny", "position")),
-    ("look and end too", NeuralSettings("tiny")),
-    ("look, end and code of 8", NeuralSettings("tiny", code=8)),
+    ("neural, tiny", NeuralSettings("tiny")),
+    ("neural, tiny, code of 8", NeuralSettings("tiny", code=8)),
 )
-"""What is trained, by what is said of it; the smallest size where no number is told."""
+"""What is trained for so many steps and judged."""
+
+PAPER = NeuralSettings("paper", "position")
 
 
-def network_table(name: str, scene: Gaussians, members: Tensor, stand: KnownCourse) -> Table:
-    """Networks trained on one edit, as trained and as baked."""
-    before = pack(scene[members])
-    rows: list[tuple[str, ...]] = []
+def network_forms(course: KnownCourse) -> list[Form]:
+    """Networks before they are baked; the paper's last, timed but neither trained nor judged."""
+    before = pack(course.scene[course.members])
+    found = []
     for label, given in NETWORKS:
         begin = time.perf_counter()
-        network = fit_neural(stand.strengths, stand.offsets, before, given, stand.weights, stand.look)
+        settings = replace(given, steps=STEPS)
+        network = fit_neural(course.strengths, course.offsets, before, settings, course.weights, course.look)
         seconds = time.perf_counter() - begin
         bound = network.bound(before)
-        curve = stand.judge.curve(bound)
-        field = baked_neural(network, before, stand.truth, stand.look)
-        baked = stand.judge.candidate(field, label)
-        asked = statistics.median(milliseconds(partial(bound.offsets, s / 6)) for s in range(1, 6))
-        rows.append(
-            (
-                label,
-                f"{network.parameters}",
-                f"{network.bytes_per_member:.0f}",
-                f"{sum(curve) / len(curve):.1f} / {min(curve):.1f}",
-                f"{baked.mean:.1f} / {baked.worst:.1f}",
-                f"{seconds:.0f}",
-                f"{asked:.1f}",
-                f"{step_ms(scene, edit_of(scene, members, field)):.2f}",
-            )
-        )
-    floor = position_floor(stand.strengths, stand.offsets, before[:, :3], stand.weights, stand.judge)
-    unpredictable = ", ".join(f"{name} {share:.0%}" for name, share in floor.unpredictable.items())
-    return Table(
-        name="network",
-        title="Neural fields: before and after they are baked",
-        columns=(
-            "what the network sees",
-            "numbers",
-            "bytes a member",
-            "PSNR as trained, mean / worst, dB",
-            "baked",
-            "s to fit",
-            "ms a slider step as trained",
-            "baked",
-        ),
-        rows=tuple(rows),
-        note=f"{name}, {len(members)} members, as above; bytes with the recorded end. What "
-        f"neighbours foretell of a member's movement: {floor.psnr_mean:.1f} / {floor.psnr_worst:.1f} dB; "
-        f"what they do not: {unpredictable}.",
-    )
+        curve = course.judge.curve(bound)
+        at = course.worst_at_snapshots(bound)
+        found.append(_form(course, network, label, curve, at, seconds))
+    fit = NeuralFit(before, course.offsets.shape[2], tuple(moving_attributes(course.offsets)), PAPER)
+    fit.scale_to(course.offsets)
+    return [*found, _form(course, fit.field(), "neural, the paper's 6 M", (), None, None)]
+
+
+def _form(
+    course: KnownCourse,
+    network: NeuralField,
+    label: str,
+    curve: tuple[float, ...],
+    at: float | None,
+    seconds: float | None,
+) -> Form:
+    bound = network.bound(pack(course.scene[course.members]))
+    before = torch.get_num_threads()
+    asked = []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            asked.append(statistics.median(milliseconds(partial(bound.offsets, s / 4)) for s in (1, 2, 3)))
+    finally:
+        torch.set_num_threads(before)
+    kind = "neural, code" if network.shape.code else "neural"
+    return Form(
+        course.name, len(course.members), kind, label, network.parameters, network.bytes_per_member,
+        curve, at, seconds, (asked[0], asked[1]),
+    )  # fmt: skip
