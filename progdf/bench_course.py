@@ -119,7 +119,7 @@ def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras:
 
 
 def step_ms(scene: Gaussians, edit: Gdf) -> tuple[float, float]:
-    """A slider step of the composer with one thread and with two, medians, ms."""
+    """A slider step of the composer with one thread and with two, in turns, medians, ms."""
     composer = Composer(scene, [edit])
     layers = [Layer(edit, s / 20) for s in range(1, 20)]
     before = threads()
@@ -128,12 +128,15 @@ def step_ms(scene: Gaussians, edit: Gdf) -> tuple[float, float]:
         set_threads(count)
         return milliseconds(partial(composer.update, [layer]))
 
+    times: tuple[list[float], list[float]] = ([], [])
     try:
-        one = [step(1, layer) for layer in layers]
-        two = [step(2, layer) for layer in layers]
+        for layer in layers:
+            for count in (1, 2):
+                composer.update([])
+                times[count - 1].append(step(count, layer))
     finally:
         set_threads(before)
-    return statistics.median(one), statistics.median(two)
+    return statistics.median(times[0]), statistics.median(times[1])
 
 
 def milliseconds(work: Callable[[], object]) -> float:

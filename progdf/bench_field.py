@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from progdf.bench import Table
@@ -55,7 +56,8 @@ def tables(recorded: Sequence[KnownCourse] = (), plot: Path | None = None) -> li
         forms += [*baked_forms(course), *network_forms(course)]
     if plot is not None:
         with written_whole(plot) as beside:
-            draw_forms(forms).save(beside, format="PNG", optimize=True)
+            drawn = draw_forms(forms).quantize(128, kmeans=3, dither=Image.Dither.NONE)
+            drawn.save(beside, format="PNG", optimize=True)
     return [field_table(forms), _compose_table()]
 
 

@@ -25,7 +25,7 @@ STYLES: dict[str, tuple[tuple[int, int, int], str]] = {
 """Colour and marker of each kind, in the order of the legend; the later lies above."""
 
 COLUMNS, PANEL = 3, (328, 212)
-LOW, HIGH = 20.0, 70.0
+LOW, HIGH = 10.0, 70.0
 """Decibels that the axis shows; what lies beyond is drawn on its edge."""
 
 _ZOOM = 2  # drawn at twice the size and scaled down, for smooth edges
@@ -86,7 +86,8 @@ def draw_forms(forms: Sequence[Form]) -> Image.Image:
         draw.text(((x + PANEL[0] - _RIGHT) * _ZOOM, (y + 14) * _ZOOM), said, PALE, small, anchor="rm")
         for row, axis in enumerate(scales):
             places = [min(form.step) if row else form.bytes_per_member for form in own]
-            _panel(draw, (x, y + _TITLE + row * PANEL[1]), axis, own, places, small)
+            corner = (x, y + _TITLE + row * PANEL[1])
+            _panel(draw, corner, axis, own, places, small, joined=row == 0)
     return page.resize((width, height), Image.Resampling.LANCZOS)
 
 
@@ -97,6 +98,7 @@ def _panel(
     forms: Sequence[Form],
     places: Sequence[float],
     font: _Font,
+    joined: bool,
 ) -> None:
     left, top = (corner[0] + _LEFT) * _ZOOM, (corner[1] + _TOP) * _ZOOM
     right, bottom = (corner[0] + PANEL[0] - _RIGHT) * _ZOOM, (corner[1] + PANEL[1] - _BOTTOM) * _ZOOM
@@ -127,7 +129,7 @@ def _panel(
         else:
             points.setdefault(form.kind, []).append((at_x(place), at_y(form.worst)))
     for kind, (colour, _) in STYLES.items():
-        if len(points.get(kind, [])) > 1:
+        if joined and len(points.get(kind, [])) > 1:
             draw.line(sorted(points[kind]), colour, round(1.5 * _ZOOM))
     for kind in STYLES:
         for x, y in points.get(kind, []):
