@@ -118,6 +118,17 @@ def test_a_picture_that_was_handed_out_stays_as_it_is(stack: Stack) -> None:
     assert not np.array_equal(again, before)
 
 
+def test_where_many_are_touched_the_picture_is_drawn_as_a_whole(
+    stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cpu_painter, "MANY", 3)
+    engine, fresh = Engine(None, stack.scene, stack.gdfs), Engine(None, stack.scene, stack.gdfs)
+    engine.image(view_of(stack, 0.2), SIZE)
+    changed = engine.image(view_of(stack, 0.7), SIZE)
+    assert engine.timings.share == 1.0
+    assert np.array_equal(changed, fresh.image(view_of(stack, 0.7), SIZE))
+
+
 def test_several_changes_before_a_picture_are_all_drawn(stack: Stack) -> None:
     engine = Engine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.5, 0.5), SIZE)

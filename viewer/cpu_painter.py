@@ -24,6 +24,10 @@ from .touched import area, boxes
 
 Image = NDArray[np.float32]
 
+MANY = 32_768
+"""Rows beyond which nobody asks where they are: telling takes longer than what is not drawn would (100 000
+members of 125 000 Gaussians: 41 ms a step, 35 without)."""
+
 WORTH_DRAWING_APART = 0.8
 """Share of the picture beyond which all of it is drawn."""
 
@@ -85,6 +89,8 @@ class CpuPainter:
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         names = tuple(attributes)
+        if len(rows) > MANY:
+            self._cells = None
         cells = self._cells
         if cells is not None and len(rows):
             cells |= self._where(rows)
