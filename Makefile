@@ -44,7 +44,8 @@ test: setup extras window
 test-all: setup extras window
 	$(BIN)/python -m pytest -m ''
 
-lint: setup
+# With the extras, so that types are checked against the same packages everywhere.
+lint: setup extras
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -130,7 +130,8 @@ def _panel(
             points.setdefault(form.kind, []).append((at_x(place), at_y(form.worst)))
     for kind, (colour, _) in STYLES.items():
         if joined and len(points.get(kind, [])) > 1:
-            draw.line(sorted(points[kind]), colour, round(1.5 * _ZOOM))
+            path: list[tuple[float, float]] = sorted(points[kind])
+            draw.line(path, colour, round(1.5 * _ZOOM))
     for kind in STYLES:
         for x, y in points.get(kind, []):
             _mark(draw, kind, x, y)
