@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -30,116 +29,16 @@ from .compare import Comparer, labelled
 from .engine import Engine
 from .headless import headless_context
 from .layer_arguments import stack_of
+from .options import ExportOptions, RenderOptions, StackOptions, ViewOptions
 from .paint import layer_of
 from .stack import shown
 from .state import LayerState, ViewCamera, ViewState
 from .turntable import first_camera, to_camera
 
-Blend = Literal["normalised", "sum", "over"]
-Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
-Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
-Paint = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FILE.npy"), tyro.conf.UseAppendAction]
-Solo = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction]
-Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.ply")]
-Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
-Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-
 DEFAULT_SIZE = (640, 480)
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 """Options of `progdf render` that each say what the picture is."""
 _BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
-
-
-@dataclass(frozen=True)
-class ViewOptions:
-    """Open the window: the splats, one slider per edit."""
-
-    scene: Scene
-    """The scene, a 3DGS .ply file; or a session saved with Ctrl+S, also as --session FILE."""
-    gdfs: Edits = ()
-    """Edits of this scene, the lowest layer first."""
-    set: Settings = ()
-    """Strength of an edit when the window opens, 0 to 1; 0 where not set. Repeat it for several edits."""
-    gain: Gains = ()
-    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
-    solo: Solo = ()
-    """Show this edit alone. Repeat it for several edits."""
-    paint: Paint = ()
-    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
-    overshoot: bool = False
-    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
-    blend: Blend = "normalised"
-    """How edits that share Gaussians go together."""
-    background: str = "white"
-    """#rrggbb, white or black."""
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """Write a picture of a scene under its edits, without a window."""
-
-    scene: Scene
-    """The scene, a 3DGS .ply file; or a session saved with Ctrl+S, also as --session FILE."""
-    out: Out
-    """The picture to write: .png, with --sweep .gif or .mp4; with --timeline also a folder."""
-    gdfs: Edits = ()
-    """Edits of this scene, the lowest layer first."""
-    set: Settings = ()
-    """Strength of an edit, 0 to 1; 0 where not set. Repeat it for several edits."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE[:INDEX]")] = None
-    """A camera of cameras.json or transforms.json, the first where no INDEX is given."""
-    orbit: Annotated[str | None, tyro.conf.arg(metavar="AZ,EL[,DISTANCE]")] = None
-    """A camera that circles the scene: degrees around it, degrees above it, world units away (fitting)."""
-    size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
-    """Pixels; else the camera's own, or 640x480."""
-    engine: Literal["auto", "gl", "cpu"] = "auto"
-    """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
-    gain: Gains = ()
-    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
-    solo: Solo = ()
-    """Show this edit alone. Repeat it for several edits."""
-    paint: Paint = ()
-    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
-    overshoot: bool = False
-    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
-    blend: Blend = "normalised"
-    """How edits that share Gaussians go together."""
-    background: str = "white"
-    """#rrggbb, white or black."""
-    sweep: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Move this edit's slider from 0 to 1 and back: an animation."""
-    sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]")] = None
-    """A contact sheet over this edit's slider, or a grid over two sliders."""
-    split: Annotated[str | None, tyro.conf.arg(metavar="[X]")] = None
-    """The original beside the edited picture, which begins at this share of the width (0.5)."""
-    difference: Annotated[str | None, tyro.conf.arg(metavar="[AMPLIFY]")] = None
-    """What differs from the original, amplified (4), with the PSNR."""
-    timeline: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
-    """A film of the keys in this file (Ctrl+K in the window): .gif, .mp4, or a folder for .png frames."""
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """Write a scene under its edits as a 3DGS .ply file."""
-
-    scene: Scene
-    """The scene, a 3DGS .ply file."""
-    out: Out
-    """The .ply file to write."""
-    gdfs: Edits = ()
-    """Edits of this scene, the lowest layer first."""
-    set: Settings = ()
-    """Strength of an edit, 0 to 1; 0 where not set. Repeat it for several edits."""
-    gain: Gains = ()
-    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
-    solo: Solo = ()
-    """Show this edit alone. Repeat it for several edits."""
-    paint: Paint = ()
-    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
-    overshoot: bool = False
-    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
-    blend: Blend = "normalised"
-    """How edits that share Gaussians go together."""
 
 
 def view(argv: Sequence[str]) -> int:
@@ -251,9 +150,7 @@ def _compare(engine: Engine, view: ViewState, camera: Camera, path: Path) -> flo
     return comparer.psnr
 
 
-def _layers(
-    options: ViewOptions | RenderOptions | ExportOptions, gdfs: Sequence[Gdf]
-) -> tuple[LayerState, ...]:
+def _layers(options: StackOptions, gdfs: Sequence[Gdf]) -> tuple[LayerState, ...]:
     return stack_of(gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint)
 
 
