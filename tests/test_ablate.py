@@ -15,6 +15,7 @@ from progdf.checkpoint import load_gdf
 from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
 from progdf.ply import load_ply
+from progdf.trajectory import Trajectory
 from tests.trained import quick_options, write_bear
 from trainer import cli
 from trainer.ablate import ablate
@@ -24,7 +25,6 @@ from trainer.artefacts import RunFolder
 from trainer.options import AblateOptions, TrainOptions, settled
 from trainer.reopen import reopened
 from trainer.run import train
-from trainer.trajectory import Trajectory
 from trainer.variants import chosen, sensible
 
 ONLY = "base,2-keyframes,one-target,slider-time"

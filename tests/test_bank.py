@@ -16,11 +16,11 @@ from progdf.errors import ProgdfError
 from progdf.field import neural_fit
 from progdf.field.neural_fit import NeuralFit, NeuralSettings
 from progdf.ply import load_ply
+from progdf.trajectory import load_trajectory
 from tests.trained import quick_options, write_bear
 from trainer.bank import Alongside, MemoryBank
 from trainer.options import FitOptions, check_network_options, settled
 from trainer.run import RunResult, refit, train
-from trainer.trajectory import load_trajectory
 
 
 @pytest.fixture(scope="module", autouse=True)

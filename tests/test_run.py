@@ -19,11 +19,11 @@ from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.ply import load_ply
+from progdf.trajectory import load_trajectory
 from tests.trained import quick_options, write_bear
 from trainer import cli
 from trainer.options import FitOptions, settled
 from trainer.run import RunResult, refit, train
-from trainer.trajectory import load_trajectory
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,14 +13,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from trainer.trajectory import (
+from progdf.tensor_file import write_tensors
+from progdf.trajectory import (
     Trajectory,
     load_trajectory,
-    record,
-    retime,
+    peek_trajectory,
+    recorded_field,
     save_trajectory,
-    straightened,
 )
+from trainer.trajectory import record, retime, straightened
 
 CHANNELS = 14
 
@@ -143,6 +145,42 @@ def test_a_trajectory_round_trips_through_its_file(tmp_path: Path) -> None:
     assert torch.equal(tensors["members"], extra["members"])
     assert torch.equal(tensors["score"], extra["score"])
     assert about == {"scene": "bär.ply"}
+
+
+def test_whose_recording_it_is_can_be_told_without_reading_the_recordings(tmp_path: Path) -> None:
+    trajectory = along([0.3, 1.0])
+    extra = {"members": torch.tensor([3, 5, 8])}
+    save_trajectory(tmp_path / "trajectory.safetensors", trajectory, extra, {})
+    s, members = peek_trajectory(tmp_path / "trajectory.safetensors")
+    assert torch.equal(s, trajectory.s)
+    assert torch.equal(members, extra["members"])
+
+
+@pytest.mark.parametrize(
+    "part", [("end", torch.zeros(2, CHANNELS)), ("s", torch.tensor([0.0, 0.9, 1.1])), ("s", torch.ones(3))]
+)
+def test_recordings_that_do_not_hold_together_are_one_line(tmp_path: Path, part: tuple[str, Tensor]) -> None:
+    trajectory = replace(along([0.5, 1.0]), **{part[0]: part[1]})
+    save_trajectory(tmp_path / "trajectory.safetensors", trajectory, {}, {})
+    with pytest.raises(ProgdfError, match=r"is damaged .*; train again"):
+        load_trajectory(tmp_path / "trajectory.safetensors")
+
+
+def test_a_file_that_lacks_a_part_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "trajectory.safetensors"
+    write_tensors(path, {"s": torch.zeros(2)}, {"format": "progdf-trajectory-1", "about": "{}"})
+    with pytest.raises(ProgdfError, match="it has no end"):
+        load_trajectory(path)
+
+
+def test_a_recording_is_a_field_that_tells_the_same_at_and_between_the_snapshots() -> None:
+    trajectory = retime(along([0.2, 0.3, 0.75, 1.0], noise=0.1), seen)
+    field = recorded_field(trajectory)
+    assert field.recorded == tuple(trajectory.s.tolist())
+    for s in trajectory.s.tolist():
+        assert torch.equal(field.offsets(s), trajectory.at(s))
+    for s in (0.01, 0.4, 0.61, 0.99):
+        assert torch.allclose(field.offsets(s), trajectory.at(s), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("content", [b"", b"no tensors", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      "])

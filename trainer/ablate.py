@@ -23,6 +23,7 @@ from progdf.field import BakedField, fit_keyframes
 from progdf.files import written_whole
 from progdf.pictures import write_image
 from progdf.slider_statistics import slider_statistics
+from progdf.trajectory import Trajectory
 from trainer.ablation_ground import Ground, digest_of, make_ground, plain, run_options
 from trainer.ablation_table import Outcome, sheet_of, table_of, told
 from trainer.artefacts import RunFolder, locked, write_json
@@ -41,7 +42,6 @@ from trainer.run import use_threads
 from trainer.settings import loss_weights
 from trainer.state import StateFolder
 from trainer.training import retimed, trained
-from trainer.trajectory import Trajectory
 from trainer.variants import Variant, chosen, sensible
 
 _WIDTH = 176  # of a picture in the sheet, pixels

@@ -25,6 +25,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.pictures import write_image
+from progdf.trajectory import FILE_NAME
 from trainer.pictures import read_picture
 from trainer.state import StateFolder
 
@@ -41,7 +42,7 @@ class RunFolder:
     @property
     def trajectory(self) -> Path:
         """The recorded trajectory."""
-        return self.root / "trajectory.safetensors"
+        return self.root / FILE_NAME
 
     @property
     def cameras(self) -> Path:

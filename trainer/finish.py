@@ -15,6 +15,7 @@ from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.compose import Layer, compose
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.pictures import write_image
+from progdf.trajectory import Trajectory
 from trainer.artefacts import RunFolder, read_views, write_json
 from trainer.fit import fit_field, judged_field, visibility
 from trainer.judge import Judge, make_judge
@@ -26,7 +27,6 @@ from trainer.preparation import Stand
 from trainer.progress import RunLog
 from trainer.report import report_picture
 from trainer.state import Saved
-from trainer.trajectory import Trajectory
 from trainer.views import View
 
 _RANK_VIEWS = 4

@@ -14,8 +14,8 @@ from progdf.field import BakedField, Candidate, FieldJudge, choose_field, fit_ke
 from progdf.field.choose import Kind
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
+from progdf.trajectory import Trajectory
 from trainer.judge import Judge
-from trainer.trajectory import Trajectory
 from trainer.views import View
 
 BASELINES = (2, 4)

@@ -13,11 +13,11 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField
 from progdf.field.judge import sample_strengths
 from progdf.slider_statistics import SliderStatistics, slider_statistics
+from progdf.trajectory import Trajectory
 from trainer.clip import Clip, direction, load_clip
 from trainer.fit import Fitted, choice_figures, field_figures
 from trainer.judge import Judge
 from trainer.losses import Perceptual
-from trainer.trajectory import Trajectory
 from trainer.views import View
 
 COMPARED = "keyframes2"

@@ -23,6 +23,7 @@ from progdf.field.neural import Inputs, NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
+from progdf.trajectory import Trajectory
 from trainer.bank import Alongside
 from trainer.crops import crop_scene, render_all
 from trainer.fit import visibility
@@ -34,7 +35,6 @@ from trainer.preparation import Stand, probes
 from trainer.progress import RunLog
 from trainer.resume import plain_options
 from trainer.state import Saved, StateFolder
-from trainer.trajectory import Trajectory
 
 PART = "network"
 """Of the saved state: a network that was trained alongside, once the trajectory is recorded."""

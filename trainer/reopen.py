@@ -14,9 +14,9 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.ply import load_ply
 from progdf.region import Region
+from progdf.trajectory import Trajectory, load_trajectory
 from trainer.artefacts import RunFolder
 from trainer.preparation import Stand
-from trainer.trajectory import Trajectory, load_trajectory
 from trainer.views import make_view
 
 

@@ -16,6 +16,7 @@ from progdf.ply import load_ply
 from progdf.rasterize import render, set_threads
 from progdf.region import Region
 from progdf.region_spec import parse_region
+from progdf.trajectory import load_trajectory, save_trajectory
 from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
 from trainer.editors import VIEW_BY_VIEW, check_editor, make_editor
@@ -45,7 +46,6 @@ from trainer.reopen import its_views, reopened
 from trainer.resume import kept_region, one_line, open_session, plain_options, still_there
 from trainer.settings import loss_weights, stages_to_ask
 from trainer.training import retimed, trained
-from trainer.trajectory import load_trajectory, save_trajectory
 
 __all__ = ["RunResult", "refit", "train", "use_threads"]
 

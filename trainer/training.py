@@ -12,6 +12,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.framing import scene_sphere
 from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.trajectory import Trajectory
 from trainer.crops import GEOMETRY, CropScene, crop_scene, moving_attributes, render_all
 from trainer.descent import PgsState
 from trainer.editors.base import EditKind
@@ -27,7 +28,7 @@ from trainer.progress import RunLog
 from trainer.settings import loss_weights, pgs_settings
 from trainer.sheen import NEEDED, view_dependence
 from trainer.state import Autosave, Resumable, Saved, StateFolder
-from trainer.trajectory import Trajectory, record, retime, straightened
+from trainer.trajectory import record, retime, straightened
 from trainer.views import crop
 
 PART = "training"

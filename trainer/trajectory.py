@@ -1,4 +1,4 @@
-"""The recorded trajectory of an edit: how every member moved, and at which slider value it was where.
+"""Recording a trajectory: which snapshots stay, and at which slider value each of them lies.
 
 The slider is visible change, not time (method.md 3, recording): between two stages, whose strengths are
 pinned, equal steps of the slider change the pictures equally.
@@ -6,61 +6,19 @@ pinned, equal steps of the slider change the pictures equally.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from progdf.errors import ProgdfError
-from progdf.files import open_failure, written_whole
-from progdf.tensor_file import write_tensors
+from progdf.trajectory import Trajectory
 
 Slider = Literal["stages", "even", "time"]
 
-_FORMAT = "progdf-trajectory-1"
 _LEAST_GAP = 1e-4  # slider values of neighbouring recordings stay apart by this
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """S recordings of the members' offsets along the slider.
-
-    Args:
-        s: slider value of each recording, ascending, first 0, last 1. [S] float32
-        offsets: raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
-        end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
-        steps: optimiser steps done at each recording. [S] int64
-        stage_ends: recording at which each stage ends, ascending, the last S − 1
-        strengths: the slider value that each stage's end is pinned to
-    """
-
-    s: Tensor
-    offsets: Tensor
-    end: Tensor
-    steps: Tensor
-    stage_ends: tuple[int, ...]
-    strengths: tuple[float, ...]
-
-    def __len__(self) -> int:
-        return int(self.s.shape[0])
-
-    def at(self, s: float) -> Tensor:
-        """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
-        right = int(torch.searchsorted(self.s, torch.tensor(s, dtype=self.s.dtype), right=True))
-        right = min(max(right, 1), len(self) - 1)
-        low, high = float(self.s[right - 1]), float(self.s[right])
-        share = min(max((s - low) / (high - low), 0.0), 1.0)
-        return torch.lerp(self.node(right - 1), self.node(right), share)
-
-    def node(self, index: int) -> Tensor:
-        """Offsets of one recording. [M,C] float32"""
-        return self.end if index == len(self) - 1 else self.offsets[index].float()
 
 
 def record(
@@ -170,58 +128,6 @@ def straightened(
         steps=trajectory.steps[rows],
         stage_ends=tuple(kept.index(end) for end in trajectory.stage_ends),
     )
-
-
-def save_trajectory(
-    path: Path, trajectory: Trajectory, extra: Mapping[str, Tensor], about: Mapping[str, Any]
-) -> None:
-    """Write a trajectory with what a refit needs.
-
-    Args:
-        path: trajectory.safetensors
-        trajectory: what to save
-        extra: further tensors by name (members, score, cameras)
-        about: JSON values (scene, options, …)
-    """
-    tensors = {
-        "s": trajectory.s,
-        "offsets": trajectory.offsets,
-        "end": trajectory.end,
-        "steps": trajectory.steps,
-        "stage_ends": torch.tensor(trajectory.stage_ends),
-        "strengths": torch.tensor(trajectory.strengths, dtype=torch.float64),
-        **extra,
-    }
-    header = {"format": _FORMAT, "about": json.dumps(dict(about))}
-    with written_whole(path) as beside:
-        write_tensors(beside, tensors, header)
-
-
-def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
-    """Read what `save_trajectory` wrote: trajectory, extra tensors, about.
-
-    Raises:
-        ProgdfError: the file is absent, damaged or something else.
-    """
-    try:
-        with safe_open(path, framework="pt") as opened:
-            header = opened.metadata() or {}
-            if header.get("format") != _FORMAT:
-                raise ProgdfError(f"{path} is no recorded trajectory; give a run folder of progdf train")
-            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # no dict
-    except OSError as error:
-        raise open_failure(path, error) from error
-    except SafetensorError as error:
-        raise ProgdfError(f"{path} is damaged ({error}); train again") from error
-    trajectory = Trajectory(
-        tensors.pop("s"),
-        tensors.pop("offsets"),
-        tensors.pop("end"),
-        tensors.pop("steps"),
-        tuple(tensors.pop("stage_ends").tolist()),
-        tuple(tensors.pop("strengths").tolist()),
-    )
-    return trajectory, tensors, json.loads(header["about"])
 
 
 def _chords(pictures: Sequence[Tensor]) -> Tensor:
