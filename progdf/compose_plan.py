@@ -110,12 +110,21 @@ def flat_bases(
     return np.concatenate(floats), np.concatenate(bytes_), found
 
 
-def factors(nodes: NDArray[np.float64], bases: FlatBases, s: float) -> NDArray[np.float32]:
-    """What every basis and channel is multiplied with at `s`; as `BakedField.coefficients`. [1+R,c]"""
+def factors(
+    nodes: NDArray[np.float64], table: NDArray[np.float32], step: NDArray[np.float32], s: float
+) -> NDArray[np.float32]:
+    """What every basis and channel is multiplied with at `s`; as `BakedField.coefficients`. [1+R,c]
+
+    Args:
+        nodes: strengths of the table's rows. [S]
+        table: an attribute's coefficients. [S,1+R]
+        step: what one unit of bases 1..R is worth. [R,c]
+        s: strength
+    """
     right = min(max(int(np.searchsorted(nodes, np.float32(s))), 1), len(nodes) - 1)
     left_s, right_s = float(nodes[right - 1]), float(nodes[right])
-    row = bases.table[right]
+    row = table[right]
     if s != right_s:
-        left = bases.table[right - 1]
+        left = table[right - 1]
         row = left + np.float32((s - left_s) / (right_s - left_s)) * (row - left)
-    return np.concatenate([np.full((1, bases.step.shape[1]), row[0]), row[1:, None] * bases.step])
+    return np.concatenate([np.full((1, step.shape[1]), row[0]), row[1:, None] * step])

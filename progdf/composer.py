@@ -18,17 +18,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.checkpoint import Gdf, verify
+from progdf.compose_effects import Effects, changed_edits, changed_gains, effects_of
 from progdf.compose_kernel import BLOCK, LAYER, blend_rows
 from progdf.compose_plan import Plan, factors, flat_bases, plan_rows
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.layers import KINDS, Gains, Layer, check_layers
+from progdf.layers import KINDS, Layer, check_layers
 from progdf.rasterize.threads import threads
 
 WORTH_A_THREAD = 16_384
 """Rows below which a second thread costs more than it saves."""
-
-Effect = tuple[tuple[float, Gains, Tensor | None, int, int], ...]
-"""What decides an edit's part, per layer: strength, gains, weights, their version, place in the stack."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,7 @@ class Composer:
         self._out = {name: _rows_of(tensor) for name, tensor in copies.items()}
         self._floats, self._bytes, self._bases = flat_bases(gdfs)
         self._nodes = [gdf.field.nodes.double().numpy() for gdf in gdfs]
-        self._effects: dict[int, Effect] = {}
-        self._blend = "normalised"
+        self._effects = Effects()
         self._plans: dict[frozenset[int], Plan] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._weights: tuple[list[Tensor], list[int], NDArray[np.float32]] = ([], [], np.zeros(0, np.float32))
@@ -103,27 +100,14 @@ class Composer:
         """
         check_layers(layers, blend)
         stack = [(self._index(layer.gdf), layer) for layer in layers if layer.active]
-        effects: dict[int, Effect] = {}
-        for place, (edit, layer) in enumerate(stack):
-            version = -1 if layer.weights is None else layer.weights._version
-            order = place if blend == "over" else 0
-            entry = (layer.strength, layer.gains, layer.weights, version, order)
-            effects[edit] = (*effects.get(edit, ()), entry)
-        before, blend_before = self._effects, self._blend
-        changed = frozenset(
-            edit
-            for edit in {*before, *effects}
-            if blend != blend_before or not _same(before.get(edit, ()), effects.get(edit, ()))
-        )
-        self._effects, self._blend = effects, blend
+        before, self._effects = self._effects, effects_of(stack, blend)
+        changed = changed_edits(before, self._effects)
         if not changed:
             return Change(np.zeros(0, np.int64), (), 0.0)
         plan = self._plan(changed)
         attributes = {name for edit in plan.edits for name in self._bases[edit]}
-        if blend == blend_before and all(
-            _same(before.get(edit, ()), effects.get(edit, ()), gains=False) for edit in changed
-        ):
-            kinds = {kind for edit in changed for kind in _other_gains(before[edit], effects[edit])}
+        kinds = changed_gains(before, self._effects, changed)
+        if kinds is not None:
             attributes = {name for edit in changed for name in self._bases[edit] if KINDS[name] in kinds}
         stack = [(edit, layer) for edit, layer in stack if edit in plan.edits]
         names = tuple(name for name in ATTRIBUTES if name in attributes)
@@ -147,7 +131,7 @@ class Composer:
                 continue
             entry["moves"], entry["rank"], entry["rest_is_float"] = 1, len(bases.step), bases.rest_is_float
             entry["full"], entry["rest"], entry["factors"] = bases.full, bases.rest, lines
-            scales.append(factors(self._nodes[edit], bases, layer.strength).reshape(-1))
+            scales.append(factors(self._nodes[edit], bases.table, bases.step, layer.strength).reshape(-1))
             lines += 1 + len(bases.step)
         # a little below 1: sums in float32 may round up to where the kernel has to look
         crowded = blend == "normalised" and sum(layer.cover for _, layer in stack) > 1 - 1e-6
@@ -200,21 +184,3 @@ class Composer:
 def _rows_of(tensor: Tensor) -> NDArray[np.float32]:
     """The tensor's memory as one row a Gaussian. [N,…] -> [N,c]"""
     return tensor.numpy().reshape(len(tensor), math.prod(tensor.shape[1:]))
-
-
-def _same(before: Effect, now: Effect, gains: bool = True) -> bool:
-    """Whether two effects are equal; weights by identity and version."""
-    return len(before) == len(now) and all(
-        a[0] == b[0] and a[2] is b[2] and a[3:] == b[3:] and (not gains or a[1] == b[1])
-        for a, b in zip(before, now, strict=True)
-    )
-
-
-def _other_gains(before: Effect, now: Effect) -> set[str]:
-    """Kinds of change whose gain differs."""
-    return {
-        kind
-        for a, b in zip(before, now, strict=True)
-        for kind, gain in vars(a[1]).items()
-        if gain != getattr(b[1], kind)
-    }
