@@ -108,7 +108,7 @@ def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_p
     assert np.abs(hand.picture()[BANNER:] - expected[BANNER:]).max() <= 1
     assert (hand.picture()[BANNER:] == 0).mean() > 0.5
     found = psnr(torch.from_numpy(edited), torch.from_numpy(original))
-    assert hand.stage.comparer.psnr == pytest.approx(found, abs=1e-6)
+    assert hand.stage.canvas.comparer.psnr == pytest.approx(found, abs=1e-6)
     hand.stage.change(replace(view, compare=replace(view.compare, amplify=16.0)))
     hand.settle()
     assert hand.picture()[BANNER:].astype(int).sum() > 1.5 * expected[BANNER:].sum()
@@ -119,8 +119,10 @@ def test_equal_pictures_have_no_difference() -> None:
     with rig(first_view(bear(), 0.0, 0.0)) as hand:
         hand.key("Shift+Y")
         assert hand.picture()[BANNER:].max() == 0
-        assert hand.stage.comparer.psnr == math.inf
-        assert compare.told(hand.stage.work.view.compare, hand.stage.comparer.psnr) == "difference: none"
+        assert hand.stage.canvas.comparer.psnr == math.inf
+        assert (
+            compare.told(hand.stage.work.view.compare, hand.stage.canvas.comparer.psnr) == "difference: none"
+        )
 
 
 @pytest.mark.gl

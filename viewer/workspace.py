@@ -22,6 +22,8 @@ from .snapshots import Snapshot
 from .state import Comparison, ViewCamera, ViewState
 from .turntable import Bounds
 
+MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
+
 
 @dataclass(frozen=True)
 class SceneFacts:
@@ -124,6 +126,12 @@ def original(view: ViewState) -> ViewState:
     """The same view without any edit."""
     layers = tuple(replace(layer, enabled=False, solo=False) for layer in view.layers)
     return replace(view, layers=layers, compare=Comparison())
+
+
+def told(workspace: Workspace, text: str, now: float, error: bool = False) -> Workspace:
+    """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
+    until = now + (ERROR_S if error else MESSAGE_S)
+    return replace(workspace, message=Message(" ".join(text.split()), until, error))
 
 
 def settled(workspace: Workspace) -> Workspace:
