@@ -38,6 +38,14 @@ def random_gaussians(
     )
 
 
+def ball(count: int = 2000, radius: float = 1.0, seed: int = 0) -> Gaussians:
+    """Gaussians inside a ball around the origin."""
+    scene = random_gaussians(count, seed=seed, scale=0.01)
+    places = torch.nn.functional.normalize(scene.means, dim=1)
+    distances = torch.rand(count, 1, generator=torch.Generator().manual_seed(seed)) ** (1 / 3)
+    return replace(scene, means=radius * distances * places)
+
+
 def orbit_camera(
     width: int = 40, height: int = 24, azimuth: float = 0.4, elevation: float = 0.3, distance: float = 4.0
 ) -> Camera:
