@@ -55,7 +55,7 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"the image is {self.width}x{self.height} pixels; both must be at least 1")
         if float(self.K[0, 0]) <= 0 or float(self.K[1, 1]) <= 0:
-            raise ValueError(f"focal lengths are {self.K[0, 0]:g}, {self.K[1, 1]:g} px; both must be positive")
+            raise ValueError(f"focal lengths {self.K[0, 0]:g}, {self.K[1, 1]:g} px; both must be positive")
 
     @property
     def c2w(self) -> Tensor:
