@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from imgui_bundle import imgui
 from ui_rig import Rig, bear, first_view, rig
 
 from progdf.camera import Camera
@@ -17,13 +18,14 @@ from progdf.errors import ProgdfError
 from viewer import paint
 from viewer.layer_arguments import stack_of
 from viewer.paint import Stroke
+from viewer.smoothing import near_mean
 from viewer.state import Brush
 from viewer.turntable import to_camera
 
 POINTS = (700, 640)
 LINE = Stroke(
     np.ones(5, np.float32),
-    np.array([[0, 0], [10, 0], [20, 0], [40, 0], [np.nan, np.nan]], np.float32),
+    np.array([[0, 0, 0], [10, 0, 0], [20, 0, 0], [40, 0, 0], [np.nan, np.nan, np.nan]], np.float32),
     np.zeros(5, np.float32),
 )
 ERASE = Brush(active=True, radius=20.0, softness=0.5)
@@ -82,13 +84,106 @@ def test_a_stroke_does_not_depend_on_how_many_events_it_came_in() -> None:
     assert steps.reached == pytest.approx(whole.reached, abs=1e-5)
 
 
-def test_erase_add_and_smooth_go_to_none_to_all_and_to_the_mean() -> None:
+def result(stroke: Stroke, brush: Brush = ERASE, mode: str = "erase") -> np.ndarray:
+    found = paint.decoded(paint.painted(replace(stroke, mode=mode), brush), len(stroke.before))
+    return np.ones(len(stroke.before)) if found is None else found.numpy()
+
+
+def test_erase_and_add_go_to_none_and_to_all_as_far_as_the_brush_touched() -> None:
     before = np.array([0.0, 1.0, 0.5, 0.25, 0.75], np.float32)
-    stroke = replace(LINE, before=before, reached=np.array([1, 1, 0, 0, 0], np.float32))
-    for mode, expected in (("erase", 0.0), ("add", 1.0), ("smooth", 0.5)):
-        found = paint.decoded(paint.painted(stroke, mode), 5)
-        assert found is not None
-        assert found.tolist() == pytest.approx([expected, expected, 0.5, 0.25, 0.75], abs=0.003)
+    stroke = replace(LINE, before=before, reached=np.array([1, 1, 0.5, 0, 0], np.float32))
+    assert result(stroke, mode="erase").tolist() == pytest.approx([0.0, 0.0, 0.25, 0.25, 0.75], abs=0.003)
+    assert result(stroke, mode="add").tolist() == pytest.approx([1.0, 1.0, 0.75, 0.25, 0.75], abs=0.003)
+
+
+def step_under_a_brush(behind: float = 0.0) -> Stroke:
+    """A row of weights 0 | 1 along x under a brush that touches all; `behind`: how much deeper 1 lies."""
+    x = np.arange(-40, 40, dtype=np.float32)
+    places = np.stack([x, np.zeros_like(x), np.where(x < 0, 0.0, behind)], 1).astype(np.float32)
+    return Stroke((x >= 0).astype(np.float32), places, np.ones(80, np.float32))
+
+
+def test_smoothing_is_local_and_makes_a_ramp_of_a_step() -> None:
+    brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
+    smooth = result(step_under_a_brush(), brush, "smooth")
+    assert smooth[:15].max() < 0.01
+    assert smooth[-15:].min() > 0.99, "what is far from the step keeps its weight"
+    assert 0.3 < smooth[39] < smooth[40] < 0.7
+    assert (np.diff(smooth) >= -1 / 255).all()
+    small = result(step_under_a_brush(), replace(brush, radius=5.0), "smooth")
+    assert np.abs(np.diff(small)).max() > 2 * np.abs(np.diff(smooth)).max(), "a small brush smooths narrowly"
+
+
+def test_smoothing_does_not_mix_what_only_looks_near() -> None:
+    brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
+    apart = step_under_a_brush(behind=200.0)
+    assert result(apart, brush, "smooth") == pytest.approx(apart.before, abs=0.003)
+
+
+def test_smoothing_leaves_what_the_brush_has_not_touched_and_keeps_even_weights() -> None:
+    brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
+    step = step_under_a_brush()
+    half = replace(step, reached=(step.places[:, 0] < 10).astype(np.float32))
+    assert (result(half, brush, "smooth")[step.places[:, 0] >= 10] == 1.0).all()
+    even = replace(step, before=np.full(80, 0.6, np.float32))
+    assert result(even, brush, "smooth") == pytest.approx(np.full(80, 0.6), abs=0.003)
+
+
+def test_a_mean_of_neighbours_stays_within_them_and_does_not_depend_on_where_cells_begin() -> None:
+    rng = np.random.default_rng(0)
+    points, values = rng.normal(size=(4000, 3)).astype(np.float32), rng.random(4000).astype(np.float32)
+    means = [near_mean(points + np.float32(shift), values, 0.5) for shift in (0.0, 0.13, 0.31)]
+    for mean in means:
+        assert values.min() <= mean.min() <= mean.max() <= values.max()
+        assert mean.std() < 0.3 * values.std()
+        assert np.abs(mean - means[0]).mean() < 0.05
+    assert len(near_mean(points[:0], values[:0], 0.5)) == 0
+
+
+def test_feathering_softens_painted_edges_more_each_time_and_leaves_full_paint_full(hand: Rig) -> None:
+    hand.key("Shift+X")
+    assert hand.stage.work.view.layers[0].paint == paint.FULL
+    x, y = scarf_on_screen(hand)
+    hand.stage.work = replace(
+        hand.stage.work, view=replace(hand.stage.work.view, brush=replace(ERASE, softness=0.0))
+    )
+    hand.drag((x - 15, y), (x + 15, y))
+    hard = weights(hand)
+    assert set(np.unique(hard)) == {0.0, 1.0}
+    away = []
+    for _ in range(2):
+        hand.key("Shift+X")
+        away.append(np.abs(weights(hand) - hard).sum())
+    assert 0.0 < away[0] < away[1]
+    assert ((weights(hand) > 0.05) & (weights(hand) < 0.95)).sum() > 5
+    assert len(hand.stage.work.past.past) == 3
+    for _ in range(2):
+        hand.key("Ctrl+Z")
+    assert (weights(hand) == hard).all()
+
+
+@pytest.mark.parametrize(
+    ("mode", "modifier", "does"),
+    [
+        ("add", "Ctrl", "erase"),
+        ("erase", "Ctrl", "add"),
+        ("smooth", "Ctrl", "smooth"),
+        ("erase", "", "erase"),
+    ],
+)
+def test_ctrl_paints_the_opposite(mode: str, modifier: str, does: str) -> None:
+    assert paint.mode_while(mode, modifier) == does
+
+
+def test_shift_held_at_the_press_smooths_for_one_stroke(hand: Rig) -> None:
+    x, y = scarf_on_screen(hand)
+    hand.drag((x - 15, y), (x, y))
+    hard = weights(hand)
+    hand.modifier(imgui.Key.mod_shift)
+    hand.drag((x - 15, y), (x, y))
+    hand.modifier(imgui.Key.mod_shift, False)
+    assert weights(hand).min() > hard.min(), "smoothing brings some back"
+    assert hand.stage.work.view.brush.mode == "erase"
 
 
 def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Rig) -> None:

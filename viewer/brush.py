@@ -16,6 +16,12 @@ DRAG = "brush"
 """What a left drag does while the brush is active, beside those of `controls.DRAGS`."""
 
 NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
+WHOLE = (
+    ("None", "paint_clear", "Paint none of it (Backspace)"),
+    ("Full", "paint_fill", "Paint all of it (Shift+Backspace)"),
+    ("Feather", "paint_feather", "Soften the edges of its paint; again, more (Shift+X)"),
+)
+"""Buttons for all of a layer's paint: name, action of `controls.KEYS`, tip."""
 
 
 def obstacle(view: ViewState, focus: int | None) -> str:
@@ -37,7 +43,7 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     heading("Paint", ui)
     label("Brush", column)
     mode = choice("brush mode", tuple(NAMES[m] for m in paint.MODES), paint.MODES.index(brush.mode), ui)
-    tip("X")
+    tip("X; while painting, Ctrl does the opposite and Shift smooths")
     if mode is not None:
         brush = replace(brush, mode=paint.MODES[mode])
     label("Radius", column)
@@ -54,9 +60,9 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
         brush = replace(brush, through=bool(depth))
     label("All of it", column)
     imgui.begin_disabled(focus is None or view.layers[focus].locked)
-    half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
-    for text, asks, keys in (("None", "paint_clear", "Backspace"), ("Full", "paint_fill", "Shift+Backspace")):
-        if imgui.button(f"{text}##{asks}", imgui.ImVec2(half, 0.0)):
+    each = (imgui.get_content_region_avail().x - 12.0 * ui.scale) / 3
+    for text, asks, keys in WHOLE:
+        if imgui.button(f"{text}##{asks}", imgui.ImVec2(each, 0.0)):
             action = asks
         tip(keys)
         imgui.same_line(0.0, 6.0 * ui.scale)

@@ -194,6 +194,7 @@ KEYS = (
     Key("Shift+]", "brush_softness:0.1", "", repeats=True),
     Key("Backspace", "paint_clear", "paint none of it; with Shift all"),
     Key("Shift+Backspace", "paint_fill", ""),
+    Key("Shift+X", "paint_feather", "feather all its paint"),
     Key("M", "blend", "next blend rule"),
     Key("O", "overshoot", "sliders to 1.2: extrapolates"),
     Key("Escape", "unfocus", "focus no layer"),

@@ -126,8 +126,9 @@ def _stroke_begun(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Work
     if reason or work.focus is None:
         return hand, workspace.told(work, f"Nothing to paint: {reason}", sight.now, error=True)
     layer, camera = work.view.layers[work.focus], sight.camera(work.view.camera)
-    scene, through = sight.engine.gaussians(work.view), work.view.brush.through
-    stroke = paint.begun(layer.paint, sight.engine.gdfs[layer.gdf], scene, camera, through)
+    scene, held = sight.engine.gaussians(work.view), work.view.brush
+    mode = paint.mode_while(held.mode, inputs.modifier())
+    stroke = paint.begun(layer.paint, sight.engine.gdfs[layer.gdf], scene, camera, held.through, mode)
     return _painted(Hand(brush.DRAG, stroke), work, sight)
 
 
@@ -138,7 +139,7 @@ def _painted(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace
         return hand, work
     density = imgui.get_io().display_framebuffer_scale.x * sight.ui.scale
     stroke = paint.drawn_to(hand.stroke, *sight.cursor, view.brush, density)
-    painted = stack.with_paint(view, focus, paint.painted(stroke, view.brush.mode))
+    painted = stack.with_paint(view, focus, paint.painted(stroke, view.brush, density))
     return replace(hand, stroke=stroke), replace(work, view=painted)
 
 

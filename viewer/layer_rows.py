@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from progdf.checkpoint import Gdf
 from progdf.gaussians import Gaussians
@@ -31,6 +32,7 @@ class LayerRow:
         shared: per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
         kinds: which gains of `Gains` have something to scale
         curve: the visible change over the strength, measured when it is first asked for
+        points: centres of its members in the original, world units. [M,3] float32
     """
 
     count: int
@@ -41,6 +43,7 @@ class LayerRow:
     shared: tuple[int, ...] = ()
     kinds: frozenset[str] = frozenset(KINDS.values())
     curve: Curve = flat
+    points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
 
 
 def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:
@@ -59,6 +62,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
         shared=tuple(_in_both(gdf, other) for other in gdfs),
         kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
         curve=curve_of(scene, gdf),
+        points=scene.means[members].numpy(),
     )
 
 

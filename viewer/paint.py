@@ -24,6 +24,7 @@ from progdf.gaussians import Gaussians
 from progdf.layers import Gains, Layer
 from progdf.rasterize import rasterize
 
+from .smoothing import near_mean
 from .state import Brush
 
 MODES = ("add", "erase", "smooth")
@@ -43,20 +44,30 @@ class Stroke:
 
     Args:
         before: weights when it began, 0..1. [M]
-        places: where each member is in the picture, pixels; NaN where the brush cannot reach it. [M,2]
+        places: where each member is in the picture, pixels, and f·log(depth), so that neighbours are as far
+            apart as they look; NaN where the brush cannot reach it. [M,3]
         reached: largest touch of the brush so far, 0..1. [M]
+        mode: of `MODES`
         last: where the brush was last, pixels
     """
 
     before: Floats
     places: Floats
     reached: Floats
+    mode: str = "erase"
     last: tuple[float, float] | None = None
 
 
 def next_mode(mode: str) -> str:
     """The mode after this one."""
     return MODES[(MODES.index(mode) + 1) % len(MODES)]
+
+
+def mode_while(mode: str, modifier: str) -> str:
+    """What a stroke does that begins with a modifier held: Ctrl the opposite, Shift smooths, as elsewhere."""
+    if modifier == "Shift":
+        return "smooth"
+    return {"add": "erase", "erase": "add"}.get(mode, mode) if modifier == "Ctrl" else mode
 
 
 def radius(wanted: float) -> float:
@@ -105,7 +116,9 @@ def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
     return Layer(gdf, strength, True, gains, decoded(paint, len(gdf.region)))
 
 
-def begun(paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool) -> Stroke:
+def begun(
+    paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool, mode: str = "erase"
+) -> Stroke:
     """A stroke that has touched nothing yet.
 
     Args:
@@ -114,6 +127,7 @@ def begun(paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool)
         scene: as it is on screen
         camera: of the picture
         through: also what lies behind the front surface
+        mode: of `MODES`
     """
     weights, count = decoded(paint, len(gdf.region)), len(gdf.region)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()
@@ -124,13 +138,14 @@ def begun(paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool)
     depth = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         places = local[:, :2] / depth[:, None] * camera.K.diagonal()[:2].numpy() + camera.K[:2, 2].numpy()
+        places = np.column_stack([places, float(camera.K[0, 0]) * np.log(depth)])
     reachable = np.isfinite(places).all(1) & (depth > 0.0)
     if not through:
         size = scene.log_scales[members].amax(1).exp().numpy()
         surface = _surface(scene, depth_of_all, camera, np.where(reachable[:, None], places, 0.0))
         reachable &= depth <= surface * (1.0 + _BEHIND) + size
     places = np.where(reachable[:, None], places, np.nan).astype(np.float32)
-    return Stroke(before, places, np.zeros(count, np.float32))
+    return Stroke(before, places, np.zeros(count, np.float32), mode)
 
 
 def drawn_to(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 1.0) -> Stroke:
@@ -145,21 +160,46 @@ def drawn_to(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 
     here = np.array([x, y], np.float32)
     there = here if stroke.last is None else np.array(stroke.last, np.float32)
     way = here - there
-    along = np.clip(((stroke.places - there) @ way) / max(float(way @ way), 1e-12), 0.0, 1.0)
-    away = np.linalg.norm(stroke.places - there - along[:, None] * way, axis=1) / (brush.radius * density)
+    places = stroke.places[:, :2]
+    along = np.clip(((places - there) @ way) / max(float(way @ way), 1e-12), 0.0, 1.0)
+    away = np.linalg.norm(places - there - along[:, None] * way, axis=1) / (brush.radius * density)
     fall = np.clip((1.0 - away) / max(brush.softness, 1e-3), 0.0, 1.0)
     touch = np.nan_to_num(fall * fall * (3.0 - 2.0 * fall)).astype(np.float32)
     return replace(stroke, reached=np.maximum(stroke.reached, touch), last=(x, y))
 
 
-def painted(stroke: Stroke, mode: str) -> str:
-    """The paint that the stroke has made so far: to 1, to 0, or to the mean of what it touched."""
-    touched = float(stroke.reached.sum())
-    if touched == 0.0:
-        return encoded(stroke.before)
-    mean = float((stroke.before * stroke.reached).sum()) / touched
-    goal = {"add": 1.0, "erase": 0.0, "smooth": mean}[mode]
+def painted(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
+    """The paint that the stroke has made so far: to 1, to 0, or to the mean of neighbours under the brush.
+
+    Args:
+        stroke: under way
+        brush, density: as for `drawn_to`; smoothing reaches as far as half the brush
+    """
+    goal = np.full_like(stroke.before, 1.0 if stroke.mode == "add" else 0.0)
+    if stroke.mode == "smooth":
+        under = np.flatnonzero(stroke.reached)
+        width = 0.5 * brush.radius * density
+        goal[under] = near_mean(stroke.places[under], stroke.before[under], width)
     return encoded(stroke.before + (goal - stroke.before) * stroke.reached)
+
+
+def feathered(paint: str, points: Floats, width: float) -> str:
+    """The paint with its edges softened, wherever one looks from.
+
+    Args:
+        paint: of a layer
+        points: the centres of its members, world units. [M,3]
+        width: see `near_mean`, world units, > 0
+
+    Raises:
+        ProgdfError: see `decoded`.
+    """
+    weights = decoded(paint, len(points))
+    if weights is None:
+        return FULL
+    soft, somewhere = weights.numpy().copy(), np.isfinite(points).all(1)
+    soft[somewhere] = near_mean(points[somewhere], soft[somewhere], width)
+    return encoded(soft)
 
 
 def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -> Floats:

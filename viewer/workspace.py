@@ -20,9 +20,11 @@ from .layer_rows import LayerRow
 from .playback import Player
 from .snapshots import Snapshot
 from .state import Comparison, ViewCamera, ViewState
-from .turntable import Bounds
+from .turntable import FARTHEST, Bounds
 
 MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
+FEATHER = 0.15
+"""How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return _framed(workspace, facts, aspect) if name == "frame" else _home(workspace)
     if name in ("paint_clear", "paint_fill"):
         return _repainted(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
+    if name == "paint_feather":
+        return _feathered(workspace, facts)
     if name == "dial":
         return _dialled(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
@@ -254,6 +258,18 @@ def _repainted(workspace: Workspace, facts: SceneFacts, weight: float) -> Worksp
         return stack.with_paint(view, index, paint.encoded(np.full(count, weight, np.float32)))
 
     return _on_focused(workspace, even)
+
+
+def _feathered(workspace: Workspace, facts: SceneFacts) -> Workspace:
+    """The edges of the focused layer's paint softened a little; again softens them more."""
+
+    def softened(view: ViewState, index: int) -> ViewState:
+        layer = view.layers[index]
+        row = facts.rows[layer.gdf]
+        width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
+        return stack.with_paint(view, index, paint.feathered(layer.paint, row.points, width))
+
+    return _on_focused(workspace, softened)
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:
