@@ -1,9 +1,9 @@
-"""Fixtures that several test files share: the real data where it is present, and golden screenshots."""
+"""Fixtures that several test files share: the real data where it is present, threads, golden screenshots."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,16 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real test data at {folder}")
     return folder
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """The rasteriser draws with two threads, as on the smallest machine that has several."""
+    from progdf.rasterize import set_threads
+
+    set_threads(2)
+    yield
+    set_threads(None)
 
 
 @pytest.fixture

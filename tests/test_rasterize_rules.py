@@ -1,0 +1,107 @@
+"""What a rasterised picture is, in both engines: crops, order, support, background, weights of masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from progdf.rasterize import ENGINES, alpha_weights, rasterize, render
+from tests.drawn import CASES, draw, drawn_case
+from tests.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 90, 61), (13, 7, 14, 8), (31, 8, 65, 40), (64, 33, 90, 61)])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_crop_is_the_slice_of_the_whole_picture_bit_for_bit(
+    engine: str, crop: tuple[int, int, int, int]
+) -> None:
+    camera = orbit_camera(90, 61)
+    camera = replace(camera, K=camera.K + torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, -5.0], [0.0, 0.0, 0.0]]))
+    scene = concatenate(
+        random_gaussians(150, seed=4), one_gaussian(mean=(2.0, 1.0, -2.5), scales=(1.0, 0.02, 0.5))
+    )
+    whole, part = draw(scene, camera, engine), draw(scene, camera, engine, crop=crop)
+    x0, y0, x1, y1 = crop
+    assert torch.equal(part.image, whole.image[y0:y1, x0:x1])
+    assert torch.equal(part.transmittance, whole.transmittance[y0:y1, x0:x1])
+
+
+def test_the_order_of_the_list_does_not_matter_where_depths_differ() -> None:
+    scene, camera = random_gaussians(300, seed=8), orbit_camera(50, 40)
+    activated = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh0.sigmoid())
+    shuffle = torch.randperm(300, generator=torch.Generator().manual_seed(1))
+    pictures = [
+        rasterize(*tensors, camera.viewmat, camera.K, 50, 40)[0]
+        for tensors in (activated, [tensor[shuffle] for tensor in activated])
+    ]
+    assert torch.equal(*pictures)
+
+
+def test_equal_depths_are_drawn_in_the_order_of_the_list() -> None:
+    red, green = (
+        one_gaussian(rgb=(1.0, 0.0, 0.0), opacity=0.99),
+        one_gaussian(rgb=(0.0, 1.0, 0.0), opacity=0.99),
+    )
+    camera = front_camera()
+    centre = (camera.height // 2, camera.width // 2)
+    assert float(render(concatenate(red, green), camera)[centre][0]) > 0.9
+    assert float(render(concatenate(green, red), camera)[centre][1]) > 0.9
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> None:
+    camera = front_camera(60, 40)
+    image, transmittance, _ = rasterize(
+        torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.3),
+        torch.tensor([0.7]), torch.ones(1, 3), camera.viewmat, camera.K, 60, 40, engine=engine,
+    )  # fmt: skip
+    x, y = torch.meshgrid(torch.arange(60) + 0.5 - 30, torch.arange(40) + 0.5 - 20, indexing="xy")
+    variance = (0.3 * 30.0 / 2.0) ** 2 + 0.3
+    alpha = 0.7 * torch.exp(-0.5 * (x.double() ** 2 + y.double() ** 2) / variance)
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+    torch.testing.assert_close(image[..., 0].double(), alpha, rtol=0, atol=2e-6)
+    assert torch.equal(transmittance == 1.0, alpha == 0.0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_no_pixel_falls_below_the_least_transmittance(engine: str) -> None:
+    drawn = drawn_case("400 opaque ones stacked", engine)
+    assert 1e-4 < float(drawn.transmittance.min()) < 2e-3
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_no_gaussians_leave_the_background(engine: str) -> None:
+    image, transmittance, _ = rasterize(
+        *(torch.zeros(shape) for shape in ((0, 3), (0, 4), (0, 3), (0,), (0, 3))),
+        torch.eye(4), front_camera().K, 40, 24, background=(0.25, 0.5, 0.75), engine=engine,
+    )  # fmt: skip
+    assert torch.equal(image, torch.tensor([0.25, 0.5, 0.75]).expand(24, 40, 3))
+    assert bool((transmittance == 1.0).all())
+
+
+def test_mask_weights_match_the_reference_and_the_picture() -> None:
+    scene, camera = random_gaussians(200, seed=9), orbit_camera(90, 61)
+    mask = torch.rand(61, 90, generator=torch.Generator().manual_seed(2)).round()
+    found = alpha_weights(scene, camera, mask)
+    expected = alpha_weights(scene.to(dtype=torch.float64), camera, mask, engine="reference")
+    torch.testing.assert_close(found.double(), expected, rtol=2e-5, atol=2e-5)
+    _, transmittance, _ = rasterize(
+        scene.means, scene.quats, scene.scales, scene.opacities, torch.zeros(200, 3),
+        camera.viewmat, camera.K, 90, 61,
+    )  # fmt: skip
+    assert float(found[:, 2].sum()) == pytest.approx(float((1 - transmittance).sum()), rel=1e-5)
+    inside = float(((1 - transmittance) * mask).sum())
+    assert float(found[:, 0].sum()) == pytest.approx(inside, rel=1e-5)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_mask_weights_of_every_hard_case_are_finite(engine: str) -> None:
+    for name, case in CASES.items():
+        mask = torch.ones(case.camera.height, case.camera.width, dtype=torch.bool)
+        weights = alpha_weights(case.gaussians.to(dtype=torch.float64), case.camera, mask, engine=engine)
+        assert bool(weights.isfinite().all()), name
+        assert torch.equal(weights[:, 1], weights[:, 3]), name

@@ -1,0 +1,116 @@
+"""How the rasteriser runs: threads, compiling, limits, and what it refuses."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.rasterize import alpha_weights, rasterize, render, set_threads
+from tests.drawn import INPUTS, Drawn, draw
+from tests.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+
+@pytest.mark.parametrize("few", [0, 8192])
+def test_bits_do_not_depend_on_the_run_or_the_number_of_threads(
+    few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from progdf.rasterize import cpu
+
+    scene, camera = random_gaussians(2000, seed=6, sh_degree=1), orbit_camera(128, 96)
+    first = draw(scene, camera, "cpu")
+    monkeypatch.setattr(cpu, "FEW", few)  # one thread lists few Gaussians, several list more
+    set_threads(1)
+    for again in (draw(scene, camera, "cpu"), draw(scene, camera, "cpu")):
+        assert torch.equal(again.image, first.image)
+        for name in INPUTS:
+            assert torch.equal(again.gradients[name], first.gradients[name]), name
+
+
+def test_two_python_threads_may_draw_at_once() -> None:
+    scene, camera = random_gaussians(500, seed=7), orbit_camera(64, 48)
+    expected = draw(scene, camera, "cpu")
+    found: list[Drawn] = []
+
+    def work() -> None:
+        found.extend(draw(scene, camera, "cpu") for _ in range(5))
+
+    workers = [threading.Thread(target=work) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert len(found) == 10
+    assert all(torch.equal(drawn.image, expected.image) for drawn in found)
+    assert all(torch.equal(drawn.gradients["means"], expected.gradients["means"]) for drawn in found)
+
+
+def test_camera_gradients_of_some_rows_only_are_refused() -> None:
+    scene, camera = one_gaussian(), front_camera()
+    with pytest.raises(ValueError, match="viewmat or K wants gradients, which need all rows"):
+        rasterize(
+            scene.means, scene.quats, scene.scales, scene.opacities, torch.ones(1, 3),
+            camera.viewmat.clone().requires_grad_(), camera.K, 40, 24, grad_rows=torch.tensor([0]),
+        )  # fmt: skip
+
+
+def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    from progdf.rasterize import cpu
+
+    monkeypatch.setattr(cpu, "MOST_INTERSECTIONS", 100)
+    with pytest.raises(ProgdfError, match="more than 100; draw a smaller image or a crop") as error:
+        render(random_gaussians(200, seed=1), orbit_camera(100, 60))
+    assert "\n" not in str(error.value)
+
+
+def test_wrong_shapes_and_windows_are_refused_by_name() -> None:
+    camera = front_camera()
+    scene = one_gaussian()
+    with pytest.raises(ValueError, match=r"crop \(0, 0, 41, 24\) is empty or leaves the image of 40x24"):
+        render(scene, camera, crop=(0, 0, 41, 24))
+    with pytest.raises(ValueError, match="no rasteriser 'gpu', expected one of reference, cpu"):
+        render(scene, camera, engine="gpu")
+    with pytest.raises(ValueError, match=r"mask has shape \[3, 3\], expected \[24, 40\]"):
+        alpha_weights(scene, camera, torch.ones(3, 3))
+    with pytest.raises(ValueError, match=r"quats has shape \[1, 3\], expected \[1, 4\]"):
+        rasterize(
+            scene.means, scene.quats[:, :3], scene.scales, scene.opacities, torch.ones(1, 3),
+            camera.viewmat, camera.K, 40, 24,
+        )  # fmt: skip
+
+
+def test_importing_progdf_does_not_load_the_compiler() -> None:
+    code = "import sys, progdf, progdf.rasterize; print('numba' in sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "False"
+
+
+def test_a_cold_start_says_once_that_it_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from progdf.rasterize import jit
+
+    monkeypatch.setattr(jit, "CACHE", tmp_path)
+    with caplog.at_level(logging.WARNING, logger="progdf"):
+        for _ in range(2):
+            with jit.running("forward", 9):
+                pass
+    assert [record.getMessage() for record in caplog.records] == [
+        "compiling the rasteriser's forward kernels (about 9 s, once per machine)"
+    ]
+
+
+def test_the_kernels_are_cached_outside_the_source_tree() -> None:
+    from progdf.rasterize import jit
+
+    render(one_gaussian(), front_camera())
+    assert list(jit.CACHE.rglob("*.nbi"))
+    assert Path(__file__).parents[1] not in jit.CACHE.parents
