@@ -15,6 +15,7 @@ from progdf.ply import save_ply
 from progdf.region import Region
 from progdf.scenes import DemoScene, bear
 from progdf.sh import rgb_to_sh0
+from progdf.trajectory import FILE_NAME, Trajectory, save_trajectory
 
 NODES = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
 GREEN, GOLD = (0.10, 0.62, 0.24), (0.90, 0.66, 0.15)
@@ -38,6 +39,26 @@ class Stack:
         for path, gdf in zip(paths[1:], self.gdfs, strict=True):
             save_gdf(path, gdf)
         return paths
+
+    def save_runs(self, folder: Path) -> list[Path]:
+        """bear.ply, and each edit in a run folder of its name with what was recorded; their paths."""
+        save_ply(folder / "bear.ply", self.scene)
+        paths = [folder / "bear.ply"]
+        for gdf in self.gdfs:
+            (folder / gdf.name).mkdir()
+            paths.append(folder / gdf.name / f"{gdf.name}.gdf")
+            save_gdf(paths[-1], gdf)
+            extra = {"members": gdf.region.members, "score": gdf.region.score}
+            save_trajectory(paths[-1].with_name(FILE_NAME), recording_of(gdf), extra, {})
+        return paths
+
+
+def recording_of(gdf: Gdf) -> Trajectory:
+    """What a run that led to this edit may have recorded: on the way, more of it than the field shows."""
+    s = torch.tensor(gdf.field.recorded)
+    rows = [(1.0 + 0.5 * float(x) * (1.0 - float(x))) * gdf.field.offsets(float(x)) for x in s]
+    ends = (len(s) - 1,)
+    return Trajectory(s, torch.stack(rows).half(), rows[-1], torch.arange(len(s)), ends, (1.0,))
 
 
 def bear_stack(size: int = 4000) -> Stack:

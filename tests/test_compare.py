@@ -120,9 +120,7 @@ def test_equal_pictures_have_no_difference() -> None:
         hand.key("Shift+Y")
         assert hand.picture()[BANNER:].max() == 0
         assert hand.stage.canvas.comparer.psnr == math.inf
-        assert (
-            compare.told(hand.stage.work.view.compare, hand.stage.canvas.comparer.psnr) == "difference: none"
-        )
+        assert hand.stage.canvas.comparer.labels(hand.stage.work.view).line == "difference: none"
 
 
 @pytest.mark.gl

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -83,6 +83,11 @@ class Rig:
             self.move(*(a + share * (b - a) for a, b in zip(start, end, strict=True)))
         self.release(button)
 
+    def click(self, x: float, y: float) -> None:
+        self.move(x, y)
+        self.press()
+        self.release()
+
     def double_click(self, x: float, y: float) -> None:
         self.move(x, y)
         for _ in range(2):
@@ -136,6 +141,7 @@ def rig(
     stack: Stack | None = None,
     pictures: Path = Path(),
     draw: str = "cpu",
+    gdf_paths: Sequence[Path] = (),
 ) -> Iterator[Rig]:
     """A stage on the bear.
 
@@ -145,11 +151,12 @@ def rig(
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
         draw: what draws the splats, as for the engine
+        gdf_paths: where the edits were opened from, one for each; none is not from files
     """
     stack = stack or bear()
     context = headless_context()
     engine = Engine(context, stack.scene, stack.gdfs, draw=draw)
-    facts = Document("bear.ply", stack.scene, stack.gdfs).facts()
+    facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
     stage = Stage(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
     try:
         yield Rig(stage, points, density)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import moderngl
 
 from . import draft
 from .compare import Comparer
 from .engine import Engine, FrameTimings
 from .painters import Image
+from .recordings import Recording
 from .snapshot_cards import SnapshotCard
 from .snapshots import Snapshot, shown
 from .state import ViewState
@@ -21,10 +24,12 @@ class Canvas:
     Args:
         context: the GL context of the engine
         engine: draws them; stays the caller's
+        found: where the engine's edits were recorded, one for each
     """
 
-    def __init__(self, context: moderngl.Context, engine: Engine) -> None:
-        self.comparer, self._thumbnails = Comparer(engine, context), Thumbnails(context, engine)
+    def __init__(self, context: moderngl.Context, engine: Engine, found: Sequence[Recording] = ()) -> None:
+        self.comparer = Comparer(engine, context, found)
+        self._thumbnails = Thumbnails(context, engine)
         self.timings = FrameTimings()
         """Of the picture on screen."""
         self.drawn = 0

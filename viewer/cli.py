@@ -144,7 +144,7 @@ def _compare(engine: Engine, view: ViewState, camera: Camera, path: Path) -> flo
     comparer = Comparer(engine, engine.ctx)
     try:
         image = comparer.image(view, camera=camera)
-        Image.fromarray(labelled(image, view.compare, comparer.psnr)).save(path)
+        Image.fromarray(labelled(image, view.compare, comparer.labels(view))).save(path)
     finally:
         comparer.release()
     return comparer.psnr

@@ -1,31 +1,34 @@
-"""Original and edited in one picture: side by side at a divider, or their difference amplified, with PSNR.
+"""Two pictures in one: side by side at a divider, or their difference amplified, with PSNR.
 
-The original is drawn by a second engine without edits, made when it is first asked for: a slider then moves
-only one of the two pictures, the divider neither.
+Beside the edited picture stands the original, or the same edits as they were recorded. That side is drawn by
+a second engine, made when it is first asked for: against the original a slider then moves only one of the
+two pictures, the divider neither.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import moderngl
 import numpy as np
-from PIL import Image as Pillow
-from PIL import ImageDraw, ImageFont
 
 from progdf.camera import Camera
+from progdf.checkpoint import Gdf
+from progdf.errors import ProgdfError
 
+from . import recordings
+from .compare_labels import Labels, column, labels
 from .engine import Engine, FrameTimings, drawn_size
-from .film import Pixels, to_pixels
 from .gl.present import Presenter
 from .painters import Image
-from .state import Comparison, ViewState
+from .recordings import Recording
+from .state import ViewState
 
 MODES = ("off", "split", "difference")
-LEFT, RIGHT = "original", "edited"
+AGAINST = ("original", "recorded")
 MOST_AMPLIFIED = 64.0
-_SHADE, _INK = (22, 24, 27), (222, 225, 230)
 
 
 class Comparer:
@@ -34,14 +37,18 @@ class Comparer:
     Args:
         engine: draws the edited scene; stays the caller's
         ctx: the engine's context; None for `image` only
+        found: where the engine's edits were recorded, one for each
     """
 
-    def __init__(self, engine: Engine, ctx: moderngl.Context | None) -> None:
+    def __init__(self, engine: Engine, ctx: moderngl.Context | None, found: Sequence[Recording] = ()) -> None:
         self.engine = engine
         self.psnr = math.nan
-        """Of the last difference or `image`, dB; infinite where nothing differs."""
+        """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
+        self.recordings = tuple(found) or (Recording(),) * len(engine.gdfs)
+        """Where the edits were recorded; one that turned out to be broken is none."""
         self._ctx = ctx
-        self._original: Engine | None = None
+        self._other: Engine | None = None
+        self._against = ""  # what `_other` draws, of `AGAINST`
         self._presenter: Presenter | None = None
         self._texture: moderngl.Texture | None = None
         self._shown: float | None = None  # how much the difference in the texture is amplified
@@ -54,7 +61,7 @@ class Comparer:
         if view.compare.mode == "off":
             return False
         apart = view.compare.mode == "difference" and self._shown != view.compare.amplify
-        return apart or self._second().needs_draw(_untouched(view), drawn)
+        return apart or self._second(view).needs_draw(self._beside(view), drawn)
 
     def draw(
         self,
@@ -71,10 +78,11 @@ class Comparer:
         Raises:
             ProgdfError: a layer of `view` means nothing.
         """
-        if view.compare.mode == "split":
-            return self._draw_split(view, framebuffer, size, pixels)
         if view.compare.mode == "difference":
             return self._draw_difference(view, framebuffer, size)
+        self._shown = None  # the engines go on, and the next difference is another
+        if view.compare.mode == "split":
+            return self._draw_split(view, framebuffer, size, pixels)
         return self.engine.draw(view, framebuffer, size, pixels)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
@@ -82,34 +90,73 @@ class Comparer:
         if view.compare.mode == "off":
             return self.engine.image(view, size, camera)
         edited = self.engine.image(view, size, camera)
-        original = self._second().image(_untouched(view), size, camera)
-        self.psnr = _psnr(original, edited)
+        other = self._second(view).image(self._beside(view), size, camera)
+        self.psnr = _psnr(other, edited)
         if view.compare.mode == "split":
             at = column(view.compare, edited.shape[1])
-            return np.concatenate([original[:, :at], edited[:, at:]], axis=1)
-        return difference(original, edited, view.compare.amplify)
+            return np.concatenate([other[:, :at], edited[:, at:]], axis=1)
+        return difference(other, edited, view.compare.amplify)
+
+    def against(self, view: ViewState) -> str:
+        """What the picture of `view` is set against, of `AGAINST`: what it asks for, if that exists."""
+        return "original" if recordings.obstacle(self.recordings) else view.compare.against
+
+    def labels(self, view: ViewState) -> Labels:
+        """What to say over the last comparison, of `view`."""
+        wished, found = view.compare.against, self.against(view)
+        obstacle = recordings.obstacle(self.recordings) if wished != found else ""
+        recorded = recordings.told(view, self.engine.gdfs, self.recordings) if found == "recorded" else ""
+        return labels(view.compare, self.psnr, recorded, obstacle)
 
     def release(self) -> None:
         """Give back all but the engine."""
-        for held in (self._original, self._presenter, self._texture):
+        for held in (self._other, self._presenter, self._texture):
             if held is not None:
                 held.release()
 
-    def _second(self) -> Engine:
-        if self._original is None:
-            self._original = Engine(self._ctx, self.engine.scene, (), self.engine.draws_with)
-        return self._original
+    def _second(self, view: ViewState) -> Engine:
+        """What draws the other side of `view`."""
+        if self._other is None or self._against != self.against(view):
+            gdfs = self._recorded() if self.against(view) == "recorded" else ()
+            if self._other is not None:
+                self._other.release()
+            self._against = self.against(view)  # reading a recording may have shown that it is none
+            self._other = Engine(self._ctx, self.engine.scene, gdfs, self.engine.draws_with)
+        return self._other
+
+    def _recorded(self) -> tuple[Gdf, ...]:
+        """The edits as they were recorded."""
+        gdfs, read = [], []
+        for gdf, recording in zip(self.engine.gdfs, self.recordings, strict=True):
+            try:
+                gdfs.append(recordings.recorded(gdf, recording))
+                read.append(recording)
+            except ProgdfError as error:
+                gdfs.append(gdf)
+                read.append(Recording(reason=str(error)))
+        self.recordings = tuple(read)
+        return tuple(gdfs)
+
+    def _beside(self, view: ViewState) -> ViewState:
+        """What the other side of `view` shows."""
+        recorded = self.against(view) == "recorded"
+        return recordings.within(view, self.recordings) if recorded else replace(view, layers=())
 
     def _draw_split(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
-        at = column(view.compare, size[0])
+        at, new = column(view.compare, size[0]), self.needs_draw(view, size, pixels)
+        other, beside = self._second(view), self._beside(view)
         edited = self.engine.draw(view, framebuffer, size, pixels)
         framebuffer.scissor = (0, 0, at, size[1])
         try:
-            original = self._second().draw(_untouched(view), framebuffer, size, pixels)
+            original = other.draw(beside, framebuffer, size, pixels)
         finally:
             framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
+        if new and pixels == 1 and self._against == "recorded":
+            self.psnr = _psnr(other.image(beside, size), self.engine.image(view, size))
+        elif new:
+            self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors
         return _together(edited, original)
 
     def _draw_difference(
@@ -124,7 +171,7 @@ class Comparer:
                 self._texture = self._ctx.texture(size, 3, dtype="f4")
             self._texture.write(apart)
             self._shown = view.compare.amplify
-            timings = _together(self.engine.timings, self._second().timings)
+            timings = _together(self.engine.timings, self._second(view).timings)
         else:
             timings = FrameTimings(drawn=self.engine.timings.drawn)
         self._presenter = self._presenter or Presenter(self._ctx)
@@ -132,41 +179,10 @@ class Comparer:
         return timings
 
 
-def column(compare: Comparison, width: int) -> int:
-    """Where in a picture of this width the edited side begins, pixels."""
-    return max(0, min(width, round(compare.divider * width)))
-
-
-def difference(original: Image, edited: Image, amplify: float) -> Image:
-    """amplify · |edited − original| of what is seen (0..1) of each; black where nothing differs. [H,W,3]"""
-    apart: Image = np.abs(np.clip(edited, 0.0, 1.0) - np.clip(original, 0.0, 1.0)) * np.float32(amplify)
+def difference(other: Image, edited: Image, amplify: float) -> Image:
+    """amplify · |edited − other| of what is seen (0..1) of each; black where nothing differs. [H,W,3]"""
+    apart: Image = np.abs(np.clip(edited, 0.0, 1.0) - np.clip(other, 0.0, 1.0)) * np.float32(amplify)
     return apart
-
-
-def told(compare: Comparison, decibels: float) -> str:
-    """The line over a difference."""
-    if math.isinf(decibels):
-        return "difference: none"
-    return f"difference × {compare.amplify:g} · PSNR {decibels:.1f} dB"
-
-
-def labelled(image: Image, compare: Comparison, decibels: float) -> Pixels:
-    """A picture of `Comparer.image` for a file: with the divider and what is on which side."""
-    pixels = to_pixels(image)
-    if compare.mode == "off":
-        return pixels
-    page = Pillow.fromarray(pixels)
-    draw = ImageDraw.Draw(page, "RGBA")
-    if compare.mode == "difference":
-        line = told(compare, decibels).replace("×", "x")  # Pillow's own font has no ×
-        _tag(draw, page.width / 2, "m", line, page.size)
-    else:
-        at = column(compare, page.width)
-        draw.line([(at, 0), (at, page.height)], (*_SHADE, 140), 3)
-        draw.line([(at, 0), (at, page.height)], (255, 255, 255, 255), 1)
-        _tag(draw, at, "r", LEFT, page.size)
-        _tag(draw, at, "l", RIGHT, page.size)
-    return np.asarray(page)
 
 
 def switched(view: ViewState, mode: str) -> ViewState:
@@ -175,26 +191,18 @@ def switched(view: ViewState, mode: str) -> ViewState:
     return replace(view, compare=replace(view.compare, mode=mode))
 
 
-def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[int, int]) -> None:
-    """A word at the top: left of x ("r" as it ends there), right of it ("l"), or around it; where it fits."""
-    letters = max(11, round(size[1] / 28))
-    font = ImageFont.load_default(size=letters)
-    wide, pad, gap = draw.textlength(text, font), 0.5 * letters, 0.6 * letters
-    left = {"r": x - gap - wide - 2 * pad, "l": x + gap, "m": x - wide / 2 - pad}[side]
-    if left < 0 or left + wide + 2 * pad > size[0]:
-        return
-    box = (left, gap, left + wide + 2 * pad, gap + 1.6 * letters)
-    draw.rounded_rectangle(box, 0.3 * letters, (*_SHADE, 200))
-    draw.text((left + pad, gap + 0.8 * letters), text, _INK, font, anchor="lm")
+def turned(view: ViewState) -> ViewState:
+    """Against the recording instead of the original, or back; where nothing is compared, side by side."""
+    compare = view.compare
+    if compare.mode == "off":
+        return replace(view, compare=replace(compare, mode="split", against="recorded"))
+    against = AGAINST[1 - AGAINST.index(compare.against)]
+    return replace(view, compare=replace(compare, against=against))
 
 
-def _untouched(view: ViewState) -> ViewState:
-    return replace(view, layers=())
-
-
-def _psnr(original: Image, edited: Image) -> float:
+def _psnr(other: Image, edited: Image) -> float:
     """As `progdf.metrics.psnr`, of what is seen, dB; without its copies in float64: a hand waits for it."""
-    apart = difference(original, edited, 1.0).ravel()
+    apart = difference(other, edited, 1.0).ravel()
     error = float(np.square(apart, out=apart).mean(dtype=np.float64)) if apart.size else 0.0
     return math.inf if error == 0.0 else -10.0 * math.log10(error)
 

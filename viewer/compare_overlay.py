@@ -7,7 +7,7 @@ from dataclasses import replace
 from imgui_bundle import imgui
 
 from . import overlay
-from .compare import LEFT, RIGHT, told
+from .compare_labels import Labels
 from .overlay import Area
 from .state import ViewState
 from .ui_context import PALETTE, SMALL_PX, UiContext, u32
@@ -37,15 +37,17 @@ def show_grip() -> None:
     imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
 
 
-def draw(view: ViewState, psnr: float, area: Area, held: bool, ui: UiContext) -> None:
-    """Divider and labels, or the line over a difference.
+def draw(view: ViewState, said: Labels, area: Area, held: bool, ui: UiContext) -> None:
+    """Divider and labels, or the line over a difference; and why it is not what was asked for.
 
     Args:
-        psnr: of the difference on screen, dB
+        said: the words
         held: the divider is in the hand, or under it
     """
     if view.compare.mode == "difference":
-        overlay.banner(told(view.compare, psnr), area, ui)
+        overlay.banner(said.line, area, ui)
+    if view.compare.mode != "off" and said.notice:
+        overlay.banner(said.notice, area, ui, row=1)
     if view.compare.mode != "split":
         return
     x = round(view.compare.divider * area.width)
@@ -56,8 +58,8 @@ def draw(view: ViewState, psnr: float, area: Area, held: bool, ui: UiContext) ->
     canvas.add_line(top, bottom, u32(PALETTE.scrim), 3.0 * ui.scale)
     canvas.add_line(top, bottom, ink, 1.5 * ui.scale)
     _knob(canvas, x, area.height / 2, ink, ui)
-    _tag(canvas, x, LEFT, True, ui)
-    _tag(canvas, x, RIGHT, False, ui)
+    _tag(canvas, x, said.left, True, ui)
+    _tag(canvas, x, said.right, False, ui)
     canvas.pop_clip_rect()
 
 

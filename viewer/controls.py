@@ -206,6 +206,7 @@ KEYS = (
     Key("Shift+F", "home", "home"),
     Key("Y", "split", "original and edited side by side"),
     Key("Shift+Y", "difference", "difference from the original"),
+    Key("Alt+Y", "against", "compare with what was recorded"),
     Key("Space", "play", "play or pause"),
     Key("K", "key", "set a key: camera and strengths"),
     Key("Delete", "drop_key", "delete the key at the playhead"),

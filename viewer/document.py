@@ -12,6 +12,7 @@ from progdf.ply import load_ply
 
 from . import arguments
 from .layer_rows import layer_rows
+from .recordings import Recording, found
 from .turntable import bounds_of
 from .workspace import SceneFacts
 
@@ -37,7 +38,13 @@ class Document:
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""
         rows = layer_rows(self.scene, self.gdfs)
-        return SceneFacts(self.title, len(self.scene), bounds_of(self.scene), rows)
+        return SceneFacts(self.title, len(self.scene), bounds_of(self.scene), rows, self.recordings())
+
+    def recordings(self) -> tuple[Recording, ...]:
+        """Where each edit was recorded."""
+        if len(self.gdf_paths) != len(self.gdfs):
+            return (Recording(),) * len(self.gdfs)
+        return tuple(found(gdf, path) for gdf, path in zip(self.gdfs, self.gdf_paths, strict=True))
 
 
 def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:

@@ -9,7 +9,9 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from . import brush, compare_overlay, dialogs, hand, overlay, panel, timeline_bar, workspace
+from .compare_labels import Labels
 from .hand import Hand, Sight
+from .recordings import obstacle
 from .snapshot_cards import SnapshotCard
 from .workspace import Workspace
 
@@ -33,6 +35,7 @@ def panels(work: Workspace, sight: Sight, cards: tuple[SnapshotCard, ...], revea
         work.dial,
         work.renaming,
         cards,
+        obstacle(facts.recordings),
     )
     result = panel.draw(work.view, shown, sight.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
@@ -48,7 +51,7 @@ def over_picture(
     work: Workspace,
     sight: Sight,
     held: Hand,
-    psnr: float,
+    said: Labels,
     figures: Sequence[tuple[str, str]],
     original: bool,
 ) -> Workspace:
@@ -56,7 +59,7 @@ def over_picture(
 
     Args:
         held: what the mouse holds
-        psnr: of the difference on screen, dB
+        said: over the comparison on screen
         figures: of the table of timings
         original: the key that shows it is held
     """
@@ -66,7 +69,7 @@ def over_picture(
     if original:
         overlay.banner("Original", area, ui)
     else:
-        compare_overlay.draw(view, psnr, area, hand.grips_divider(held, view, sight), ui)
+        compare_overlay.draw(view, said, area, hand.grips_divider(held, view, sight), ui)
     if view.overlay:
         overlay.table(figures, ui)
     if work.help:

@@ -24,6 +24,7 @@ MOUSE_HELP = (
     ("W A S D Q E", "fly; Shift ten times faster, Alt slower"),
     ("Shift on a slider", "ten times finer"),
     ("Ctrl+click a slider", "type a value"),
+    ("Esc, right click", "while dragging: take it back"),
     ("\\ held", "the original"),
 )
 
@@ -89,11 +90,11 @@ def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
         _text(right - pad - _wide(figure, size, ui), y, figure, size, PALETTE.text, ui)
 
 
-def banner(text: str, area: Area, ui: UiContext) -> None:
-    """A word at the top centre of the picture."""
+def banner(text: str, area: Area, ui: UiContext, row: int = 0) -> None:
+    """A word at the top centre of the picture, or so many rows below."""
     size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
     wide = _wide(text, size, ui)
-    x, y = (area.width - wide) / 2, 14.0 * ui.scale
+    x, y = (area.width - wide) / 2, (14.0 + 32.0 * row) * ui.scale
     corners = imgui.ImVec2(x - 1.5 * pad, y - pad / 2), imgui.ImVec2(x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)

@@ -10,7 +10,7 @@ from imgui_bundle import imgui
 from . import brush, compare, layer_cards, snapshot_cards, turntable
 from .layer_rows import LayerRow
 from .snapshot_cards import SnapshotCard
-from .state import Vec3, ViewState
+from .state import Comparison, Vec3, ViewState
 from .ui_context import PALETTE, Icon, UiContext
 from .widgets import choice, elided, grouped, icon_button, label, right_edge, section, small, tip
 
@@ -38,6 +38,7 @@ class PanelInput:
         snapshots: the original and what was kept
         dial: which of `stack.DIALS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
+        unrecorded: why there is nothing recorded to compare with, "" where there is
     """
 
     title: str
@@ -50,6 +51,7 @@ class PanelInput:
     dial: str = "strength"
     renaming: int | None = None
     snapshots: tuple[SnapshotCard, ...] = ()
+    unrecorded: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     if state.brush.active:
         state, asked = brush.section(state, focus, ui)
         actions += [asked] if asked else []
-    state = _view(state, ui, actions)
+    state = _view(state, shown.unrecorded, ui, actions)
     snapshot_cards.draw(shown.snapshots, ui, actions)
     _end_body()
     _footer(state, shown, ui, actions)
@@ -139,7 +141,7 @@ def _title(shown: PanelInput, ui: UiContext) -> None:
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
 
 
-def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
+def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) -> ViewState:
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     section("View", ui)
     column = 82.0 * ui.scale
@@ -165,19 +167,7 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
     background = (red, green, blue) if changed else state.background
-    shown = compare.MODES.index(state.compare.mode)
-    label("Compare", column)
-    chosen = choice("compare", ("Off", "Split", "Diff"), shown, ui)
-    tip("With the original: beside each other (Y), or what differs (Shift+Y)")
-    comparison = state.compare if chosen is None else replace(state.compare, mode=compare.MODES[chosen])
-    if comparison.mode == "difference":
-        label("Amplify", column)
-        imgui.set_next_item_width(-1.0)
-        changed, times = imgui.slider_float(
-            "##amplify", comparison.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
-        )
-        comparison = replace(comparison, amplify=float(round(times))) if changed else comparison
-        tip("What the difference is multiplied by")
+    comparison = _comparison(state.compare, unrecorded, column, ui)
     label("Show", column)
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
@@ -188,6 +178,33 @@ def _view(state: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
         actions.append("home")
     tip("Back to the first view (Shift+F)")
     return replace(state, camera=camera, background=background, compare=comparison)
+
+
+def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext) -> Comparison:
+    """Off, beside each other or subtracted; with the original, or with what was recorded."""
+    label("Compare", column)
+    chosen = choice("compare", ("Off", "Split", "Diff"), compare.MODES.index(shown.mode), ui)
+    tip("Beside each other (Y), or what differs (Shift+Y)")
+    if chosen is not None:
+        shown = replace(shown, mode=compare.MODES[chosen])
+    if shown.mode == "off":
+        return shown
+    label("With", column)
+    against = 0 if unrecorded else compare.AGAINST.index(shown.against)
+    chosen = choice("against", ("Original", "Recorded"), against, ui, usable=1 if unrecorded else 2)
+    told = f"\nNothing was recorded: {unrecorded}" if unrecorded else ""
+    tip(f"The original, or the same strengths as training recorded them (Alt+Y){told}")
+    if chosen is not None:
+        shown = replace(shown, against=compare.AGAINST[chosen])
+    if shown.mode == "difference":
+        label("Amplify", column)
+        imgui.set_next_item_width(-1.0)
+        changed, times = imgui.slider_float(
+            "##amplify", shown.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
+        )
+        shown = replace(shown, amplify=float(round(times))) if changed else shown
+        tip("What the difference is multiplied by")
+    return shown
 
 
 _ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value

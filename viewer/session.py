@@ -13,7 +13,7 @@ from progdf.layers import BLENDS
 from progdf.session_file import SUFFIX, SessionFile, read_session, reference, verified, write_session
 
 from . import document, draft, paint, plain, timeline_file
-from .compare import MODES, MOST_AMPLIFIED
+from .compare import AGAINST, MODES, MOST_AMPLIFIED
 from .document import Document
 from .history import Edit
 from .plain import NotPlainError
@@ -99,6 +99,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ..
         _check("view.compare.divider", [view.compare.divider], 0.0, 1.0)
         _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)
         _among("view.compare.mode", view.compare.mode, MODES)
+        _among("view.compare.against", view.compare.against, AGAINST)
         _among("view.draft", view.draft, draft.MODES)
         _among("view.brush.mode", view.brush.mode, paint.MODES)
         _check("view.brush.radius", [view.brush.radius], paint.SMALLEST_PX, paint.LARGEST_PX)

@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 
 from . import hand, inputs, interface, overlay, panel, playback, saved_files, workspace
 from .canvas import Canvas
-from .compare import labelled
+from .compare_labels import labelled
 from .engine import Engine, FrameTimings, drawn_size
 from .gl.screen import read_rgb
 from .hand import Hand, Sight
@@ -53,7 +53,7 @@ class Stage:
         pictures: Path = Path(),
     ) -> None:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
-        self.canvas = Canvas(context, engine)
+        self.canvas = Canvas(context, engine, facts.recordings)
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -77,7 +77,8 @@ class Stage:
     def serve(self, engine: Engine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
         self.canvas.release()
-        self.engine, self.facts, self.canvas = engine, facts, Canvas(self.context, engine)
+        self.engine, self.facts = engine, facts
+        self.canvas = Canvas(self.context, engine, facts.recordings)
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -206,9 +207,10 @@ class Stage:
         sight, before = self._sight(), self.work
         pressed = [press.chord for press in self._keys.pressed]
         self.work = interface.asked(self.work, sight, self.recent, pressed)
-        original, psnr = inputs.holds_original(self._keys), self.canvas.comparer.psnr
+        original = inputs.holds_original(self._keys)
+        said = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
-        self.work = interface.over_picture(self.work, sight, self._hand, psnr, figures, original)
+        self.work = interface.over_picture(self.work, sight, self._hand, said, figures, original)
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()
@@ -262,8 +264,8 @@ class Stage:
         if request == "window_picture":
             return saved_files.picture(self.pictures, title, read_rgb(screen, size))
         image = self.canvas.image(view, self._sight().size)
-        told = labelled(image, view.compare, self.canvas.comparer.psnr)
-        return saved_files.picture(self.pictures, title, told)
+        pixels = labelled(image, view.compare, self.canvas.comparer.labels(view))
+        return saved_files.picture(self.pictures, title, pixels)
 
 
 def _strengths(view: ViewState) -> list[float]:

@@ -78,17 +78,19 @@ class Brush:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How the edited picture is set against the original (see compare.py).
+    """What the edited picture is set against, and how (see compare.py).
 
     Args:
         mode: "off", "split" or "difference"
         divider: where the edited side of a split begins, share of the picture's width
         amplify: what a difference is multiplied by, 1 to 64
+        against: "original", or "recorded": the same strengths as training recorded them, where it did
     """
 
     mode: str = "off"
     divider: float = 0.5
     amplify: float = 4.0
+    against: str = "original"
 
 
 @dataclass(frozen=True)

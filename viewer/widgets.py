@@ -58,6 +58,11 @@ def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
     return bool(pressed)
 
 
+def let_go() -> bool:
+    """Whether the last item was held until the mouse let it go in this frame; not where a drag is called off."""
+    return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
+
+
 def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
     """A button of small text on the present line, in the accent's colour while on; True when pressed."""
     colours = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)
@@ -96,8 +101,10 @@ def value_slider(name: str, value: float, ends: tuple[float, float], form: str, 
     return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
 
 
-def choice(name: str, options: Sequence[str], current: int | None, ui: UiContext) -> int | None:
-    """A row of joined buttons; the index that was pressed, or None."""
+def choice(
+    name: str, options: Sequence[str], current: int | None, ui: UiContext, usable: int | None = None
+) -> int | None:
+    """A row of joined buttons, the first `usable` of them; the index that was pressed, or None."""
     gap = 2.0 * ui.scale
     each = (imgui.get_content_region_avail().x - gap * (len(options) - 1)) / len(options)
     pressed = None
@@ -108,8 +115,10 @@ def choice(name: str, options: Sequence[str], current: int | None, ui: UiContext
             imgui.same_line(0.0, gap)
         colour = PALETTE.accent_dark if i == current else PALETTE.field
         imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*colour))
+        imgui.begin_disabled(usable is not None and i >= usable)
         if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
             pressed = i
+        imgui.end_disabled()
         imgui.pop_style_color()
     imgui.pop_style_var()
     imgui.end_group()

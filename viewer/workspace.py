@@ -18,6 +18,7 @@ from . import compare, controls, draft, history, paint, playback, snapshots, sta
 from .history import Edit, History
 from .layer_rows import LayerRow
 from .playback import Player
+from .recordings import Recording
 from .snapshots import Snapshot
 from .state import Comparison, ViewCamera, ViewState
 from .turntable import FARTHEST, Bounds
@@ -36,12 +37,14 @@ class SceneFacts:
         count: Gaussians in the scene
         bounds: what `frame` shows with no layer focused
         rows: one per .gdf, indexed by `LayerState.gdf`
+        recordings: where each .gdf was recorded, in the same order
     """
 
     title: str
     count: int
     bounds: Bounds
     rows: Sequence[LayerRow]
+    recordings: Sequence[Recording] = ()
 
 
 @dataclass(frozen=True)
@@ -366,6 +369,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "split": lambda w, _: replace(w, view=compare.switched(w.view, "split")),
     "difference": lambda w, _: replace(w, view=compare.switched(w.view, "difference")),
+    "against": lambda w, _: replace(w, view=compare.turned(w.view)),
     "draft": lambda w, _: replace(w, view=draft.switched(w.view)),
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
