@@ -25,7 +25,8 @@ from progdf.ply import GEOMETRY, load_ply, save_ply
 
 from . import arguments, film, session_arguments, timeline, timeline_file, timeline_film
 from . import document as documents
-from .compare import Comparer, labelled
+from .compare import Comparer
+from .compare_labels import labelled
 from .engine import Engine
 from .headless import headless_context
 from .layer_arguments import stack_of
