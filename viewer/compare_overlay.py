@@ -46,11 +46,14 @@ def draw(view: ViewState, said: Labels, area: Area, held: bool, ui: UiContext) -
     """
     if view.compare.mode == "difference":
         overlay.banner(said.line, area, ui)
+    if view.compare.mode == "split":
+        _divider(view.compare.divider, said, area, held, ui)
     if view.compare.mode != "off" and said.notice:
         overlay.banner(said.notice, area, ui, row=1)
-    if view.compare.mode != "split":
-        return
-    x = round(view.compare.divider * area.width)
+
+
+def _divider(share: float, said: Labels, area: Area, held: bool, ui: UiContext) -> None:
+    x = round(share * area.width)
     canvas = imgui.get_background_draw_list()
     canvas.push_clip_rect(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(area.width, area.height), False)
     ink = u32(PALETTE.accent if held else PALETTE.handle)
