@@ -91,12 +91,18 @@ def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
     """
     sample = _sample(scene)
     centre, radius = scene_sphere(sample)
-    offsets = sample.means - centre
-    if len(sample) < _ENOUGH or radius > _LONG_TAIL * float(offsets.norm(dim=1).median()):
-        return len(sample) >= _ENOUGH
+    typical = float((sample.means - centre).norm(dim=1).median())
+    return len(sample) >= _ENOUGH and (radius > _LONG_TAIL * typical or has_ceiling(sample, up))
+
+
+def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
+    """Whether a slab at the top covers most of the ground plan, so that all is hidden from above."""
+    sample = _sample(scene)
+    if len(sample) < _ENOUGH:
+        return False
     ahead = front(up)
-    plan = offsets @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
-    height = offsets @ up
+    plan = sample.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
+    height = sample.means @ up
     low, high = (_quantile(height, q) for q in (0.02, 0.98))
     cells = _cells(plan)
     covered = len(torch.unique(cells))

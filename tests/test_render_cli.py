@@ -88,6 +88,26 @@ def test_an_orbit_turns_the_camera_even_with_a_leading_minus(run: Run) -> None:
     assert not np.array_equal(pixels("left.png"), pixels("near.png"))
 
 
+def test_a_region_or_the_whole_scene_can_fill_the_picture(run: Run) -> None:
+    for name, frame in (("scarf", ("--frame", "scarf")), ("all", ("--frame", "all")), ("plain", ())):
+        options = (*frame, *SMALL, "--background", "#ff00ff", "-o", f"{name}.png")
+        assert run("render", "bear.ply", "scarf.gdf", *options) == 0
+    bare = {name: shown_share(f"{name}.png") for name in ("scarf", "plain", "all")}
+    assert bare["scarf"] < bare["plain"] < bare["all"]
+
+
+def shown_share(path: str) -> float:
+    """The share of a picture that shows its background."""
+    return float((np.abs(pixels(path).astype(int) - (255, 0, 255)).max(axis=2) < 8).mean())
+
+
+def test_the_frame_follows_the_orbit_and_a_distance_that_is_said_holds(run: Run) -> None:
+    for name, orbit in (("side", "90,10"), ("far", "90,10,30")):
+        options = ("--frame", "scarf", "--orbit", orbit, *SMALL, "--background", "#ff00ff")
+        assert run("render", "bear.ply", "scarf.gdf", *options, "-o", f"{name}.png") == 0
+    assert shown_share("side.png") < 0.5 < shown_share("far.png")
+
+
 def test_the_background_is_what_was_asked_for(run: Run) -> None:
     assert run("render", "bear.ply", "--background", "#204060", *SMALL, "-o", "blue.png") == 0
     assert tuple(pixels("blue.png")[0, 0]) == (0x20, 0x40, 0x60)
@@ -145,6 +165,8 @@ def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: R
         (("--camera", "nope.json"), "nope.json does not exist"),
         (("--camera", "cameras.json:3"), "cameras.json has no camera 3; it holds 3, numbered 0 to 2"),
         (("--camera", "cameras.json", "--orbit", "1,2"), "--camera and --orbit were both given"),
+        (("--camera", "cameras.json", "--frame", "all"), "--camera and --frame were both given"),
+        (("--frame", "hat"), "--frame hat: there is no edit of that name; there are scarf, ears"),
         (("--orbit", "30"), "--orbit 30 is not two or three numbers"),
         (("--orbit", "a,b"), "--orbit a,b is not a list of numbers"),
         (("--orbit", "0,91"), "--orbit 0,91: the elevation is 91"),

@@ -25,6 +25,7 @@ from progdf.ply import GEOMETRY, load_ply, save_ply
 
 from . import arguments, film, session_arguments, timeline, timeline_file, timeline_film
 from . import document as documents
+from .camera_arguments import asked_camera
 from .compare import Comparer
 from .compare_labels import labelled
 from .engine import Engine
@@ -33,10 +34,9 @@ from .layer_arguments import stack_of
 from .options import ExportOptions, RenderOptions, StackOptions, ViewOptions
 from .paint import layer_of
 from .stack import shown
-from .state import LayerState, ViewCamera, ViewState
-from .turntable import first_camera, to_camera
+from .state import LayerState, ViewState
+from .turntable import first_camera
 
-DEFAULT_SIZE = (640, 480)
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 """Options of `progdf render` that each say what the picture is."""
 _BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
@@ -78,7 +78,7 @@ def render(argv: Sequence[str]) -> int:
         scene, gdfs = document.scene, document.gdfs
     layers = state.layers
     swept = _swept(options, gdfs)
-    camera = _camera(options, scene, size, None if opened is None else state.camera)
+    camera = asked_camera(options, scene, gdfs, size, None if opened is None else state.camera)
     comparison = arguments.parse_comparison(options.split, options.difference)
     if comparison.mode == "off":
         comparison = state.compare
@@ -173,22 +173,6 @@ def _showing(name: str, options: RenderOptions, option: str) -> str:
     if options.solo and name not in options.solo:
         raise ProgdfError(f"{option} {name}: --solo {options.solo[0]} hides it; add --solo {name}")
     return name
-
-
-def _camera(
-    options: RenderOptions, scene: Gaussians, size: tuple[int, int] | None, saved: ViewCamera | None
-) -> Camera:
-    """The camera that was asked for; that of the session (`saved`); or one that frames the scene."""
-    if options.camera is not None and options.orbit is not None:
-        raise ProgdfError("--camera and --orbit were both given; give one of them")
-    if options.camera is not None:
-        camera = arguments.read_camera(options.camera)
-        return camera if size is None else arguments.fitted(camera, size)
-    width, height = size or DEFAULT_SIZE
-    framed = saved or first_camera(scene, aspect=width / height)
-    if options.orbit is not None:
-        framed = arguments.parse_orbit(options.orbit, framed)
-    return to_camera(framed, width, height)
 
 
 @contextmanager

@@ -63,6 +63,8 @@ class RenderOptions(PictureOptions):
     """A camera of cameras.json or transforms.json, the first where no INDEX is given."""
     orbit: Annotated[str | None, tyro.conf.arg(metavar="AZ,EL[,DISTANCE]")] = None
     """A camera that circles the scene: degrees around it, degrees above it, world units away (fitting)."""
+    frame: Annotated[str | None, tyro.conf.arg(metavar="NAME|all")] = None
+    """What fills the picture: an edit's region, or the whole scene; else what stands in the scene."""
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
     """Pixels; else the camera's own, or 640x480."""
     engine: Literal["auto", "gl", "cpu"] = "auto"

@@ -16,10 +16,17 @@ import torch
 from progdf.camera import Camera, intrinsics
 from progdf.framing import guess_up, scene_sphere
 from progdf.gaussians import Gaussians
+from progdf.subject import fitted_eye, is_room, standpoint, subject_rows
 
 from .state import Vec3, ViewCamera
 
 FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
+
+FILL = 0.72
+"""Share of the picture's tighter side that what one looks at takes at first."""
+
+INSIDE_FOV = 60.0
+"""Degrees: as much as one has to see of a room to know where one stands."""
 
 
 @dataclass(frozen=True)
@@ -168,18 +175,50 @@ def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera
     return replace(camera, pivot=bounds.centre, distance=1.05 * bounds.radius / math.sin(half))
 
 
+def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, with these Gaussians filling `FILL` of the tighter side of the picture.
+
+    Args:
+        shown: at least one
+        aspect: width / height of the picture
+    """
+    picture = axes(camera)
+    tangent = math.tan(math.radians(camera.fov_y) / 2)
+    frame_axes = torch.tensor([picture.right, picture.up, picture.back], dtype=torch.float64)
+    radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
+    found = fitted_eye(shown.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
+    x, y, z = (float(c) for c in found)
+    depth = dot((x, y, z), picture.back) - float((shown.means.double() @ frame_axes[2]).median())
+    if not (math.isfinite(x + y + z) and 0.0 < depth < FARTHEST):
+        return frame(camera, bounds_of(shown), aspect)
+    return replace(camera, pivot=along((x, y, z), (-depth, picture.back)), distance=depth)
+
+
+def fit_subject(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, filled by what the scene is about (`subject_rows`); in a room the same view."""
+    up = torch.tensor(camera.up)
+    return camera if is_room(scene, up) else fit(camera, scene[subject_rows(scene, up)], aspect)
+
+
 def first_camera(
     scene: Gaussians, cameras: Sequence[Camera] = (), aspect: float = 1.5, fov_y: float = 45.0
 ) -> ViewCamera:
-    """What one sees first: all of the scene, upright, from the front and a little above.
+    """What one sees first: what the scene is about, upright, from the front and a little above.
 
-    An up axis within two degrees of a world axis is that axis: nobody holds a camera straighter.
+    A room is met inside, from a wall or a corner, with at least `INSIDE_FOV` degrees. An up
+    axis within two degrees of a world axis is that axis: nobody holds a camera straighter.
     """
     x, y, z = (float(c) for c in guess_up(scene, cameras)) if len(scene) else (0.0, 1.0, 0.0)
     for i, c in enumerate((x, y, z)):
         if abs(c) > math.cos(math.radians(2.0)):
             x, y, z = (math.copysign(1.0, c) if j == i else 0.0 for j in range(3))
-    return frame(ViewCamera(up=(x, y, z), azimuth=20.0, fov_y=fov_y), bounds_of(scene), aspect)
+    camera, up = ViewCamera(up=(x, y, z), azimuth=20.0, fov_y=fov_y), torch.tensor([x, y, z])
+    if not len(scene):
+        return frame(camera, Bounds(), aspect)
+    if is_room(scene, up):
+        eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, up))
+        return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
+    return fit_subject(camera, scene, aspect)
 
 
 def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:
