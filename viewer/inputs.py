@@ -80,6 +80,20 @@ def any_button_down() -> bool:
     return any(imgui.is_mouse_down(button) for _, button in _BUTTONS)
 
 
+def calls_off(keys: Keys, drag: str | None) -> bool:
+    """Whether Escape or the right button takes back what the left button is dragging.
+
+    Args:
+        drag: what is held on the picture, see `hand.Hand`; the camera stays where it was turned
+    """
+    io, buttons = imgui.get_io(), imgui.MouseButton_
+    holds = imgui.is_any_item_active() or (drag is not None and all(drag != d.does for d in controls.DRAGS))
+    if not holds or io.want_text_input or not imgui.is_mouse_down(buttons.left.value):
+        return False
+    escape = any(press.chord == "Escape" for press in keys.pressed)
+    return escape or bool(imgui.is_mouse_clicked(buttons.right.value))
+
+
 def flying(keys: Keys) -> bool:
     """Whether flight keys are held, and not as parts of a chord or of a text."""
     io = imgui.get_io()

@@ -13,7 +13,7 @@ from . import layer_fold, stack, strength_slider
 from .layer_rows import LayerRow
 from .state import LayerState, ViewState
 from .ui_context import PALETTE, Icon, Rgba, UiContext, u32
-from .widgets import elided, grouped, icon_button, right_edge, section, small, small_toggle, tip
+from .widgets import elided, grouped, icon_button, let_go, right_edge, section, small, small_toggle, tip
 
 BLEND_HELP = {
     "normalised": "Overlapping edits share a Gaussian by their weights; never more than a full edit.",
@@ -252,7 +252,7 @@ def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui
     if imgui.is_item_active() and imgui.is_mouse_dragging(imgui.MouseButton_.left.value, threshold):
         return replace(card, drag="dragged")
     moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, threshold)
-    if imgui.is_item_deactivated() and (moved.x or moved.y):
+    if let_go() and (moved.x or moved.y):
         return replace(card, drag="dropped")
     return card
 

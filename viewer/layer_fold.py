@@ -45,7 +45,8 @@ def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContex
     imgui.begin_disabled(not moves)
     value = stack.dial_value(layer, kind)
     new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", ui)
-    if imgui.is_item_clicked(imgui.MouseButton_.right.value):
+    held = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button calls its drag off
+    if imgui.is_item_clicked(imgui.MouseButton_.right.value) and not held:
         new = 1.0
     imgui.end_disabled()
     if moves:

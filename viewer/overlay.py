@@ -25,6 +25,7 @@ MOUSE_HELP = (
     ("Shift on a slider", "ten times finer"),
     ("Ctrl+click a slider", "type a value"),
     ("Esc, right click", "while dragging: take it back"),
+    ("Esc, right click", "while dragging: take it back"),
     ("\\ held", "the original"),
 )
 

@@ -170,6 +170,9 @@ class Stage:
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
+        off = inputs.calls_off(self._keys, self._hand.drag)
+        if off:
+            self._call_off()
         for action in inputs.actions_pressed(self._keys):
             if self.work.dialog is None or action in ("picture", "window_picture"):
                 self._perform(action)
@@ -183,7 +186,14 @@ class Stage:
                 self.wake()
             self.work = interface.panels(self.work, self._sight(), cards, reveal)
             self._revealed = self.work.focus
-        self._hand, self.work = hand.moved(self._hand, self.work, self._sight())
+        if not off:  # else the right button has said all it was pressed for
+            self._hand, self.work = hand.moved(self._hand, self.work, self._sight())
+
+    def _call_off(self) -> None:
+        """What is dragged goes back to where it was, and nothing is held any more."""
+        self.work, self._hand = workspace.called_off(self.work), Hand()
+        imgui.internal.clear_active_id()
+        self._keys = replace(self._keys, pressed=())
 
     def _perform(self, action: str) -> None:
         area = self._area()

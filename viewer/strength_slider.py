@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from .ui_context import PALETTE, Rgba, u32
+from .widgets import let_go
 
 HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one types
 FINE = 0.1
@@ -66,7 +67,7 @@ def draw(
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
         _anchor(label, mouse, value)
-    elif held or imgui.is_item_deactivated():  # a slow frame may hold the last move and the release
+    elif held or let_go():  # a slow frame may hold the last move and the release
         fine = imgui.get_io().key_shift
         if storage.get_bool(_slot(label, "fine")) != fine:
             _anchor(label, mouse, value)

@@ -15,7 +15,7 @@ from .overlay import Area
 from .playback import Player
 from .state import Timeline
 from .ui_context import PALETTE, SMALL_PX, UiContext, u32
-from .widgets import icon_button, tip
+from .widgets import icon_button, let_go, tip
 
 HEIGHT_PX = 46.0  # at 1×
 ROOMY_PX = 520.0  # narrower, only what moves the playhead is shown
@@ -138,7 +138,7 @@ def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: 
     if imgui.is_item_activated():
         storage.set_int(slot, -1 if under is None else under)
         actions.append(f"seek:{to if under is None else under}")
-    elif imgui.is_item_active() or imgui.is_item_deactivated():  # a slow frame may hold move and release
+    elif imgui.is_item_active() or let_go():  # a slow frame may hold move and release
         held = storage.get_int(slot, -1)
         moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
         if held < 0 and to != frame:

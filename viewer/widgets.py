@@ -63,6 +63,11 @@ def let_go() -> bool:
     return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
 
 
+def let_go() -> bool:
+    """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
+    return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
+
+
 def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
     """A button of small text on the present line, in the accent's colour while on; True when pressed."""
     colours = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)

@@ -145,6 +145,11 @@ def settled(workspace: Workspace) -> Workspace:
     return workspace if past is workspace.past else replace(workspace, past=past)
 
 
+def called_off(workspace: Workspace) -> Workspace:
+    """As it was before the gesture under way."""
+    return replace(workspace, view=history.restored(workspace.view, workspace.past.present))
+
+
 def played(workspace: Workspace, seconds: float) -> Workspace:
     """After so much time; the film goes on where it is playing."""
     if not workspace.player.playing:
