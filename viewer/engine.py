@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
-from progdf.composer import Composer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.layers import Gains
 
 from .cpu_painter import CpuPainter
+from .editing import CpuEditing, Editing, GpuEditing, Stack
+from .gl.edit_pass import EditPassError
 from .headless import is_software
 from .paint import layer_of
 from .painters import GlPainter, Image, Painter
@@ -32,6 +33,7 @@ from .state import ViewState
 from .turntable import bounds_of, to_camera
 
 DRAWS = ("auto", "gl", "cpu")
+EDIT_PASSES = ("auto", "gpu", "cpu")
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,8 @@ class FrameTimings:
     """Where the time of one picture went: wall clock, milliseconds, the GPU's work waited for.
 
     Args:
-        compose_ms: strengths → attributes
-        upload_ms: attributes → where they are drawn from
+        compose_ms: strengths → attributes, by the CPU
+        upload_ms: attributes → where they are drawn from; or the GPU's edit pass, which does both there
         sort_ms: depth order (the CPU rasteriser sorts within `draw_ms`)
         draw_ms: the picture
         changed: Gaussians whose attributes were composed anew
@@ -88,10 +90,12 @@ class Engine:
         scene: the original
         gdfs: the edits that `LayerState.gdf` counts
         draw: "gl", "cpu", or "auto": "gl" where OpenGL has hardware behind it
+        edit_pass: what works out the attributes of a new strength: "gpu" (see gl/edit_pass.py), "cpu", or
+            "auto": "gpu" where OpenGL draws with hardware behind it
 
     Raises:
-        ProgdfError: an edit was made for another scene.
-        ValueError: `draw` is unknown, or "gl" without a context.
+        ProgdfError: an edit was made for another scene; or "gpu" where the CPU draws.
+        ValueError: `draw` or `edit_pass` is unknown, or `draw` is "gl" without a context.
     """
 
     def __init__(
@@ -100,9 +104,12 @@ class Engine:
         scene: Gaussians,
         gdfs: Sequence[Gdf] = (),
         draw: str = "auto",
+        edit_pass: str = "auto",
     ) -> None:
         if draw not in DRAWS:
             raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
+        if edit_pass not in EDIT_PASSES:
+            raise ValueError(f"edit_pass is '{edit_pass}', expected one of {', '.join(EDIT_PASSES)}")
         if draw == "gl" and ctx is None:
             raise ValueError("draw is 'gl', which needs a context")
         self.ctx, self.scene = ctx, scene
@@ -112,18 +119,17 @@ class Engine:
         """Of the last picture."""
         self.near = near_plane(bounds_of(scene).radius)
         """Depth at and below which nothing is drawn, world units."""
-        self._composer = Composer(scene, self.gdfs)
         self._edits = _Edits()
         self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
         self._ordered_for: bytes | None = None
         self._picture: _Picture | None = None
-        self._painter: Painter
-        if self.draws_with == "gl":
-            assert ctx is not None
-            self._painter = GlPainter(ctx)
-        else:
-            self._painter = CpuPainter(ctx, self.near)
-        self._painter.upload(self._composer.gaussians)
+        if edit_pass == "gpu" and self.draws_with == "cpu":
+            raise ProgdfError("the CPU draws here, so the GPU cannot edit; ask for drawing by OpenGL too: gl")
+        self.edit_obstacle = ""
+        """Why the CPU composes though the GPU's edit pass was wanted; empty where that is not so."""
+        self._edit_error: float | None = None
+        wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))
+        self._painter, self._editing = self._made(wants_pass and self.draws_with == "gl")
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
@@ -167,8 +173,25 @@ class Engine:
 
     def gaussians(self, view: ViewState) -> Gaussians:
         """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
-        self._compose(_edits(view))
-        return self._composer.gaussians
+        edits = _edits(view)
+        self._compose(edits)
+        return self._editing.gaussians(*self._stack(edits))
+
+    @property
+    def edits_with(self) -> str:
+        """What works out the attributes: "gpu" or "cpu"."""
+        return self._editing.where
+
+    def edit_error(self) -> float:
+        """How far the attributes that are drawn are from `progdf.compose`, in a sample that is read back.
+
+        Returns:
+            The largest difference of a raw number, relative to it where it is larger than 1; 0 where the CPU
+            composes.
+        """
+        if self._edit_error is None:
+            self._edit_error = self._editing.error(*self._stack(self._edits))
+        return self._edit_error
 
     def forget(self) -> None:
         """Draw the next picture as a whole, though only a part of the last one has changed."""
@@ -177,7 +200,23 @@ class Engine:
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
+        self._editing.release()
         self._painter.release()
+
+    def _made(self, wants_pass: bool) -> tuple[Painter, Editing]:
+        """The painter with the scene in it, and what edits it there."""
+        if self.draws_with == "cpu" or self.ctx is None:
+            painter: Painter = CpuPainter(self.ctx, self.near)
+            return painter, CpuEditing(painter, self.scene, self.gdfs)
+        if wants_pass:
+            by_gl = GlPainter(self.ctx, editable=True)
+            try:
+                return by_gl, GpuEditing(by_gl, self.scene, self.gdfs)
+            except EditPassError as error:
+                by_gl.release()
+                self.edit_obstacle = str(error)
+        painter = GlPainter(self.ctx)
+        return painter, CpuEditing(painter, self.scene, self.gdfs)
 
     def _wanted(self, view: ViewState, camera: Camera) -> _Picture:
         return _Picture(
@@ -196,7 +235,7 @@ class Engine:
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
         started = time.perf_counter()
         if self._painter.wants_order and self._ordered_for != wanted.viewmat:
-            self._order = back_to_front(self._composer.gaussians.means.numpy(), camera, self.near)
+            self._order = back_to_front(self._editing.means, camera, self.near)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
         share = self._painter.draw(camera, view.background, self._order)
@@ -208,7 +247,7 @@ class Engine:
             1e3 * (sorted_at - started),
             1e3 * (drawn_at - sorted_at),
             changed,
-            len(self._order) if self._painter.wants_order else len(self._composer.gaussians),
+            len(self._order) if self._painter.wants_order else len(self.scene),
             share,
         )
 
@@ -217,15 +256,18 @@ class Engine:
         if edits == self._edits:
             return 0.0, 0.0, 0
         started = time.perf_counter()
-        layers = [layer_of(self._gdf(l[0]), *l[1:]) for l in edits.layers]
-        change = self._composer.update(layers, edits.blend or "normalised")
-        composed = time.perf_counter()
-        self._edits, self._picture = edits, None
-        if change.means_moved:
+        stack = self._stack(edits)
+        unpacked_ms = 1e3 * (time.perf_counter() - started)
+        step = self._editing.bring(*stack)
+        self._edits, self._picture, self._edit_error = edits, None, None
+        if step.moved:
             self._ordered_for = None
-        self._painter.update(self._composer.gaussians, change.attributes, change.rows)
-        uploaded = time.perf_counter()
-        return 1e3 * (composed - started), 1e3 * (uploaded - composed), len(change.rows)
+        return unpacked_ms + step.compose_ms, step.upload_ms, step.changed
+
+    def _stack(self, edits: _Edits) -> tuple[Stack, str]:
+        """The layers and the blend rule of what was asked for."""
+        stack = [(layer[0], layer_of(self._gdf(layer[0]), *layer[1:])) for layer in edits.layers]
+        return stack, edits.blend or "normalised"
 
     def _gdf(self, index: int) -> Gdf:
         if not 0 <= index < len(self.gdfs):

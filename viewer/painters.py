@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Protocol, TypeVar
 
 import moderngl
@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.checkpoint import Gdf
 from progdf.gaussians import Gaussians
 
+from .gl.edit_pass import EditPass
 from .gl.present import Presenter
 from .gl.splats import SplatRenderer
 from .state import Vec3
@@ -56,18 +58,35 @@ class Painter(Protocol):
 
 
 class GlPainter:
-    """Draws with OpenGL (see `SplatRenderer`)."""
+    """Draws with OpenGL (see `SplatRenderer`).
+
+    Args:
+        ctx: to draw in
+        editable: let an edit pass write every attribute (see `SplatTextures`)
+    """
 
     wants_order = True
 
-    def __init__(self, ctx: moderngl.Context) -> None:
-        self._ctx = ctx
+    def __init__(self, ctx: moderngl.Context, editable: bool = False) -> None:
+        self._ctx, self._editable = ctx, editable
         self._renderer = SplatRenderer(ctx)
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
 
     def upload(self, scene: Gaussians) -> None:
-        self._renderer.upload(scene)
+        self._renderer.upload(scene, self._editable)
+        self._ctx.finish()
+
+    def edit_pass(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> EditPass:
+        """An edit pass that writes into the scene that is drawn; the caller releases it.
+
+        Raises:
+            ProgdfError: see `EditPass`.
+        """
+        return EditPass(self._ctx, self._renderer.textures, scene, gdfs)
+
+    def finish(self) -> None:
+        """Wait until all that OpenGL was asked for is done."""
         self._ctx.finish()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 SPLATS_PER_ROW = 512
@@ -15,11 +17,57 @@ SH0 = np.dtype([("sh0", "<f4", 3), ("unused", "<f4")])
 SPLAT_TEXTURES = {"mean_logit": MEAN_LOGIT, "log_scale": LOG_SCALE, "quat": QUAT, "sh0": SH0}
 """Sampler in shaders/include/raw_splats.glsl -> one texel of it; raw parameters, 16 bytes each.
 
-Bands 1 to 3 lie in `shN`: rgb32f, K texels a Gaussian.
+Bands 1 to 3 lie in `shN`: rgb32f (rgba32f where the edit pass writes it), K texels a Gaussian.
 """
+
+SHOWN_SH = 15
+"""Largest K: coefficients above degree 3 ride along in the scene and are not shown."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an attribute lies: the texture, its first component there, and how many."""
+
+    texture: str
+    component: int
+    components: int
+
+
+PLACES = {
+    "means": Place("mean_logit", 0, 3),
+    "logit_opacities": Place("mean_logit", 3, 1),
+    "log_scales": Place("log_scale", 0, 3),
+    "quats": Place("quat", 0, 4),
+    "sh0": Place("sh0", 0, 3),
+    "shN": Place("shN", 0, 3),
+}
+"""Attribute -> its place in each of its texels."""
 
 PROJECTED = np.dtype([("centre", "<f4", 2), ("shape", "<f4", 3), ("r2", "<f4"), ("rgb_opacity", "<f4", 4)])
 """One projected Gaussian, written by shaders/project.vert and read by shaders/splat.vert. 40 bytes."""
 
 ORDER = np.dtype("<u4")
 """One row index of the scene, in drawing order; `splat` in shaders/project.vert."""
+
+TARGETS = (*SPLAT_TEXTURES, "shN")
+"""The textures that the edit pass writes, as include/edit_layers.glsl counts them."""
+
+TEXELS_PER_ROW = 4096
+"""Texels in a row of the lists that the edit pass reads; see `gl.texel_list`."""
+
+EDIT_TARGET = np.dtype([("full", "<i4"), ("rest", "<i4"), ("rank", "<i4"), ("numbers", "<i4")])
+"""What a layer does to one of `TARGETS`; one rgba32i texel, explained in include/edit_layers.glsl."""
+
+EDIT_LAYER = np.dtype(
+    [
+        ("places", "<i4"),
+        ("weights", "<i4"),
+        ("numbers", "<i4"),
+        ("unused", "<i4"),
+        ("targets", EDIT_TARGET, len(TARGETS)),
+    ]
+)
+"""One layer of the stack, LAYER_TEXELS rgba32i texels."""
+
+SPAN = np.dtype([("column", "<i4"), ("row", "<i4"), ("texels", "<i4"), ("slot", "<i4")])
+"""Gaussians that follow each other in one row of the scene's textures; `span` in shaders/edit.vert."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import moderngl
 import numpy as np
@@ -11,26 +11,8 @@ from numpy.typing import NDArray
 
 from progdf.gaussians import ATTRIBUTES, Gaussians
 
-from .layout import SPLAT_TEXTURES, SPLATS_PER_ROW
+from .layout import PLACES, SPLAT_TEXTURES, SPLATS_PER_ROW
 
-
-@dataclass(frozen=True)
-class _Place:
-    """Where an attribute lies: the texture and the first of its float channels."""
-
-    texture: str
-    channel: int
-
-
-_PLACES = {
-    "means": _Place("mean_logit", 0),
-    "logit_opacities": _Place("mean_logit", 3),
-    "log_scales": _Place("log_scale", 0),
-    "quats": _Place("quat", 0),
-    "sh0": _Place("sh0", 0),
-    "shN": _Place("shN", 0),
-}
-_SHOWN_SH = 15  # coefficients above degree 3 ride along in the scene and are not shown
 _GAP = 4  # texture rows: uploading so many untouched ones costs less than another call
 
 
@@ -41,13 +23,19 @@ class SplatTextures:
         ctx: where they live
         count: N
         sh_coefficients: K of shN that are shown: 0, 3, 8 or 15
+        editable: let the edit pass write shN too: a third larger, as no driver has to draw into rgb32f
     """
 
-    def __init__(self, ctx: moderngl.Context, count: int, sh_coefficients: int) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, count: int, sh_coefficients: int, editable: bool = False
+    ) -> None:
         self.count = count
         self.sh_coefficients = sh_coefficients
+        self.editable = editable
         self.rows = max(1, -(-count // SPLATS_PER_ROW))
-        self._channels = dict.fromkeys(SPLAT_TEXTURES, 4) | {"shN": 3 * max(1, sh_coefficients)}
+        self._channels = dict.fromkeys(SPLAT_TEXTURES, 4)
+        sh_components = 4 if editable else 3
+        self._channels["shN"] = sh_components * max(1, sh_coefficients)
         self._memory = {
             name: np.zeros((self.rows * SPLATS_PER_ROW, channels), np.float32)
             for name, channels in self._channels.items()
@@ -59,7 +47,7 @@ class SplatTextures:
             components = 4
             if name == "shN":
                 size = (SPLATS_PER_ROW * sh_coefficients, self.rows) if sh_coefficients else (1, 1)
-                components = 3
+                components = sh_components
             texture = ctx.texture(size, components, dtype="f4")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
             self.textures[name] = texture
@@ -80,20 +68,20 @@ class SplatTextures:
         runs = [(0, self.rows)] if rows is None else list(row_runs(rows))
         touched = []
         for attribute in attributes:
-            place = _PLACES[attribute]
+            place = PLACES[attribute]
             if place.texture not in self._memory:
                 continue
             values = getattr(scene, attribute).detach()
             if attribute == "shN":
-                values = values[:, : self.sh_coefficients].flatten(1)
-            columns = _two_dimensional(values.numpy())
-            memory = self._memory[place.texture][:, place.channel : place.channel + columns.shape[1]]
-            for (
-                first,
-                last,
-            ) in runs:  # whole runs: gathering the changed rows alone takes several times longer
+                values = values[:, : self.sh_coefficients]
+            width = math.prod(values.shape[1:]) // place.components
+            numbers = values.reshape(self.count, width, place.components).numpy()
+            memory = self._memory[place.texture].reshape(self.rows * SPLATS_PER_ROW, width, -1)
+            memory = memory[..., place.component : place.component + place.components]
+            # whole runs: gathering the changed rows alone takes several times longer
+            for first, last in runs:
                 begin, end = first * SPLATS_PER_ROW, min(last * SPLATS_PER_ROW, self.count)
-                memory[begin:end] = columns[begin:end]
+                memory[begin:end] = numbers[begin:end]
             if place.texture not in touched:
                 touched.append(place.texture)
         return sum(self._send(name, runs) for name in touched)
@@ -129,7 +117,3 @@ def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     lasts = touched[np.concatenate([breaks, [len(touched) - 1]])]
     for first, last in zip(firsts, lasts, strict=True):
         yield int(first), int(last) + 1
-
-
-def _two_dimensional(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return values[:, None] if values.ndim == 1 else values

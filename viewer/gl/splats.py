@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
-from .layout import ORDER, PROJECTED
+from .layout import ORDER, PROJECTED, SHOWN_SH
 from .programs import load_program
 from .scene_textures import SplatTextures
 
 Rgb = tuple[float, float, float]
-
-_SHOWN_SH = 15  # coefficients above degree 3 ride along in the scene and are not shown
 
 
 @dataclass(frozen=True)
@@ -65,20 +63,32 @@ class SplatRenderer:
         self._target: _Target | None = None
         self._drawn = 0
 
-    def upload(self, scene: Gaussians) -> int:
-        """Take a whole scene; gives the bytes sent. The order has to be set anew."""
-        count, coefficients = len(scene), min(int(scene.shN.shape[1]), _SHOWN_SH)
-        if self._scene is None or (self._scene.count, self._scene.sh_coefficients) != (count, coefficients):
+    @property
+    def textures(self) -> SplatTextures:
+        """The scene as it is drawn."""
+        assert self._scene is not None, "upload comes first"
+        return self._scene
+
+    def upload(self, scene: Gaussians, editable: bool = False) -> int:
+        """Take a whole scene; gives the bytes sent. The order has to be set anew.
+
+        Args:
+            scene: what is drawn
+            editable: see `SplatTextures`
+        """
+        count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)
+        wanted = (count, coefficients, editable)
+        held = self._scene
+        if held is None or (held.count, held.sh_coefficients, held.editable) != wanted:
             self._release_scene()
-            self._scene = SplatTextures(self.ctx, count, coefficients)
+            self._scene = SplatTextures(self.ctx, count, coefficients, editable)
             self._buffers = self._make_buffers(max(count, 1))
         self._drawn = 0
-        return self._scene.write(scene)
+        return self.textures.write(scene)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> int:
         """Take the changed attributes of the changed rows (sorted); gives the bytes sent."""
-        assert self._scene is not None, "upload comes first"
-        return self._scene.write(scene, attributes, rows)
+        return self.textures.write(scene, attributes, rows)
 
     def set_order(self, order: NDArray[np.uint32]) -> None:
         """Which Gaussians are drawn, farthest first; see `viewer.sort`."""

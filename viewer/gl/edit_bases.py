@@ -1,0 +1,183 @@
+"""Edits as the edit pass reads them: bases, original attributes and memberships as flat lists of texels.
+
+Made once. Their length grows with the members of the edits, not with the scene: about 64 bytes of original
+attributes a member and 16 + 4R bytes a target, and 4 bytes for every edit to say which member a Gaussian is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.checkpoint import Gdf
+from progdf.field.baked import AttributeBases
+from progdf.gaussians import Gaussians
+
+from .layout import PLACES, SHOWN_SH, TARGETS, Place
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One attribute that an edit moves: what its factors are made from (see `compose_plan.factors`)."""
+
+    attribute: str
+    table: Floats
+    step: Floats
+
+
+@dataclass(frozen=True)
+class TargetBases:
+    """What an edit does to one of `TARGETS`: where its bases begin, and what they move.
+
+    Args:
+        full: texel of the full offsets in `floats`
+        rest: texel of bases 1 to `rank` in `levels`; −1: they follow each full offset in `floats`
+        rank: largest R of its attributes
+        movers: one attribute or, in `mean_logit`, up to two
+    """
+
+    full: int
+    rest: int
+    rank: int
+    movers: tuple[Mover, ...]
+
+
+@dataclass(frozen=True)
+class PackedEdits:
+    """All edits of a scene.
+
+    Args:
+        slots: Gaussians that are a member of any edit, ascending. [U]
+        originals: where the slots' original texels begin in `floats`, by target; −1 where no edit moves it
+        floats: [·,4] float32
+        levels: [·,4] int8
+        places: for each edit in turn, which member each slot is, −1 where none. [E·U] int32
+        edits: by target, what each edit does to it
+        nodes: strengths of each edit's coefficients. [S] each
+        sh_coefficients: K of shN that are shown
+    """
+
+    slots: NDArray[np.int64]
+    originals: tuple[int, ...]
+    floats: Floats
+    levels: NDArray[np.int8]
+    places: NDArray[np.int32]
+    edits: tuple[Mapping[int, TargetBases], ...]
+    nodes: tuple[NDArray[np.float64], ...]
+    sh_coefficients: int
+
+    def width(self, target: int) -> int:
+        """Texels of a Gaussian in a target."""
+        return self.sh_coefficients if TARGETS[target] == "shN" else 1
+
+    @property
+    def texels(self) -> int:
+        """Length of the longest list."""
+        return max(len(self.floats), len(self.levels), len(self.places))
+
+
+class _List:
+    """A list under construction."""
+
+    def __init__(self) -> None:
+        self.parts: list[NDArray[Any]] = []
+        self.length = 0
+
+    def put(self, texels: NDArray[Any]) -> int:
+        begin, self.length = self.length, self.length + len(texels)
+        self.parts.append(texels)
+        return begin
+
+    def joined(self, dtype: Any) -> NDArray[Any]:
+        return np.concatenate([np.zeros((0, 4), dtype), *self.parts])
+
+
+def pack_edits(scene: Gaussians, gdfs: Sequence[Gdf]) -> PackedEdits:
+    """All that the pass has to know of a scene and its edits."""
+    shown = min(int(scene.shN.shape[1]), SHOWN_SH)
+    members = [gdf.region.members.numpy() for gdf in gdfs]
+    slots = np.unique(np.concatenate([np.zeros(0, np.int64), *members]))
+    places = np.full((len(gdfs), len(slots)), -1, np.int32)
+    for edit, own in enumerate(members):
+        places[edit, np.searchsorted(slots, own)] = np.arange(len(own))
+    floats, levels = _List(), _List()
+    edits = [_edit(gdf, shown, floats, levels) for gdf in gdfs]
+    moved = {target for edit in edits for target in edit}
+    originals = [-1] * len(TARGETS)
+    for target in sorted(moved):
+        originals[target] = floats.put(_originals(scene, TARGETS[target], slots, shown))
+    return PackedEdits(
+        slots,
+        tuple(originals),
+        floats.joined(np.float32),
+        levels.joined(np.int8),
+        places.reshape(-1),
+        tuple(edits),
+        tuple(gdf.field.nodes.double().numpy() for gdf in gdfs),
+        shown,
+    )
+
+
+def _edit(gdf: Gdf, shown: int, floats: _List, levels: _List) -> dict[int, TargetBases]:
+    found: dict[int, TargetBases] = {}
+    for target, texture in enumerate(TARGETS):
+        attributes = {
+            name: bases for name, bases in gdf.field.attributes.items() if PLACES[name].texture == texture
+        }
+        if attributes and not (texture == "shN" and shown == 0):
+            found[target] = _target(attributes, shown, floats, levels)
+    return found
+
+
+def _target(
+    attributes: Mapping[str, AttributeBases], shown: int, floats: _List, levels: _List
+) -> TargetBases:
+    """Put the attributes of one target side by side, members in turn, each with all its bases."""
+    rank = max(bases.rest.shape[0] for bases in attributes.values())
+    as_floats = any(bases.rest.dtype != torch.int8 for bases in attributes.values())
+    full = rest = np.zeros(0)
+    movers = []
+    for name, bases in attributes.items():
+        place = PLACES[name]
+        own = _texels(bases.full.numpy(), place, shown)
+        own_rest = bases.rest.float() if as_floats else bases.rest
+        if not full.size:
+            full = np.zeros((len(own), 4), np.float32)
+            rest = np.zeros((len(own), rank, 4), np.float32 if as_floats else np.int8)
+        columns = slice(place.component, place.component + place.components)
+        full[:, columns] = own
+        for k in range(len(own_rest)):
+            rest[:, k, columns] = _texels(own_rest[k].numpy(), place, shown)
+        width = shown if name == "shN" else 1
+        step = bases.step[:, : width * place.components].numpy()
+        movers.append(Mover(name, bases.coefficients.numpy(), step))
+    if as_floats:
+        together = np.concatenate([full[:, None], rest], axis=1).reshape(-1, 4)
+        return TargetBases(floats.put(together), -1, rank, tuple(movers))
+    return TargetBases(floats.put(full), levels.put(rest.reshape(-1, 4)), rank, tuple(movers))
+
+
+def _originals(scene: Gaussians, texture: str, slots: NDArray[np.int64], shown: int) -> Floats:
+    width = shown if texture == "shN" else 1
+    texels = np.zeros((len(slots) * width, 4), np.float32)
+    for name, place in PLACES.items():
+        if place.texture == texture:
+            values = getattr(scene, name).detach().float()[torch.from_numpy(slots)].numpy()
+            columns = slice(place.component, place.component + place.components)
+            rows = values.reshape(len(slots), math.prod(values.shape[1:]))
+            texels[:, columns] = _texels(rows, place, shown)
+    return texels
+
+
+def _texels(values: NDArray[Any], place: Place, shown: int) -> NDArray[Any]:
+    """Rows of channels as texels, one or `shown` a row. [M,c] -> [M·w,components]"""
+    width = shown if place.texture == "shN" else 1
+    return values[:, : width * place.components].reshape(-1, place.components)

@@ -1,0 +1,74 @@
+"""A stack of layers at its present strengths, as shaders/include/edit_layers.glsl reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.compose_plan import factors
+from progdf.layers import Layer
+
+from .edit_bases import Floats, PackedEdits, TargetBases
+from .layout import EDIT_LAYER, PLACES
+
+
+def described(
+    packed: PackedEdits, stack: Sequence[tuple[int, Layer]], weights_at: Sequence[int]
+) -> tuple[NDArray[Any], Floats]:
+    """The lists `edit_layers` and `edit_numbers`.
+
+    Args:
+        packed: the edits
+        stack: index of the edit and the layer, the lowest first
+        weights_at: where each layer's painted weights begin; −1 where it has none
+
+    Returns:
+        [L] of `EDIT_LAYER`, and the numbers it points to. [·,4] float32
+    """
+    layers = np.zeros(len(stack), EDIT_LAYER)
+    lines: list[Floats] = []
+    length = 0
+
+    def put(some: Floats) -> int:
+        nonlocal length
+        begin, length = length, length + len(some)
+        lines.append(some)
+        return begin
+
+    for i, (edit, layer) in enumerate(stack):
+        entry: Any = layers[i]
+        entry["places"], entry["weights"] = edit * len(packed.slots), weights_at[i]
+        entry["numbers"] = put(np.array([[layer.cover, 0.0, 0.0, 0.0]], np.float32))
+        entry["targets"]["numbers"] = -1
+        for target, bases in packed.edits[edit].items():
+            if not any(layer.gain(mover.attribute) for mover in bases.movers):
+                continue
+            numbers = put(_numbers(packed.nodes[edit], bases, packed.width(target), layer))
+            entry["targets"][target] = (bases.full, bases.rest, bases.rank, numbers)
+    return layers, np.concatenate([np.zeros((0, 4), np.float32), *lines])
+
+
+def joined_weights(stack: Sequence[tuple[int, Layer]]) -> tuple[Floats, list[int]]:
+    """The painted weights of all layers in turn, and where each layer's begin; −1 for one without."""
+    parts, begins, length = [np.zeros(0, np.float32)], [], 0
+    for _, layer in stack:
+        begins.append(-1 if layer.weights is None else length)
+        if layer.weights is not None:
+            parts.append(layer.weights.detach().float().numpy())
+            length += len(layer.weights)
+    return np.concatenate(parts), begins
+
+
+def _numbers(nodes: NDArray[np.float64], bases: TargetBases, width: int, layer: Layer) -> Floats:
+    """The gain, then the factors of every basis, `width` texels each. [1+(1+R)·width,4]"""
+    lines = np.zeros((1 + (1 + bases.rank) * width, 4), np.float32)
+    for mover in bases.movers:
+        place = PLACES[mover.attribute]
+        columns = slice(place.component, place.component + place.components)
+        own = factors(nodes, mover.table, mover.step, layer.strength).reshape(-1, place.components)
+        lines[0, columns] = layer.gain(mover.attribute)
+        lines[1 : 1 + len(own), columns] = own
+    return lines
