@@ -26,6 +26,8 @@ BENCHES: dict[str, str] = {
     "rasterize": "progdf.bench_rasterize:tables",
     "field": "progdf.bench_field:tables",
     "viewer": "viewer.bench:tables",
+    "frames": "viewer.bench_frames:tables",
+    "window": "viewer.bench_window:tables",
 }
 
 RECORDED = "trainer.bench_runs:recorded_course"

@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import platform
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -52,11 +53,13 @@ class Options:
     """Measure speed against error; each benchmark interleaves what it compares in one process.
 
     Args:
-        what: rasterize, field, viewer; all of them when none is named
+        what: rasterize, field, viewer, frames, window; all of them when none is named
         json: also write the tables to this JSON file
         readme: also put the tables between their markers in this Markdown file
         runs: finished run folders whose recorded edits `field` measures beside the bear's
         plot: `field` also draws its errors into this PNG file
+        scenes: .ply files that viewer, frames and window draw in place of the bears
+        seconds: how long `window` drags its slider; 60 where not said
     """
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -64,6 +67,8 @@ class Options:
     readme: Path | None = None
     runs: tuple[Path, ...] = ()
     plot: Path | None = None
+    scenes: tuple[Path, ...] = ()
+    seconds: float | None = None
 
 
 def machine() -> str:
@@ -88,13 +93,28 @@ def main(argv: Sequence[str]) -> int:
             raise ProgdfError(f"there is no benchmark '{name}'; try one of {', '.join(BENCHES)}")
     if (options.runs or options.plot) and options.what and "field" not in options.what:
         raise ProgdfError("--runs and --plot are for fields; say progdf bench field")
+    drawing = ("viewer", "frames", "window")
+    if options.scenes and options.what and not set(drawing) & set(options.what):
+        raise ProgdfError(f"--scenes are for {', '.join(drawing)}; say progdf bench {drawing[0]}")
+    if options.seconds is not None and options.what and "window" not in options.what:
+        raise ProgdfError("--seconds is how long the window is dragged; say progdf bench window")
     given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
     if options.runs:
         given["field"]["recorded"] = [_named(RECORDED)(run) for run in options.runs]
+    given |= {name: {"scenes": options.scenes} for name in drawing}
+    if options.seconds is not None:
+        given["window"]["seconds"] = options.seconds
     tables: list[Table] = []
     print(f"{machine()}\n")
     for name in options.what or tuple(BENCHES):
-        for table in _named(BENCHES[name])(**given.get(name, {})):
+        try:
+            measured = _named(BENCHES[name])(**given.get(name, {}))
+        except ProgdfError as error:
+            if options.what:
+                raise
+            print(f"{name} is not measured: {error}\n", file=sys.stderr)
+            continue
+        for table in measured:
             tables.append(table)
             print(table.markdown() + "\n", flush=True)
     if options.json:

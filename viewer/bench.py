@@ -1,48 +1,66 @@
-"""`progdf bench viewer`: milliseconds from a slider's change to finished pixels, beside the error.
+"""`progdf bench viewer`: milliseconds from a slider's event to finished pixels, and where they go.
 
-The scene is the bear, so that anybody can repeat it; one edit recolours and moves its members, the other only
-recolours them, which needs no new depth order. OpenGL and the CPU rasteriser take turns in one process.
+A hand drags the slider of a whole window (panel and picture) drawn without a screen; the ways of drawing take
+turns at every step, in one process. The scenes are bears, so that anybody can repeat it, or --scenes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import moderngl
 import numpy as np
-import torch
 
 from progdf.bench import Table
-from progdf.checkpoint import Gdf, fingerprint
-from progdf.errors import ProgdfError
-from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
-from progdf.region import Region
-from progdf.scenes import bear
 
+from .bench_mouse import SIZE, Mouse, slider_at
+from .bench_scenes import edit_for, scenes_of
 from .engine import Engine, FrameTimings
 from .headless import headless_context
 from .state import LayerState, ViewState
 from .turntable import first_camera, to_camera
 
-SIZE = (640, 480)
-WARM_UP = 2
-RANKS = 3
+WARM_UP, STEPS = 2, 24
+PARTS = ("compose_ms", "upload_ms", "sort_ms", "draw_ms")
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to bring a slider's change to the screen; what is to be compared gets a row here.
+
+    Args:
+        title: in the table
+        draw: of `engine.DRAWS`
+        whole: draw the whole picture at every step, though only a part of it has changed
+    """
+
+    title: str
+    draw: str
+    whole: bool = False
+
+
+WAYS = {
+    "gl": Way("OpenGL", "gl"),
+    "cpu": Way("CPU", "cpu"),
+    "cpu, whole": Way("CPU, whole picture", "cpu", whole=True),
+}
 
 
 @dataclass(frozen=True)
 class Case:
-    """One scene with an edit.
+    """An edit of a scene.
 
     Args:
-        count: Gaussians in the scene
-        members: Gaussians that the edit changes
+        members: Gaussians that it changes
         moves: whether it moves them too, so that they have to be sorted anew
     """
 
-    count: int
     members: int
     moves: bool
 
@@ -51,160 +69,158 @@ class Case:
         return "colour and place" if self.moves else "colour"
 
 
-CASES = (Case(31_000, 3_000, False), Case(31_000, 3_000, True), Case(125_000, 100_000, True))
+CASES = (Case(3_000, False), Case(3_000, True), Case(30_000, True), Case(125_000, True))
 
 
 @dataclass(frozen=True)
 class Result:
-    """What one way of drawing took, a timing per slider step, and how far it is from the CPU engine.
+    """What one way took, an entry per step of the slider, and how far its picture is from the CPU engine's.
 
     Args:
-        drawn_by: a key of `WAYS`
-        slider: from a strength to finished pixels
-        orbit: from a camera to finished pixels
+        count: Gaussians in the scene
+        way: a key of `WAYS`
+        events_ms: from the mouse's event to finished pixels
+        parts: what of that the engine took
         psnr_db: against `progdf.render`, the worst of three strengths
-        apart: largest difference of a slider step's picture from the same drawn as a whole by the same engine
+        apart: largest difference of a picture that was drawn step by step from the same drawn afresh
     """
 
     case: Case
-    drawn_by: str
-    slider: tuple[FrameTimings, ...]
-    orbit: tuple[FrameTimings, ...]
+    count: int
+    way: str
+    events_ms: tuple[float, ...]
+    parts: tuple[FrameTimings, ...]
     psnr_db: float
-    apart: float = 0.0
+    apart: float
+
+    @property
+    def rest_ms(self) -> float:
+        """Panel, events and the way to the screen: what the engine did not take; the median."""
+        pairs = zip(self.events_ms, self.parts, strict=True)
+        return float(np.median([event - part.total_ms for event, part in pairs]))
 
 
-WAYS = {"gl": "OpenGL", "cpu": "CPU", "cpu, whole": "CPU, whole picture"}
-"""Ways to draw; "cpu" draws only the part of the picture that the slider touches, the last one all of it."""
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """Measure, for the README and for `progdf bench`.
+
+    Args:
+        scenes: .ply files that take the place of the bears
+
+    Raises:
+        ProgdfError: there is no OpenGL here to draw a window with, or a file is broken.
+    """
+    opened = scenes_of(scenes)
+    ctx = headless_context()
+    try:
+        results: list[Result] = []
+        for case in CASES:
+            results += rows(ctx, _fitting(opened, case.members), case)
+        return [table(results, str(ctx.info["GL_RENDERER"]))]
+    finally:
+        ctx.release()
 
 
-def edit_for(scene: Gaussians, case: Case) -> Gdf:
-    """A made-up edit, as large as a trained one: beside the full offset three int8 bases."""
-    rng = torch.Generator().manual_seed(0)
-    members = torch.arange(min(case.members, len(scene)))
-    widths = {"means": 3, "log_scales": 3, "quats": 4, "sh0": 3} if case.moves else {"sh0": 3}
-    nodes = torch.linspace(0, 1, 9)
-    bumps = [torch.sin(math.pi * (k + 1) * nodes) for k in range(RANKS)]
-    coefficients = torch.stack([nodes, *bumps], dim=1)
-    coefficients[-1] = torch.tensor([1.0] + [0.0] * RANKS)
-    attributes = {
-        name: AttributeBases(
-            full=(0.5 if name == "sh0" else 0.01) * torch.randn(len(members), width, generator=rng),
-            rest=torch.randint(-127, 128, (RANKS, len(members), width), generator=rng, dtype=torch.int8),
-            step=torch.full((RANKS, width), 1e-4),
-            coefficients=coefficients.clone(),
-        )
-        for name, width in widths.items()
-    }
-    score = torch.zeros(len(scene)).index_fill(0, members, 1.0)
-    return Gdf(
-        "edit",
-        Region("edit", members, score),
-        BakedField("separable", nodes, attributes, 14),
-        fingerprint(scene),
+def rows(
+    ctx: moderngl.Context,
+    scene: Gaussians,
+    case: Case,
+    steps: int = STEPS,
+    size: tuple[int, int] = SIZE,
+) -> list[Result]:
+    """One edit, by every way, a step each in turns."""
+    gdf = edit_for(scene, case.members, case.moves)
+    case = replace(case, members=len(gdf.region))
+    layers = (LayerState(0, "edit", 0.05),)
+    view = ViewState(first_camera(scene), layers, draft="off")
+    events: dict[str, list[float]] = {way: [] for way in WAYS}
+    parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
+    with ExitStack() as held:
+        mice: dict[str, Mouse] = {}
+        for name, way in WAYS.items():
+            engine = Engine(ctx, scene, [gdf], way.draw)
+            held.callback(engine.release)
+            mice[name] = held.enter_context(Mouse(ctx, engine, scene, [gdf], view, size))
+            mice[name].grip_slider()
+        for step in range(1, WARM_UP + steps + 1):
+            place = slider_at(mice["cpu"].pixels[0], 0, 0.05 + 0.9 * step / (WARM_UP + steps))
+            for name, mouse in mice.items():
+                if WAYS[name].whole:
+                    mouse.engine.forget()
+                events[name].append(mouse.move(*place))
+                parts[name].append(mouse.stage.canvas.timings)
+        return [
+            Result(
+                case,
+                len(scene),
+                name,
+                tuple(events[name][WARM_UP:]),
+                tuple(parts[name][WARM_UP:]),
+                _psnr(mouse.engine, view, size),
+                _apart(mouse, size),
+            )
+            for name, mouse in mice.items()
+        ]
+
+
+def table(results: Sequence[Result], renderer: str) -> Table:
+    """The measurements, named after what OpenGL was drawn by."""
+    return Table(
+        "viewer",
+        "Slider event to finished pixels, 640×480, ms",
+        (
+            "Gaussians",
+            "members",
+            "edit of",
+            "drawn by",
+            "compose",
+            "upload",
+            "sort",
+            "draw",
+            "panel, screen",
+            "redrawn",
+            "in all p50 / p95",
+            "PSNR to the CPU engine, dB",
+        ),
+        tuple(_cells(result) for result in results),
+        f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
+        "waited for, the parts are medians. The CPU rasteriser sorts as it draws and draws where the slider "
+        "touches the picture. Largest difference between a picture drawn step by step and the same drawn "
+        f"afresh: {max(result.apart for result in results):g}.",
     )
 
 
-def rows(cases: Sequence[Case] = CASES, steps: int = 20, size: tuple[int, int] = SIZE) -> list[Result]:
-    """Measure every case with every way to draw that this machine has."""
-    try:
-        ctx = headless_context()
-    except ProgdfError:
-        ctx = None
-    results = []
-    for case in cases:
-        scene = bear(case.count).gaussians
-        gdf = edit_for(scene, case)
-        ways = [way for way in WAYS if ctx or way != "gl"]
-        engines = [Engine(ctx, scene, [gdf], "gl" if way == "gl" else "cpu") for way in ways]
-        view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.5),))
-        slider: list[list[FrameTimings]] = [[] for _ in engines]
-        orbit: list[list[FrameTimings]] = [[] for _ in engines]
-        apart = 0.0
-        for step in range(WARM_UP + steps):
-            strength = 0.05 + 0.9 * step / (WARM_UP + steps)
-            slid = _at(view, strength, 0.0)
-            turned = _at(view, strength, 7.0 * (step + 1))
-            images = {}
-            for i, engine in enumerate(engines):
-                if ways[i] == "cpu, whole":
-                    engine.forget()
-                images[ways[i]] = engine.image(slid, size)
-                slider[i].append(engine.timings)
-                engine.image(turned, size)
-                orbit[i].append(engine.timings)
-                engine.image(slid, size)
-            apart = max(apart, float(np.abs(images["cpu"] - images["cpu, whole"]).max()))
-        for way, engine, slides, turns in zip(ways, engines, slider, orbit, strict=True):
-            error = _psnr(engine, view, size)
-            results.append(Result(case, way, tuple(slides[WARM_UP:]), tuple(turns[WARM_UP:]), error, apart))
-            engine.release()
-    if ctx is not None:
-        ctx.release()
-    return results
+def _cells(result: Result) -> tuple[str, ...]:
+    middle, late = np.percentile(result.events_ms, (50, 95))
+    return (
+        f"{result.count:,}".replace(",", " "),
+        f"{result.case.members:,}".replace(",", " "),
+        result.case.title,
+        WAYS[result.way].title,
+        *(f"{np.median([getattr(part, name) for part in result.parts]):.1f}" for name in PARTS),
+        f"{result.rest_ms:.1f}",
+        f"{100 * np.median([part.share for part in result.parts]):.0f} %",
+        f"**{middle:.1f}** / {late:.1f}",
+        "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
+    )
 
 
-def tables(results: Sequence[Result] | None = None) -> list[Table]:
-    """The measurements for the README and for `progdf bench`."""
-    measured = rows() if results is None else results
-    cells = []
-    for result in measured:
-        totals = [timing.total_ms for timing in result.slider]
-        middle, late = np.percentile(totals, (50, 95))
-        split = [
-            f"{np.median([getattr(timing, stage) for timing in result.slider]):.1f}"
-            for stage in ("compose_ms", "upload_ms", "sort_ms", "draw_ms")
-        ]
-        orbit = np.median([timing.total_ms for timing in result.orbit])
-        cells.append(
-            (
-                f"{result.case.count:,}".replace(",", " "),
-                f"{result.case.members:,}".replace(",", " "),
-                result.case.title,
-                WAYS[result.drawn_by],
-                *split,
-                f"{100 * np.median([timing.share for timing in result.slider]):.0f} %",
-                f"**{middle:.1f}** / {late:.1f}",
-                f"{orbit:.1f}",
-                "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
-            )
-        )
-    return [
-        Table(
-            "viewer",
-            "Slider change to finished pixels, 640×480, ms",
-            (
-                "Gaussians",
-                "members",
-                "edit of",
-                "drawn by",
-                "compose",
-                "upload",
-                "sort",
-                "draw",
-                "redrawn",
-                "in all p50 / p95",
-                "orbit p50",
-                "PSNR to the CPU engine, dB",
-            ),
-            tuple(cells),
-            "Wall clock, the GPU waited for; the parts are medians. The CPU rasteriser sorts as it draws "
-            "and draws where the slider touches the picture; the largest difference from whole pictures: "
-            f"{max(result.apart for result in measured):g}.",
-        )
-    ]
+def _fitting(scenes: Sequence[Gaussians], members: int) -> Gaussians:
+    """The smallest scene with so many Gaussians, or nearly; else the largest."""
+    return next((scene for scene in scenes if len(scene) >= 0.9 * members), scenes[-1])
 
 
-def _at(view: ViewState, strength: float, azimuth: float) -> ViewState:
-    """`view` at another strength, turned by `azimuth` degrees."""
-    camera = replace(view.camera, azimuth=view.camera.azimuth + azimuth)
-    return replace(view, camera=camera, layers=(LayerState(0, "edit", strength),))
+def _apart(mouse: Mouse, size: tuple[int, int]) -> float:
+    """How far the picture is from the same one drawn afresh."""
+    view = mouse.stage.work.view
+    stepped = mouse.engine.image(view, size)
+    mouse.engine.forget()
+    return float(np.abs(stepped - mouse.engine.image(view, size)).max())
 
 
 def _psnr(engine: Engine, view: ViewState, size: tuple[int, int]) -> float:
     worst = math.inf
     for strength in (0.0, 0.5, 1.0):
-        slid = _at(view, strength, 0.0)
+        slid = replace(view, layers=(LayerState(0, "edit", strength),))
         image = engine.image(slid, size)
         target = render(engine.gaussians(slid), to_camera(slid.camera, *size)).numpy()
         error = float(((image.astype(np.float64) - target) ** 2).mean())

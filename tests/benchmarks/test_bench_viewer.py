@@ -1,20 +1,191 @@
-"""The viewer's benchmark on a scene small enough for a test: it runs, and its error column is true."""
+"""The viewer's benchmarks on scenes small enough for a test: they run, and measure what they say."""
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf import bench as front
 from progdf.bench import Table
-from viewer.bench import Case, rows, tables
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.ply import save_ply
+from progdf.scenes import bear
+from viewer import bench, bench_frames, bench_window
+from viewer.bench import Case
+from viewer.bench_mouse import Mouse
+from viewer.bench_scenes import copies, edit_for, scenes_of
+from viewer.bench_window import Dragging, Idle
+from viewer.engine import Engine, FrameTimings
+from viewer.headless import headless_context
+from viewer.state import LayerState, ViewState
+from viewer.turntable import bounds_of, first_camera
+
+SIZE = (160, 400)
 
 
-def test_the_viewers_table_has_a_row_for_each_way_to_draw_with_its_error() -> None:
-    results = rows([Case(600, 100, True)], steps=2, size=(64, 48))
-    assert {result.drawn_by for result in results} >= {"cpu"}
+@pytest.mark.gl
+def test_the_slider_table_has_a_row_for_each_way_to_draw_with_its_error() -> None:
+    ctx = headless_context()
+    results = bench.rows(ctx, bear(600).gaussians, Case(100, True), steps=2, size=SIZE)
+    ctx.release()
+    assert [result.way for result in results] == list(bench.WAYS)
     for result in results:
-        assert len(result.slider) == len(result.orbit) == 2
-        assert all(timing.changed == 100 for timing in result.slider)
-        assert all(timing.changed == 0 for timing in result.orbit)
+        assert len(result.events_ms) == len(result.parts) == 2
+        assert all(part.changed == 100 for part in result.parts)
+        assert all(ms > part.total_ms for ms, part in zip(result.events_ms, result.parts, strict=True))
         assert result.psnr_db >= 65.0, "the early stop at 1e-4, in a picture of few pixels"
-    (table,) = tables(results)
+        assert result.apart == 0.0
+    assert [result.parts[-1].share == 1.0 for result in results if result.way != "cpu"] == [True, True]
+    table = bench.table(results, "a renderer")
     assert isinstance(table, Table)
-    assert len(table.rows) == len(results)
     assert all(len(row) == len(table.columns) for row in table.rows)
+    assert table.note.startswith("OpenGL by a renderer.")
+
+
+@pytest.mark.gl
+def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: Path) -> None:
+    path = tmp_path / "bear.ply"
+    save_ply(path, bear(600).gaussians)
+    ctx = headless_context()
+    turnings = bench_frames.turned(ctx, path, steps=2, size=SIZE)
+    ctx.release()
+    assert [turning.way for turning in turnings] == list(bench_frames.WAYS)
+    for turning in turnings:
+        assert len(turning.frames_ms) == len(turning.draws_ms) == len(turning.coarse_ms) == 2
+        assert min(turning.draws_ms) > 0.0, "every frame is a new picture"
+        assert (turning.count, turning.wrong) == (600, 0)
+        assert turning.checked >= 2
+        assert 10.0 < turning.coarse_db < 60.0
+        assert turning.at_rest == 0
+    frames = bench_frames.frames_table(turnings, [bench_frames.Start(1.5, 300.0)], "a renderer")
+    coarse = bench_frames.coarse_table(turnings, "a renderer")
+    assert [row[-2:] for row in frames.rows] == [("-", "-"), ("1.50", "300")]
+    assert all(len(row) == len(table.columns) for table in (frames, coarse) for row in table.rows)
+
+
+@pytest.mark.gl
+def test_a_frame_in_the_order_of_the_last_one_is_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "bear.ply"
+    save_ply(path, bear(600).gaussians)
+    draw = Engine._bring
+
+    def stale(engine: Engine, view: ViewState, camera: Camera) -> FrameTimings:
+        if engine._ordered_for is not None:
+            engine._ordered_for = camera.viewmat.numpy().tobytes()
+        return draw(engine, view, camera)
+
+    monkeypatch.setattr(Engine, "_bring", stale)
+    ctx = headless_context()
+    turnings = bench_frames.turned(ctx, path, steps=2, size=SIZE)
+    ctx.release()
+    assert {turning.way: turning.wrong > 0 for turning in turnings} == {"gl": True, "cpu": False}
+
+
+@pytest.mark.gl
+def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
+    scene = bear(600).gaussians
+    gdf = edit_for(scene, 50, moves=False)
+    ctx = headless_context()
+    engine = Engine(ctx, scene, [gdf], "cpu")
+    view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.3),), draft="off")
+    with Mouse(ctx, engine, scene, [gdf], view, SIZE) as mouse:
+        mouse.grip_slider()
+        assert mouse.stage.work.view.layers[0].strength == pytest.approx(0.3)
+        mouse.turn(24.2)
+        mouse.release()
+        assert mouse.stage.work.view.layers[0].strength == pytest.approx(0.4, abs=0.01)
+        assert mouse.stage.work.view.camera == view.camera
+        mouse.grip_picture()
+        mouse.turn(10.0)
+        mouse.release()
+        assert mouse.stage.work.view.camera.azimuth == pytest.approx(view.camera.azimuth - 3.0)
+        assert mouse.picture().shape == (*SIZE[::-1], 3)
+    engine.release()
+    ctx.release()
+
+
+def test_made_up_scenes_and_edits_are_the_same_every_time_and_as_large_as_they_say(tmp_path: Path) -> None:
+    scene = bear(600).gaussians
+    many = copies(scene, 3)
+    radius = bounds_of(scene).radius
+    assert len(many) == 1800
+    assert torch.equal(many.means[:600], scene.means)
+    off = (many.means[600:1200] - scene.means).std() / radius
+    assert float(off) == pytest.approx(0.002, rel=0.1)
+    assert torch.equal(many.means, copies(scene, 3).means)
+    first, again = edit_for(scene, 70, moves=True), edit_for(scene, 70, moves=True)
+    assert len(first.region) == 70
+    assert torch.equal(first.field.attributes["means"].full, again.field.attributes["means"].full)
+    assert set(edit_for(scene, 70, moves=False).field.attributes) == {"sh0"}
+    for name, size in (("b.ply", 300), ("a.ply", 200)):
+        save_ply(tmp_path / name, scene[:size])
+    assert [len(s) for s in scenes_of([tmp_path / "b.ply", tmp_path / "a.ply"])] == [200, 300]
+
+
+def test_one_odd_sample_is_no_leak_and_a_steady_rise_is_one() -> None:
+    times = tuple(float(i) for i in range(60))
+    flat = [500.0] * 60
+    flat[50] = 480.0
+    assert Dragging(times, tuple(flat), 1, ()).slope == 0.0
+    rising = tuple(500.0 + 0.1 * t for t in times)
+    assert Dragging(times, rising, 1, ()).slope == pytest.approx(6.0)
+    table = bench_window.table([Idle("at rest", 0.05, 10.0)], Dragging(times, rising, 7, (3.0, 4.0)), 600)
+    assert table.rows[0][1] == "0.5 % of one core"
+    assert table.rows[1][2:] == ("500 → 506", "+6.00")
+    assert all(len(row) == len(table.columns) for row in table.rows)
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("Xvfb and xdotool are not installed")
+    monkeypatch.setattr(bench_window, "_SETTLED_S", 0.2)
+    scene = bear(600).gaussians
+    resting = bench_window.idle(scene, wall_s=0.2)
+    assert len(resting) == 2
+    assert all(one.wall_s >= 0.2 for one in resting)
+    dragging = bench_window.dragged(scene, seconds=0.1)
+    assert dragging.pictures > 20, "one sweep to and fro"
+    assert len(dragging.slider_ms) > 20
+    assert len(dragging.seconds) == len(dragging.memory_mb) >= 2
+    assert min(dragging.memory_mb) > 50.0
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path) -> None:
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("Xvfb and xdotool are not installed")
+    save_ply(tmp_path / "bear.ply", bear(600).gaussians)
+    start = bench_frames.started(tmp_path / "bear.ply", times=1, size=SIZE)
+    assert 0.2 < start.first_s < 300.0
+    assert start.memory_mb > 50.0
+
+
+def test_options_of_one_benchmark_are_refused_where_it_does_not_run(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="say progdf bench viewer"):
+        front.main(["rasterize", "--scenes", str(tmp_path / "a.ply")])
+    with pytest.raises(ProgdfError, match="say progdf bench window"):
+        front.main(["frames", "--seconds", "3"])
+
+
+def test_what_cannot_be_measured_here_is_said_and_left_out_unless_it_was_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(**_: object) -> list[Table]:
+        raise ProgdfError("nothing here; something there")
+
+    monkeypatch.setattr(front, "_named", lambda _: refuse)
+    assert front.main([]) == 0
+    assert "window is not measured: nothing here" in capsys.readouterr().err
+    with pytest.raises(ProgdfError, match="nothing here"):
+        front.main(["window"])
