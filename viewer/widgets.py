@@ -59,11 +59,6 @@ def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
 
 
 def let_go() -> bool:
-    """Whether the last item was held until the mouse let it go in this frame; not where a drag is called off."""
-    return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
-
-
-def let_go() -> bool:
     """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
     return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
 
