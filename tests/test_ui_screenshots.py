@@ -141,6 +141,13 @@ def test_the_original_beside_the_edited(screenshot: Compare) -> None:
         screenshot("ui_split", hand.image())
 
 
+def test_the_field_beside_what_was_recorded(screenshot: Compare, tmp_path: Path) -> None:
+    runs = bear().save_runs(tmp_path)[1:]
+    with rig(first_view(bear(), 0.62, 0.0), SMALLEST, gdf_paths=runs) as hand:
+        hand.key("Alt+Y")
+        screenshot("ui_recorded", hand.image())
+
+
 def test_the_difference_from_the_original(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
         hand.key("Shift+Y")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from . import brush, compare_overlay, dialogs, hand, overlay, panel, timeline_bar, workspace
+from . import bindings, brush, compare_overlay, dialogs, hand, overlay, panel, timeline_bar, workspace
 from .compare_labels import Labels
 from .hand import Hand, Sight
 from .recordings import obstacle
@@ -72,13 +72,14 @@ def over_picture(
         compare_overlay.draw(view, said, area, hand.grips_divider(held, view, sight), ui)
     if view.overlay:
         overlay.table(figures, ui)
+    closed, free = False, imgui.get_io().display_size
+    if work.message is not None:
+        bar = timeline_bar.height(work.player, ui) if view.panel else 0.0
+        closed, top = overlay.message(work.message, replace(area, height=area.height - bar), ui)
+        closed, free = closed or sight.now >= work.message.until, imgui.ImVec2(free.x, top)
     if work.help:
-        overlay.bindings(area, ui)
-    if work.message is None:
-        return work
-    bar = timeline_bar.height(work.player, ui) if view.panel else 0.0
-    closed = overlay.message(work.message, replace(area, height=area.height - bar), ui)
-    return replace(work, message=None) if closed or sight.now >= work.message.until else work
+        bindings.draw(free, ui)
+    return replace(work, message=None) if closed else work
 
 
 def asked(work: Workspace, sight: Sight, recent: Sequence[Path], pressed: Sequence[str]) -> Workspace:

@@ -1,4 +1,4 @@
-"""What is drawn over the picture: timings, the list of bindings, messages, the word "Original"."""
+"""What is drawn over the picture: timings, messages, the word "Original"."""
 
 from __future__ import annotations
 
@@ -8,26 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from imgui_bundle import imgui
 
-from . import controls
 from .engine import FrameTimings
 from .ui_context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32
 from .widgets import grouped
 from .workspace import Message
-
-MOUSE_HELP = (
-    ("Left drag", "orbit"),
-    ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
-    ("Right drag", "pan; look around while flying"),
-    ("Wheel", "zoom"),
-    ("Click", "focus the layer under the cursor"),
-    ("Double click", "turn around the surface under the cursor"),
-    ("W A S D Q E", "fly; Shift ten times faster, Alt slower"),
-    ("Shift on a slider", "ten times finer"),
-    ("Ctrl+click a slider", "type a value"),
-    ("Esc, right click", "while dragging: take it back"),
-    ("Esc, right click", "while dragging: take it back"),
-    ("\\ held", "the original"),
-)
 
 
 @dataclass(frozen=True)
@@ -101,8 +85,12 @@ def banner(text: str, area: Area, ui: UiContext, row: int = 0) -> None:
     _text(x, y, text, size, PALETTE.text, ui)
 
 
-def message(shown: Message, area: Area, ui: UiContext) -> bool:
-    """One line at the bottom left, wrapped where the window is narrow; True once its cross was clicked."""
+def message(shown: Message, area: Area, ui: UiContext) -> tuple[bool, float]:
+    """One line at the bottom left, wrapped where the window is narrow.
+
+    Returns:
+        Whether its cross was clicked; its upper edge in window pixels.
+    """
     pad = 12.0 * ui.scale
     widest = min(area.width - 2 * pad, 640.0 * ui.scale)
     imgui.set_next_window_pos(imgui.ImVec2(pad, area.height - pad), 0, imgui.ImVec2(0.0, 1.0))
@@ -119,59 +107,11 @@ def message(shown: Message, area: Area, ui: UiContext) -> bool:
     imgui.text_colored(imgui.ImVec4(*colour), shown.text)
     imgui.pop_text_wrap_pos()
     imgui.same_line()
-    closed = bool(imgui.small_button("×"))
+    closed, top = bool(imgui.small_button("×")), imgui.get_window_pos().y
     imgui.end()
     imgui.pop_style_var()
     imgui.pop_style_color()
-    return closed
-
-
-def bindings(area: Area, ui: UiContext) -> None:
-    """The list of bindings, made from the table, in the middle of the picture."""
-    imgui.set_next_window_pos(imgui.ImVec2(area.width / 2, area.height / 2), 0, imgui.ImVec2(0.5, 0.5))
-    imgui.set_next_window_size_constraints(
-        imgui.ImVec2(0.0, 0.0), imgui.ImVec2(area.width - 16 * ui.scale, area.height - 16 * ui.scale)
-    )
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
-    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
-    imgui.begin("bindings", None, _FLOATING)
-    imgui.push_font(None, SMALL_PX)
-    for column, rows in enumerate(_columns()):
-        if column:
-            imgui.same_line(0.0, 28.0 * ui.scale)
-        imgui.begin_group()
-        wide = max(imgui.calc_text_size(chord).x for chord, _ in rows) + 14.0 * ui.scale
-        for chord, does in rows:
-            imgui.text(chord)
-            imgui.same_line(wide)  # from the group's left edge
-            imgui.text_disabled(does)
-        imgui.end_group()
-    imgui.pop_font()
-    imgui.end()
-    imgui.pop_style_var()
-    imgui.pop_style_color()
-
-
-def _columns() -> tuple[tuple[tuple[str, str], ...], tuple[tuple[str, str], ...]]:
-    """The mouse and, under it, as many of the last keys as make both columns equally long."""
-    keys = key_help()
-    below = max((len(keys) - len(MOUSE_HELP) - 1) // 2, 0)
-    above = len(keys) - below
-    return (*MOUSE_HELP, ("", ""), *keys[above:]), keys[:above]
-
-
-def key_help() -> tuple[tuple[str, str], ...]:
-    """Chord and help of every key that has a help text, in the words of a person."""
-    names = {"1": "1–9", "Shift+1": "Shift+1–9", "Right": "← →", "Shift+Right": "Shift+← →"}
-    names |= {
-        "Ctrl+Right": "Ctrl+← →",
-        "Escape": "Esc",
-        "Alt+Down": "Alt+↑ ↓",
-        "]": "[ ]",
-        ".": ", .",
-        "Shift+.": "Shift+, .",
-    }
-    return tuple((names.get(key.chord, key.chord), key.help) for key in controls.KEYS if key.help)
+    return closed, top
 
 
 _FLOATING = (
