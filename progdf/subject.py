@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -143,7 +144,9 @@ def _upright(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
 def _standing(height: Tensor, plan: Tensor) -> Tensor | None:
     """Which rows stand above a ground. [R], [R,2] -> [R] bool; None where there is no ground to speak of."""
     cells = ((plan + 1.0) * 0.5 * _PLAN).long().clamp(0, _PLAN - 1)
-    taken, cell, counts = (cells[:, 0] * _PLAN + cells[:, 1]).unique(return_inverse=True, return_counts=True)
+    taken, cell, counts = torch.unique(
+        cells[:, 0] * _PLAN + cells[:, 1], return_inverse=True, return_counts=True
+    )
     form = _powers(plan)
     if len(taken) < form.shape[1]:
         return None
@@ -171,7 +174,9 @@ def _ground(low: Tensor, form: Tensor) -> Tensor:
     """
     weights = torch.ones_like(low)
     for _ in range(20):
-        surface = torch.linalg.lstsq(form * weights[:, None], (low * weights)[:, None]).solution[:, 0]
+        # numpy's own: torch's threads spin over a few hundred rows, and this is in the way of a first picture
+        fit = np.linalg.lstsq((form * weights[:, None]).numpy(), (low * weights).numpy(), rcond=None)
+        surface = torch.from_numpy(fit[0])
         left = low - form @ surface
         weights = 1.0 / (1.0 + (left / torch.where(left > 0, 0.5 * _ABOVE, _ABOVE)) ** 2)
     return surface
@@ -189,7 +194,7 @@ def _of_large_things(places: Tensor) -> Tensor:
     side = float((high - low).amax().clamp_min(1e-9)) / _ACROSS
     span = 2 * _ACROSS + 2
     keys = ((places - low) / side + 0.5 * _ACROSS).clamp(0, span - 3).long() + 1
-    boxes, box = ((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2]).unique(return_inverse=True)
+    boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
     thing = _connected(boxes, span)
     size = torch.zeros(len(boxes)).index_add(0, thing, torch.ones(len(boxes)))
     return (size[thing] >= _LEAST * size.max())[box]
