@@ -266,7 +266,7 @@ def test_f_frames_the_focused_layer_and_with_none_all_of_the_scene_in_this_windo
     hand.key("2")
     hand.key("F")
     framed = hand.stage.work.view.camera
-    assert framed.distance < 0.5 * home.distance
+    assert framed.distance < 0.75 * home.distance
     assert axes(framed) == axes(home)
     hand.key("Escape")
     hand.key("F")
