@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 from imgui_bundle import imgui
 
-from . import paint, stack
+from . import paint, stack, tint
 from .state import ViewState
-from .ui_context import PALETTE, Icon, UiContext, u32
+from .ui_context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from .widgets import choice, icon_button, label, tip, value_slider
 from .widgets import section as heading
 
@@ -58,6 +59,13 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     tip("The front surface only, or all that lies under the brush (Shift+B)")
     if depth is not None:
         brush = replace(brush, through=bool(depth))
+    label("Weights", column)
+    colours = choice("weights", ("Colours", "Hidden"), int(not brush.weights), ui)
+    tip("The weights as colours on the layer's splats, blue for none of the edit, yellow for all of it (C)")
+    if colours is not None:
+        brush = replace(brush, weights=not colours)
+    if brush.weights:
+        _legend(column, ui)
     label("All of it", column)
     imgui.begin_disabled(focus is None or view.layers[focus].locked)
     each = (imgui.get_content_region_avail().x - 12.0 * ui.scale) / 3
@@ -69,6 +77,25 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     imgui.end_disabled()
     imgui.new_line()
     return replace(view, brush=brush), action
+
+
+def _legend(column: float, ui: UiContext) -> None:
+    """The ramp of the weights with its ends named."""
+    imgui.set_cursor_pos_x(column)
+    left, top = imgui.get_cursor_screen_pos()
+    width, height, size = imgui.get_content_region_avail().x, 10.0 * ui.scale, SMALL_PX * ui.scale
+    canvas = imgui.get_window_draw_list()
+    for (start, a), (end, b) in pairwise(tint.RAMP):
+        low, high = (u32(tint.rgba(colour)) for colour in (a, b))
+        corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
+        canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
+    imgui.push_font(None, SMALL_PX)
+    wide = imgui.calc_text_size("all").x
+    imgui.pop_font()
+    for x, text in ((left, "none"), (left + width - wide, "all")):
+        at = imgui.ImVec2(round(x), round(top + height + 2.0 * ui.scale))
+        canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.dim), text)
+    imgui.dummy(imgui.ImVec2(width, height + size + 2.0 * ui.scale))
 
 
 def toggle(view: ViewState, ui: UiContext) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import moderngl
 
-from . import draft
+from . import draft, tint
 from .compare import Comparer
 from .engine import Engine, FrameTimings
 from .painters import Image
@@ -44,10 +44,12 @@ class Canvas:
         size: tuple[int, int],
         held: bool,
         now: float,
+        focus: int | None = None,
     ) -> None:
         """Show `view` in the lower left `size` pixels of `screen`.
 
         Args:
+            focus: the layer whose painted weights are shown while the brush is out, or None
             held: a hand is on something, so that more will follow
             now: seconds on the stage's clock
 
@@ -61,6 +63,7 @@ class Canvas:
         self._last = aim, edits
         mode = "off" if view.compare.mode == "difference" else view.draft
         self._draft = draft.begun(self._draft, mode, held, turned, slid, now)
+        self.comparer.engine.tint = tint.wanted(view, focus)
         new = self.comparer.needs_draw(view, size, self.pixels)
         timings = self.comparer.draw(view, screen, size, self.pixels)
         if new:

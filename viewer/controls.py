@@ -188,6 +188,7 @@ KEYS = (
     Key("B", "brush", "paint its strength (left drag)"),
     Key("X", "brush_mode", "brush: erase, smooth, add"),
     Key("Shift+B", "brush_through", "brush: front surface or through"),
+    Key("C", "brush_weights", "brush: show weights as colours"),
     Key("[", f"brush_radius:{1 / 1.25:g}", "", repeats=True),
     Key("]", "brush_radius:1.25", "brush size; with Shift softness", repeats=True),
     Key("Shift+[", "brush_softness:-0.1", "", repeats=True),

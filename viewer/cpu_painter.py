@@ -14,6 +14,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.pixel_cells import mark_cells, no_cells
 from progdf.rasterize import Crop, rasterize
+from progdf.sh import C0
 
 from .gl.layout import SPLATS_PER_ROW
 from .gl.present import Presenter
@@ -23,6 +24,8 @@ from .state import Vec3
 from .touched import area, boxes
 
 Image = NDArray[np.float32]
+
+SH = ("sh0", "shN")
 
 MANY = 32_768
 """Rows beyond which nobody asks where they are: telling takes longer than what is not drawn would (100 000
@@ -75,11 +78,13 @@ class CpuPainter:
         self._lent = False  # whether the picture's array is in other hands
         self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
+        self._tints: Image | None = None  # rgb and its share, 0..1; None is no tint. [N,4]
 
     def upload(self, scene: Gaussians) -> None:
         """Take a whole scene. The painter's copies are what was drawn, when `scene` is written in place."""
         self._means, self._quats = _copy(scene.means), _copy(scene.quats)
         self._scales, self._opacities = _exp(scene.log_scales), _sigmoid(scene.logit_opacities)
+        self._scene, self._tints = scene, None
         self._sh = scene.sh
         self._degree = min(scene.sh_degree, 3)
         self._kept = self._cells = self._last = None
@@ -88,7 +93,9 @@ class CpuPainter:
         mark_cells(no_cells(1, 1), *self._shapes(), nobody, camera, self._near)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
-        names = tuple(attributes)
+        self._scene, names = scene, tuple(attributes)
+        dyed = self._tints is not None and any(name in SH for name in names)
+        names = tuple(dict.fromkeys((*names, *SH))) if dyed else names
         if len(rows) > MANY:
             self._cells = None
         cells = self._cells
@@ -98,10 +105,21 @@ class CpuPainter:
             part = slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW)
             for name in names:
                 self._write(scene, name, part)
-        if any(name not in ("sh0", "shN") for name in names):
+            if dyed:
+                self._dye(part)
+        if any(name not in SH for name in names):
             self._last = None
             if cells is not None and len(rows):
                 cells |= self._where(rows)
+
+    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        """See `Painter.tint`."""
+        if self._tints is None:
+            self._tints = np.zeros((len(self._means), 4), np.float32)
+        self._tints[rows] = tints.astype(np.float32) / 255.0
+        self.update(self._scene, SH, rows)
+        if not self._tints[:, 3].any():
+            self._tints = None
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
         """Make the picture; `order` is not used, the rasteriser sorts by itself. Gives the share drawn."""
@@ -210,6 +228,13 @@ class CpuPainter:
                 self._sh.numpy()[part, 0] = scene.sh0[part].numpy()
             case "shN":
                 self._sh.numpy()[part, 1:] = scene.shN[part].numpy()
+
+    def _dye(self, part: slice) -> None:
+        """Mix the tints into colours that were just written: into all bands, as colour is linear in them."""
+        assert self._tints is not None, "nothing to dye with"
+        sh, share = self._sh.numpy()[part], self._tints[part, 3:]
+        sh *= 1.0 - share[:, :, None]
+        sh[:, 0] += share * (self._tints[part, :3] - 0.5) / C0
 
     def _picture(self) -> _Kept:
         if self._kept is None:

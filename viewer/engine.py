@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
@@ -30,6 +30,7 @@ from .painters import GlPainter, Image, Painter
 from .sort import back_to_front, near_plane
 from .stack import shown
 from .state import ViewState
+from .tint import Tint, tints
 from .turntable import bounds_of, to_camera
 
 DRAWS = ("auto", "gl", "cpu")
@@ -80,6 +81,7 @@ class _Picture:
     viewmat: bytes
     K: bytes
     size: tuple[int, int]
+    tint: Tint | None = None
 
 
 class Engine:
@@ -123,6 +125,9 @@ class Engine:
         self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
         self._ordered_for: bytes | None = None
         self._picture: _Picture | None = None
+        self.tint: Tint | None = None
+        """What `draw` shows over the members of an edit; `image` never does."""
+        self._tinted: tuple[Tint, NDArray[np.uint8]] | None = None  # and the tints of its members
         if edit_pass == "gpu" and self.draws_with == "cpu":
             raise ProgdfError("the CPU draws here, so the GPU cannot edit; ask for drawing by OpenGL too: gl")
         self.edit_obstacle = ""
@@ -133,7 +138,8 @@ class Engine:
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
-        return self._wanted(view, camera or to_camera(view.camera, *size)) != self._picture
+        wanted = self._wanted(view, camera or to_camera(view.camera, *size))
+        return replace(wanted, tint=self.tint) != self._picture
 
     def draw(
         self,
@@ -150,7 +156,7 @@ class Engine:
         Raises:
             ProgdfError: a layer of `view` means nothing; the last picture stays.
         """
-        self.timings = self._bring(view, to_camera(view.camera, *drawn_size(size, pixels)))
+        self.timings = self._bring(view, to_camera(view.camera, *drawn_size(size, pixels)), self.tint)
         self._painter.show(framebuffer, size)
         return self.timings
 
@@ -227,13 +233,15 @@ class Engine:
             (camera.width, camera.height),
         )
 
-    def _bring(self, view: ViewState, camera: Camera) -> FrameTimings:
+    def _bring(self, view: ViewState, camera: Camera, tint: Tint | None = None) -> FrameTimings:
         """Do what lies between the last picture and this one."""
-        wanted = self._wanted(view, camera)
+        wanted = replace(self._wanted(view, camera), tint=tint)
         if wanted == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
         started = time.perf_counter()
+        self._dye(tint)
+        dyed = time.perf_counter()
         if self._painter.wants_order and self._ordered_for != wanted.viewmat:
             self._order = back_to_front(self._editing.means, camera, self.near)
             self._ordered_for = wanted.viewmat
@@ -243,8 +251,8 @@ class Engine:
         self._picture = wanted
         return FrameTimings(
             compose_ms,
-            upload_ms,
-            1e3 * (sorted_at - started),
+            upload_ms + 1e3 * (dyed - started),
+            1e3 * (sorted_at - dyed),
             1e3 * (drawn_at - sorted_at),
             changed,
             len(self._order) if self._painter.wants_order else len(self.scene),
@@ -263,6 +271,21 @@ class Engine:
         if step.moved:
             self._ordered_for = None
         return unpacked_ms + step.compose_ms, step.upload_ms, step.changed
+
+    def _dye(self, tint: Tint | None) -> None:
+        """Bring the tints up to date; the painter hears of those alone that are others than before."""
+        if tint == (self._tinted and self._tinted[0]):
+            return
+        if self._tinted is not None and (tint is None or tint.gdf != self._tinted[0].gdf):
+            last, shown = self._tinted
+            self._tinted = None
+            self._painter.tint(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
+        if tint is not None:
+            members = self._gdf(tint.gdf).region.members.numpy()
+            new = tints(tint, len(members))
+            others = slice(None) if self._tinted is None else (new != self._tinted[1]).any(1)
+            self._tinted = tint, new
+            self._painter.tint(members[others], new[others])
 
     def _stack(self, edits: _Edits) -> tuple[Stack, str]:
         """The layers and the blend rule of what was asked for."""

@@ -34,6 +34,13 @@ class Painter(Protocol):
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """Take the changed attributes of the changed rows (sorted)."""
 
+    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        """Draw Gaussians (sorted) in other colours from now on, whatever becomes of their own.
+
+        Args:
+            tints: rgb and the share that it takes of a Gaussian's colour, 0..255; 0 takes none. [R,4]
+        """
+
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
         """Make the picture and wait until it is done.
 
@@ -92,6 +99,9 @@ class GlPainter:
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         self._renderer.update(scene, attributes, rows)
         self._ctx.finish()
+
+    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        self._renderer.tint(rows, tints)
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
         self._renderer.set_order(order)

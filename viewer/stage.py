@@ -152,7 +152,8 @@ class Stage:
             self.work = workspace.settled(self.work)
         if self.work != before:
             self.wake()
-        self.canvas.draw(self._shown(), screen, self._sight().size, self._held(), self._clock)
+        shown, area = self._shown(), self._sight().size
+        self.canvas.draw(shown, screen, area, self._held(), self._clock, self.work.focus)
         self._draw_overlays()
         imgui.render()
         screen.use()

@@ -67,6 +67,7 @@ class Brush:
         softness: the part of the radius over which its touch fades, 0..1
         mode: of `paint.MODES`
         through: also behind the front surface
+        weights: the members of the focused layer show their weights as colours meanwhile
     """
 
     active: bool = False
@@ -74,6 +75,7 @@ class Brush:
     softness: float = 0.5
     mode: str = "erase"
     through: bool = False
+    weights: bool = True
 
 
 @dataclass(frozen=True)

@@ -361,6 +361,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "blend": _blend,
     "brush": lambda w, _: _brushed(w, active=not w.view.brush.active),
     "brush_mode": lambda w, _: _brushed(w, mode=paint.next_mode(w.view.brush.mode)),
+    "brush_weights": lambda w, _: _brushed(w, weights=not w.view.brush.weights),
     "brush_through": lambda w, _: _brushed(w, through=not w.view.brush.through),
     "brush_radius": lambda w, by: _brushed(w, radius=paint.radius(w.view.brush.radius * float(by))),
     "brush_softness": lambda w, by: _brushed(w, softness=paint.softness(w.view.brush.softness + float(by))),

@@ -16,6 +16,7 @@ from progdf.gaussians import Gaussians
 from .layout import ORDER, PROJECTED, SHOWN_SH
 from .programs import load_program
 from .scene_textures import SplatTextures
+from .tint_texture import TintTexture
 
 Rgb = tuple[float, float, float]
 
@@ -59,6 +60,7 @@ class SplatRenderer:
         self._project = load_program(ctx, "project.vert", varyings=PROJECTED.names or ())
         self._splat = load_program(ctx, "splat.vert", "splat.frag")
         self._scene: SplatTextures | None = None
+        self._tints: TintTexture | None = None
         self._buffers: _Buffers | None = None
         self._target: _Target | None = None
         self._drawn = 0
@@ -90,6 +92,14 @@ class SplatRenderer:
         """Take the changed attributes of the changed rows (sorted); gives the bytes sent."""
         return self.textures.write(scene, attributes, rows)
 
+    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        """Draw Gaussians (sorted) in other colours: rgb and its share, 0..255. [R,4]"""
+        self._tints = self._tints or TintTexture(self.ctx, self.textures.count)
+        self._tints.write(rows, tints)
+        if self._tints.empty:
+            self._tints.release()
+            self._tints = None
+
     def set_order(self, order: NDArray[np.uint32]) -> None:
         """Which Gaussians are drawn, farthest first; see `viewer.sort`."""
         assert self._buffers is not None, "upload comes first"
@@ -119,6 +129,9 @@ class SplatRenderer:
             self._scene.bind(self._project)
             _set_camera(self._project, camera)
             self._project["antialiased"] = antialiased
+            self._project["tinted"] = self._tints is not None
+            if self._tints is not None:
+                self._tints.bind(self._project, len(self._scene.textures))
             self._buffers.project.transform(self._buffers.projected, moderngl.POINTS, vertices=self._drawn)
             self.ctx.enable_only(moderngl.BLEND)
             target.framebuffer.viewport = (0, 0, *size)
@@ -164,6 +177,9 @@ class SplatRenderer:
             self._buffers.release()
         if self._scene is not None:
             self._scene.release()
+        if self._tints is not None:
+            self._tints.release()
+            self._tints = None
 
 
 def vertex_format(dtype: np.dtype[Any]) -> str:

@@ -1,0 +1,45 @@
+"""Colours drawn over those of the scene: one texel a Gaussian, made when they are first asked for."""
+
+from __future__ import annotations
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from .layout import SPLATS_PER_ROW, TINT
+from .scene_textures import row_runs
+
+
+class TintTexture:
+    """rgb and the share of it, laid out as the scene's textures are; 0 leaves a Gaussian its own colour.
+
+    Args:
+        ctx: where it lives
+        count: N
+    """
+
+    def __init__(self, ctx: moderngl.Context, count: int) -> None:
+        rows = max(1, -(-count // SPLATS_PER_ROW))
+        self._memory = np.zeros((rows * SPLATS_PER_ROW, TINT.itemsize), np.uint8)
+        self._texture = ctx.texture((SPLATS_PER_ROW, rows), TINT.itemsize, self._memory.tobytes())
+        self._texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+
+    def write(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        """Take other tints [R,4] for Gaussians (sorted)."""
+        self._memory[rows] = tints
+        for first, last in row_runs(rows):
+            part = self._memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
+            self._texture.write(part, viewport=(0, first, SPLATS_PER_ROW, last - first))
+
+    @property
+    def empty(self) -> bool:
+        """Whether it leaves every Gaussian its own colour."""
+        return not self._memory[:, 3].any()
+
+    def bind(self, program: moderngl.Program, unit: int) -> None:
+        """Make it what the sampler `tint` of `program` reads."""
+        self._texture.use(unit)
+        program["tint"] = unit
+
+    def release(self) -> None:
+        self._texture.release()
