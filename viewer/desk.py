@@ -23,6 +23,7 @@ from .playback import Player
 from .session import Session
 from .stage import Stage
 from .state import LayerState, Timeline
+from .threads import all_threads
 from .turntable import first_camera, from_camera
 from .workspace import Dialog
 
@@ -198,7 +199,8 @@ class Desk:
     def _add_edit(self, path: Path) -> None:
         """On top, at full strength, so that one sees what came; undo takes it off again."""
         opened = self._app.document
-        gdf = load_gdf(path, opened.scene)
+        with all_threads():
+            gdf = load_gdf(path, opened.scene)
         layer = LayerState(len(opened.gdfs), _free_name(gdf.name, opened), strength=1.0)
         paths = (*opened.gdf_paths, path) if len(opened.gdf_paths) == len(opened.gdfs) else ()
         gdfs = (*opened.gdfs, replace(gdf, name=layer.name))
