@@ -10,31 +10,14 @@ from torch import Tensor
 
 from progdf.camera import Camera, orbit_rig
 from progdf.gaussians import Gaussians
-from progdf.rasterize import rasterize
 from progdf.scenes import DemoScene, bear
 from tests.scenes import concatenate, front_camera, one_gaussian, random_gaussians
+from tests.trained import label_mask
 from trainer import lift
 from trainer.lift import Evidence, gather, lift_masks, score
 from trainer.neighbours import nearest_rows, surface_vote
 
 WALL = 15
-
-
-def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:
-    """Where the members make up more than half of what a pixel shows. [H,W] bool"""
-    colors = member.float()[:, None].expand(-1, 3).contiguous()
-    image = rasterize(
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        colors,
-        camera.viewmat,
-        camera.K,
-        camera.width,
-        camera.height,
-    )[0]
-    return image[..., 0] > 0.5
 
 
 def overlap(members: Tensor, expected: Tensor) -> float:

@@ -10,28 +10,11 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
-from tests.trained import WHITE, Small, masked_psnr, small
-from trainer.crops import CropScene, crop_scene
+from tests.trained import WHITE, Small, course, masked_psnr, small
+from trainer.crops import crop_scene
 from trainer.editors import make_editor
-from trainer.losses import GradientL1
-from trainer.objective import LossWeights, Objective
-from trainer.pgs import PgsSettings, Snapshot, Stage, learning_rates, most_change, optimise
+from trainer.pgs import Snapshot, learning_rates, most_change, optimise
 from trainer.views import crop
-
-STRENGTHS = (0.5, 1.0)
-
-
-Course = tuple[Tensor, list[CropScene], list[CropScene], list[Stage], Objective, PgsSettings]
-
-
-def course(case: Small, steps: int = 40, **more: object) -> Course:
-    """What `optimise` needs to recolour a small bear's part in two stages."""
-    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
-    original = pack(case.scene[case.region.members], with_shN=True)
-    crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
-    stages = [Stage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in STRENGTHS]
-    settings = replace(PgsSettings(learning_rates("colour", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
-    return original, crops, crops[:2], stages, Objective(GradientL1(), LossWeights()), settings
 
 
 def run(case: Small, steps: int = 40, **more: object) -> tuple[Tensor, list[Snapshot]]:

@@ -22,9 +22,8 @@ from progdf.pictures import write_image
 from progdf.region import Region
 from progdf.region_spec import parse_region
 from progdf.scenes import bear
-from tests.test_lift import label_mask
 from tests.tiny_segmenters import tiny_detector, tiny_outliner
-from tests.trained import quick_options, write_bear
+from tests.trained import label_mask, quick_options, write_bear
 from trainer import segmenters
 from trainer.regions import RegionSettings, region_kinds
 from trainer.run import train

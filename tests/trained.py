@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -10,13 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from progdf.gaussians import Gaussians
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians, pack
 from progdf.ply import save_ply
 from progdf.region import Region, from_mask
 from progdf.scenes import bear
+from trainer.crops import CropScene, crop_scene
+from trainer.editors import make_editor
+from trainer.losses import GradientL1
+from trainer.objective import LossWeights, Objective
 from trainer.options import TrainOptions
+from trainer.pgs import PgsSettings, Stage, learning_rates
 from trainer.view_choice import choose_views
-from trainer.views import View, region_rig
+from trainer.views import View, crop, drawn, region_rig
 
 WHITE = torch.ones(3)
 
@@ -39,6 +45,25 @@ def small(part: str = "scarf", size: int = 1500, count: int = 6, image_size: int
     region = from_mask(part, mask)
     cameras = region_rig(demo.gaussians, region, count + count // 2, image_size)
     return Small(demo.gaussians, region, choose_views(demo.gaussians, region, cameras, count, WHITE).views)
+
+
+Course = tuple[Tensor, list[CropScene], list[CropScene], list[Stage], Objective, PgsSettings]
+
+
+def course(case: Small, steps: int = 40, **more: object) -> Course:
+    """What `optimise` needs to recolour a small bear's part in two stages."""
+    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    original = pack(case.scene[case.region.members], with_shN=True)
+    crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
+    stages = [Stage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in (0.5, 1.0)]
+    settings = replace(PgsSettings(learning_rates("colour", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
+    return original, crops, crops[:2], stages, Objective(GradientL1(), LossWeights()), settings
+
+
+def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:
+    """Where the members [N] bool make up more than half of what a pixel shows. [H,W] bool"""
+    white = member.float()[:, None].expand(-1, 3).contiguous()
+    return drawn(scene, white, camera, torch.zeros(3))[..., 0] > 0.5
 
 
 def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:

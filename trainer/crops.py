@@ -16,9 +16,10 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import Crop, rasterize
-from progdf.sh import basis, shade
+from progdf.sh import basis
 from trainer.losses import clamp_towards
 from trainer.tiles import live_pixels, live_tiles, reaching
+from trainer.views import seen_colors
 
 
 @dataclass(frozen=True)
@@ -142,8 +143,7 @@ def crop_scene(
         still: nothing but colours will move, so only the tiles that show a member are drawn, see `tiles`;
             transmittance is then right in these only
     """
-    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
-    colors = shade(min(scene.sh_degree, 3), directions, scene.sh)
+    colors = seen_colors(scene, camera)
     _, _, seen = rasterize(
         scene.means,
         scene.quats,

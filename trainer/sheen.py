@@ -22,6 +22,7 @@ import torch
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.sh import basis
+from trainer.areas import covered_areas
 
 NEEDED = 0.04
 """Colour (0..1) by which a region's must change with the view for the bands to pay."""
@@ -42,7 +43,5 @@ def view_dependence(members: Gaussians, cameras: Sequence[Camera]) -> float:
         seen.append((basis(degree, directions)[:, 1 : bands + 1, None] * members.shN[:, :bands]).sum(dim=1))
     colours = torch.stack(seen)
     change = (colours - colours.mean(dim=0)).square().mean(dim=(0, 2)).double()
-    _, middle, long = members.scales.sort(dim=1).values.double().unbind(1)
-    areas = members.opacities.double() * middle * long
-    areas = areas.clamp_max(20 * float(areas.mean()))  # no giant speaks for all
+    areas = covered_areas(members)
     return float(((change * areas).sum() / areas.sum().clamp_min(1e-300)).sqrt())

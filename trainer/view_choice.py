@@ -20,6 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
+from trainer.areas import covered_areas
 from trainer.views import View, fit_size, make_view
 
 _SAMPLES = 256
@@ -174,10 +175,7 @@ def _reach(count: int) -> float:
 
 def _sampled(scene: Gaussians, region: Region) -> Tensor:
     """Rows that stand for the region, evenly by the area they can cover. -> [S] int64"""
-    _, middle, long = scene.scales[region.members].sort(dim=1).values.double().unbind(1)
-    areas = scene.opacities[region.members].double() * middle * long
-    areas = areas.clamp_max(20 * float(areas.mean()))  # no giant stands for all
-    total = areas.cumsum(dim=0)
+    total = covered_areas(scene[region.members]).cumsum(dim=0)
     ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
     picked = torch.searchsorted(total, ticks).clamp_max(len(total) - 1)
     return region.members[torch.unique_consecutive(picked)]

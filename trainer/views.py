@@ -70,33 +70,38 @@ def crop(image: Tensor, box: Crop) -> Tensor:
 
 def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:
     """Render the original view and the region's share of it."""
-    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
-    colors = shade(min(scene.sh_degree, 3), directions, scene.sh)
-    member = torch.zeros(len(scene))
+    colors = seen_colors(scene, camera)
+    member = torch.zeros(len(scene), 1)
     member[region.members] = 1.0
+    black = torch.zeros(3)
+    image = drawn(scene, colors, camera, background).clamp(0.0, 1.0)
+    mask = drawn(scene, member.expand(-1, 3).contiguous(), camera, black)[..., 0].clamp(0.0, 1.0)
+    inside = drawn(scene, colors * member, camera, black) / mask.clamp_min(1e-4)[..., None]
+    return View(camera, image, mask, inside.clamp(0.0, 1.0), region_box(mask))
 
-    def draw(values: Tensor, behind: Tensor) -> Tensor:
+
+def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
+    """Each Gaussian's colour from where the camera stands. [N,3], not below 0"""
+    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
+    return shade(min(scene.sh_degree, 3), directions, scene.sh)
+
+
+def drawn(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
+    """The scene in these colours instead of its own, without gradients. [N,3] -> [H,W,3]"""
+    with torch.no_grad():
         image: Tensor = rasterize(
             scene.means,
             scene.quats,
             scene.scales,
             scene.opacities,
-            values,
+            colors,
             camera.viewmat,
             camera.K,
             camera.width,
             camera.height,
-            background=behind,
+            background=background,
         )[0]
-        return image
-
-    with torch.no_grad():
-        image = draw(colors, background).clamp(0.0, 1.0)
-        black = torch.zeros(3)
-        mask = draw(member[:, None].expand(-1, 3).contiguous(), black)[..., 0].clamp(0.0, 1.0)
-        premultiplied = draw(colors * member[:, None], black)
-    inside = (premultiplied / mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0)
-    return View(camera, image, mask, inside, region_box(mask))
+    return image
 
 
 def region_box(mask: Tensor, margin: int = 6) -> Crop:

@@ -16,13 +16,12 @@ from torch import Tensor
 from progdf import colour
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.rasterize import rasterize
 from progdf.region import Region
-from progdf.sh import shade
 from trainer.editors.base import EditKind, EditorSettings
-from trainer.views import View
+from trainer.views import View, drawn, seen_colors
 
-_GREY, _COLOURED = 0.5, 1.3  # of the typical chroma: up to here a grey, from here a colour
+_GREY, _COLOURED = 0.5, 1.1  # of the chroma of what is coloured: up to here a grey, from here a colour
+_KIN, _OTHER = math.radians(50), math.radians(100)  # from the typical hue: up to here its kin, from here another
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
 
@@ -53,14 +52,14 @@ class StripesEditor:
         members: rows of the region. [M] int64
         pattern: how much of each member is stripe, 0..1. [M]
         target: colour of the stripes, sRGB 0..1. [3]
-        reference: typical colour of the region. [3]
+        palette: of the region
     """
 
     scene: Gaussians
     members: Tensor
     pattern: Tensor
     target: Tensor
-    reference: Tensor
+    palette: Palette
     kind: EditKind = "colour"
     stages: tuple[float, ...] = ()
     confined: bool = True
@@ -68,31 +67,17 @@ class StripesEditor:
     def painted(self, rgb: Tensor, strength: float) -> Tensor:
         """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
         covered = strength * self.pattern
-        plainer = torch.lerp(rgb, self.reference.expand_as(rgb), (_COVER * covered)[:, None])
-        return recolored(plainer, self.target, covered, self.reference)
+        plainer = torch.lerp(rgb, self.palette.typical.expand_as(rgb), (_COVER * covered)[:, None])
+        return recolored(plainer, self.target, covered, self.palette)
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
         scene, members, camera = self.scene, self.members, view.camera
-        directions = torch.nn.functional.normalize(scene.means[members] - camera.position, dim=1)
-        before = shade(min(scene.sh_degree, 3), directions, scene.sh[members])
-        painted = self.painted(before, strength)
+        painted = self.painted(seen_colors(scene[members], camera), strength)
         colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
-        with torch.no_grad():
-            premultiplied, _, _ = rasterize(
-                scene.means,
-                scene.quats,
-                scene.scales,
-                scene.opacities,
-                colors,
-                camera.viewmat,
-                camera.K,
-                camera.width,
-                camera.height,
-                background=torch.zeros(3),
-            )
+        premultiplied = drawn(scene, colors, camera, torch.zeros(3))
         return view.blended((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
 
 
@@ -100,8 +85,8 @@ def recolor(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> ColourEditor:
     """`recolor:#rrggbb`: another colour, the shading kept; hue, saturation and lightness move together."""
-    target, reference = colour.parse_color(what), reference_color(views)
-    return ColourEditor(lambda rgb, strength: recolored(rgb, target, strength, reference))
+    target, palette = colour.parse_color(what), region_palette(views)
+    return ColourEditor(lambda rgb, strength: recolored(rgb, target, strength, palette))
 
 
 def tint(
@@ -136,7 +121,7 @@ def stripes(
     points = scene.means[region.members]
     axis, period, phase = stripe_frame(points)
     pattern = colour.stripe_pattern(points, axis, period, phase)
-    return StripesEditor(scene, region.members, pattern, target, reference_color(views))
+    return StripesEditor(scene, region.members, pattern, target, region_palette(views))
 
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
@@ -149,34 +134,65 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
     return axis, period, 0.5 - float(low[longest]) / period
 
 
-def recolored(rgb: Tensor, target: Tensor, strength: float | Tensor, reference: Tensor) -> Tensor:
-    """`colour.recolor` with calm greys on the way.
+@dataclass(frozen=True)
+class Palette:
+    """What a region's colours are like, the same for all views, so that each view's edit is one function.
 
-    The hue of what is coloured turns; but a grey's hue is noise, and turned it shines in every colour of the
-    rainbow half way. So what has less chroma than the region's typical colour goes straight to its end.
+    Args:
+        typical: the mean colour, see `colour.typical_color`. [3]
+        chroma: how colourful what is coloured is, OKLab; white and black beside it do not lower it
+    """
+
+    typical: Tensor
+    chroma: float
+
+
+def palette_of(rgb: Tensor, weights: Tensor) -> Palette:
+    """Of sRGB colours [Q,3] that count by `weights` [Q]."""
+    chroma = colour.srgb_to_oklab(rgb.clamp(0, 1))[:, 1:].norm(dim=1)
+    by_colour = float((weights * chroma.square()).sum() / (weights * chroma).sum().clamp_min(1e-12))
+    return Palette(colour.typical_color(rgb, weights), by_colour)
+
+
+def region_palette(views: Sequence[View]) -> Palette:
+    """The region's, over all views."""
+    return palette_of(
+        torch.cat([view.inside.reshape(-1, 3) for view in views]),
+        torch.cat([view.mask.reshape(-1) for view in views]),
+    )
+
+
+def recolored(rgb: Tensor, target: Tensor, strength: float | Tensor, palette: Palette) -> Tensor:
+    """`colour.recolor`, in which the hue turns only of what the region's colour is seen in.
+
+    The rest goes straight to its end in OKLab. A grey's hue is noise, and turned it shines in every colour of
+    the rainbow half way. A hue far from the region's own has its own way to go, short or long, and next to
+    one that is opposite, neighbours would go round either side: the robot's eyes, cyan in an orange region,
+    went once round the circle to become blue.
 
     Args:
         rgb: sRGB colours. [...,3]
-        target: what `reference` becomes. [3]
+        target: what the palette's typical colour becomes. [3]
         strength: 0..1, one number or [...]
-        reference: the region's typical colour. [3]
+        palette: of the region
     """
     s = torch.as_tensor(strength, dtype=rgb.dtype).expand(rgb.shape[:-1])
-    turned = colour.recolor(rgb, target, s, reference)
+    turned = colour.recolor(rgb, target, s, palette.typical)
     lab = colour.srgb_to_oklab(rgb.clamp(0, 1))
-    finished = colour.srgb_to_oklab(colour.recolor(rgb, target, 1.0, reference))
+    finished = colour.srgb_to_oklab(colour.recolor(rgb, target, 1.0, palette.typical))
     straight = colour.oklab_to_srgb(torch.lerp(lab, finished, s[..., None])).clamp(0, 1)
-    typical = float(colour.srgb_to_oklab(reference)[1:].norm())
-    share = (lab[..., 1:].norm(dim=-1) / max(typical, 1e-3) - _GREY) / (_COLOURED - _GREY)
-    share = torch.where((s == 0) | (s == 1), 1.0, share.clamp(0, 1))
-    return torch.lerp(straight, turned, (share * share * (3 - 2 * share))[..., None])
+    own = colour.srgb_to_oklab(palette.typical)[1:]
+    across, along = lab[..., 1] * own[1] - lab[..., 2] * own[0], lab[..., 1:] @ own
+    coloured = lab[..., 1:].norm(dim=-1) / max(palette.chroma, 1e-3)
+    share = _rise(coloured, _GREY, _COLOURED) * (1 - _rise(torch.atan2(across, along).abs(), _KIN, _OTHER))
+    share = torch.where((s == 0) | (s == 1), 1.0, share)
+    return torch.lerp(straight, turned, share[..., None])
 
 
-def reference_color(views: Sequence[View]) -> Tensor:
-    """The region's typical colour over all views, so that each view's edit is the same function. [3]"""
-    inside = torch.cat([view.inside.reshape(-1, 3) for view in views])
-    weights = torch.cat([view.mask.reshape(-1) for view in views])
-    return colour.typical_color(inside, weights)
+def _rise(values: Tensor, low: float, high: float) -> Tensor:
+    """0 up to `low`, 1 from `high`, smooth between."""
+    x = ((values - low) / (high - low)).clamp(0, 1)
+    return x * x * (3 - 2 * x)
 
 
 def _stops(what: str, editor: str) -> float:
