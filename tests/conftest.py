@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+pytest.register_assert_rewrite("tests.ply_files", "tests.refused", "tests.stopped_runs")
+
 SCREENSHOTS = Path(__file__).parent / "screenshots"
 LEVELS = 2  # of 255: the last bits of a software GPU differ between processors
 

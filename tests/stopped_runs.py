@@ -1,0 +1,139 @@
+"""Runs that were stopped, as fixtures, and what stops them: keys, a full disk, a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import trainer.run
+from tests.stopped import OUT, small_run
+from tests.trained import write_bear
+from trainer.artefacts import RunFolder
+from trainer.run import train
+from trainer.state import Autosave
+
+NEVER = 1e6  # seconds between saves
+
+
+@pytest.fixture(scope="session")
+def bear_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small bear."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made
+
+
+@pytest.fixture(scope="session")
+def uninterrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder that all others must equal."""
+    made = tmp_path_factory.mktemp("uninterrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        train(small_run(bear_folder), quiet=True)
+    return made / OUT
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test trains into `run` of its own folder: the path stands in the files."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def interrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder that was left with Ctrl-C in its tenth step."""
+    made = tmp_path_factory.mktemp("interrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        at_step(patch, 9, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(small_run(bear_folder, save_every=NEVER), quiet=True)
+    return made / OUT
+
+
+@pytest.fixture
+def stopped(interrupted: Path, elsewhere: None) -> None:
+    """The folder `run` holds a run that was stopped at step 10."""
+    shutil.copytree(interrupted, OUT)
+
+
+def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], object]) -> None:
+    """Let something happen when the optimiser has done so many steps in this process."""
+    calls, done = 0, Autosave.step_done
+
+    def step_done(self: Autosave) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == number:
+            happens()
+        done(self)
+
+    monkeypatch.setattr(Autosave, "step_done", step_done)
+
+
+def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
+    """Go on to the trajectory, which must be the uninterrupted run's, and no further; the log."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer.run, "finished", lambda *_: None)
+        train(replace(small_run(bear_folder, **more), resume=True), quiet=True)
+    found, expected = (root / "trajectory.safetensors" for root in (OUT, uninterrupted))
+    if more:  # the options stand in the header
+        assert load_file(found).keys() == load_file(expected).keys()
+        assert all(torch.equal(load_file(found)[k], tensor) for k, tensor in load_file(expected).items())
+    else:
+        assert found.read_bytes() == expected.read_bytes()
+    return (OUT / "log.txt").read_text(encoding="utf-8")
+
+
+def words(bear_folder: Path, *more: str) -> list[str]:
+    """The command line of `small_run`."""
+    options = small_run(bear_folder)
+    names = ("region", "editor", "views", "image_size", "steps", "stages", "field", "threads")
+    pairs = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in names]
+    return ["train", str(options.scene), "--out=run", *pairs, *more]
+
+
+def saved_step() -> int:
+    """How far the saved state is."""
+    saved = RunFolder(OUT).state.load("training")
+    assert saved is not None
+    return int(saved.values["pgs"]["step"])
+
+
+@contextmanager
+def files_up_to(size: int) -> Iterator[None]:
+    """No file may grow beyond so many bytes: the system refuses, as it does where a disk is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def killed(bear_folder: Path, where: Path, moments: Sequence[float], **options: object) -> list[str]:
+    """`python -m tests.stopped`; its lines."""
+    arguments = [str(bear_folder), json.dumps(options), ",".join(map(str, moments))]
+    told = subprocess.run(
+        [sys.executable, "-m", "tests.stopped", *arguments],
+        cwd=where,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert told.returncode == 0, told.stdout + told.stderr
+    return told.stdout.splitlines()
