@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -9,14 +10,16 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
+from progdf import colour
 from progdf.errors import ProgdfError
 from progdf.pictures import write_image
 from progdf.rasterize import render
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from tests.trained import WHITE, small
 from trainer.editors import EDITORS, check_editor, make_editor
-from trainer.editors.procedural import StripesEditor, recolored
+from trainer.editors.procedural import StripesEditor, palette_of, recolored
 from trainer.views import make_view
 
 PROCEDURAL = ("recolor:#3060d0", "tint:#d4af37", "stripes:#20a040", "darken:0.7", "night")
@@ -49,15 +52,48 @@ def test_the_edit_grows_continuously_with_the_strength(spec: str) -> None:
     assert max(steps) < 0.25
 
 
+BLUE, ORANGE = torch.tensor([0.19, 0.38, 0.82]), torch.tensor([0.85, 0.45, 0.10])
+ORANGE_ONE = palette_of(ORANGE[None], torch.ones(1))
+
+
 def test_the_greys_of_a_thing_do_not_turn_through_the_rainbow_when_its_colour_does() -> None:
-    orange, target = torch.tensor([0.85, 0.45, 0.10]), torch.tensor([0.19, 0.38, 0.82])
-    warm_grey, cool_grey = torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]])
     for s in (0.2, 0.4, 0.6, 0.8):
-        warm, cool = recolored(torch.stack([warm_grey, cool_grey]), target, s, orange)
+        warm, cool = recolored(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE_ONE)
         assert float((warm - cool).abs().max()) < 0.06, "they were neighbours and stay so"
         assert float(warm[2]) > float(warm[1]), "towards blue, not by way of green"
-    green = recolored(orange, target, 0.5, orange)
+    green = recolored(ORANGE, BLUE, 0.5, ORANGE_ONE)
     assert float(green[1]) > max(float(green[0]), float(green[2])), "the colour itself turns by way of green"
+
+
+def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
+    """sRGB colours all around the hue circle. [count,3]"""
+    angle = torch.linspace(0, 2 * math.pi, count + 1)[:-1]
+    lab = torch.stack([torch.full_like(angle, lightness), chroma * angle.cos(), chroma * angle.sin()], dim=1)
+    return colour.oklab_to_srgb(lab).clamp(0, 1)
+
+
+@pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
+def test_hues_on_the_far_side_of_the_wheel_take_their_own_short_way(s: float) -> None:
+    eyes = torch.tensor([[0.10, 0.70, 0.85], [0.15, 0.60, 0.95], [0.25, 0.45, 0.95]])  # cyan to blue
+    between = recolored(eyes, BLUE, s, ORANGE_ONE)
+    assert bool((between[:, 2] > between[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
+    assert bool((between[:, 2] > between[:, 1]).all())
+
+
+@pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
+def test_neighbouring_hues_stay_neighbours_on_the_way(s: float) -> None:
+    circle = hues(0.65, 0.11)
+    between = recolored(circle, BLUE, s, ORANGE_ONE)
+    apart = (between - between.roll(1, dims=0)).abs().amax(dim=1)
+    assert float(apart.max()) < 0.06
+
+
+def test_white_beside_a_colour_does_not_make_tinted_whites_turn() -> None:
+    weights = torch.tensor([3.0, 1.0])
+    palette = palette_of(torch.stack([torch.full((3,), 0.75), ORANGE]), weights)
+    pinkish = torch.tensor([0.80, 0.72, 0.68])
+    between = recolored(pinkish, BLUE, 0.5, palette)
+    assert float(between[2]) >= float(between[1]), "straight towards blue, not green"
 
 
 def test_what_shares_a_pixel_with_the_region_is_not_edited() -> None:
