@@ -34,7 +34,7 @@ from progdf.scenes import bear, bear_edits
 
 EDITS = ("gold", "stripes", "big ears")
 BEAR, SIDE, SNAPSHOTS = 12_000, 160, 33
-CLOUDS = ((3_000, 30_000), (100_000, 100_000))
+CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
 """Members and Gaussians of the scenes on which a slider step is timed."""
 
 
@@ -131,58 +131,69 @@ def _compose_table() -> Table:
         chosen = torch.randperm(count, generator=rng)[:members].sort().values
         offsets = torch.randn(9, members, 14, generator=rng).cumsum(dim=0)
         offsets -= offsets[:1].clone()
-        field = fit_separable(torch.linspace(0, 1, 9), offsets, dict.fromkeys(ATTRIBUTES, 2))
-        rows.append(_compose_row(scene, edit_of(scene, chosen, field)))
+        strengths = torch.linspace(0, 1, 9)
+        edit = edit_of(scene, chosen, fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, 2)))
+        one = edit_of(
+            scene, chosen[:1], fit_separable(strengths, offsets[:, :1], dict.fromkeys(ATTRIBUTES, 2))
+        )
+        rows.append(_compose_row(scene, edit, one))
     return Table(
         name="compose",
         title="A slider step: new attributes of all members",
         columns=(
             "members / Gaussians",
+            "MB moved",
+            "copying, ms",
             "compose, ms",
             "Composer 1 thread, ms",
             "2 threads, ms",
-            "copying, ms",
-            "ratio to copying",
+            "of these for one member",
+            "ratio to copying, 1 / 2 threads",
             "largest difference",
         ),
         rows=tuple(rows),
-        note="Medians, taken in turns. Copying: a NumPy copy that moves as many bytes as a step must. "
-        "The plain compose also checks that the edit belongs to the scene.",
+        note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centres, "
+        "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
+        "member takes does not grow. The plain compose also checks that the edit belongs to the scene.",
     )
 
 
-def _compose_row(scene: Gaussians, edit: Gdf) -> tuple[str, ...]:
-    composer = Composer(scene, [edit])
+def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
+    composer, alone = Composer(scene, [edit]), Composer(scene, [single])
     # bases, the original and the last centres are read, row numbers too, 14 numbers written
-    traffic = len(edit.region) * (edit.field.bytes_per_member + 56 + 12 + 8 + 56)
+    traffic = len(edit.region) * (edit.field.bytes_per_member + 56 + 12 + 12 + 56)
     source = np.ones(int(traffic) // 8, np.float32)
     target = source.copy()
     before = threads()
-    times: dict[str, list[float]] = {"plain": [], "one": [], "two": [], "copy": []}
+    times: dict[str, list[float]] = {"plain": [], "1": [], "2": [], "copy": [], "one": []}
     difference = 0.0
     try:
-        for i in range(25):
-            layer = Layer(edit, 0.03 + 0.9 * i / 25)
-            if i % 5 == 0:
+        for i in range(50):
+            s = 0.03 + 0.9 * i / 50
+            layer = Layer(edit, s)
+            if i % 10 == 0:
                 times["plain"].append(milliseconds(partial(compose, scene, [layer])))
-            for key, count in (("one", 1), ("two", 2)):
+            for count in (1, 2):
                 set_threads(count)
                 composer.update([])
-                times[key].append(milliseconds(partial(composer.update, [layer])))
+                times[str(count)].append(milliseconds(partial(composer.update, [layer])))
+            times["one"].append(milliseconds(partial(alone.update, [Layer(single, s)])))
             times["copy"].append(milliseconds(partial(np.copyto, target, source)))
-            if i % 5 == 0:
+            if i % 10 == 0:
                 plain = pack(compose(scene, [layer]))
                 difference = max(difference, float((pack(composer.gaussians) - plain).abs().max()))
     finally:
         set_threads(before)
-    plain_ms, one, two, copied = (statistics.median(times[key]) for key in ("plain", "one", "two", "copy"))
+    took = {key: statistics.median(found) for key, found in times.items()}
     return (
         f"{len(edit.region)} / {len(scene)}",
-        f"{plain_ms:.1f}",
-        f"{one:.2f}",
-        f"{two:.2f}",
-        f"{copied:.2f}",
-        f"{min(one, two) / copied:.1f}",
+        f"{traffic / 1e6:.2f}",
+        f"{took['copy']:.3f}",
+        f"{took['plain']:.1f}",
+        f"{took['1']:.3f}",
+        f"{took['2']:.3f}",
+        f"{took['one']:.3f}",
+        f"{took['1'] / took['copy']:.1f} / {took['2'] / took['copy']:.1f}",
         f"{difference:g}",
     )
 

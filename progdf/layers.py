@@ -74,6 +74,13 @@ def check_layers(layers: Sequence[Layer], blend: str) -> None:
         ProgdfError: a strength or gain is not finite, or the blend rule is unknown.
         ValueError: weights do not fit the members, or one is not in 0..1.
     """
+    check_numbers(layers, blend)
+    for layer in layers:
+        check_weights(layer)
+
+
+def check_numbers(layers: Sequence[Layer], blend: str) -> None:
+    """`check_layers` without a look at the weights, which takes no time."""
     if blend not in BLENDS:
         raise ProgdfError(f"there is no blend rule '{blend}'; use one of {', '.join(BLENDS)}")
     for layer in layers:
@@ -82,10 +89,14 @@ def check_layers(layers: Sequence[Layer], blend: str) -> None:
         for kind, gain in vars(layer.gains).items():
             if not math.isfinite(gain):
                 raise ProgdfError(f"the {kind} gain of {layer.gdf.name} is {gain}; use a number, 0 to 1")
-        if layer.weights is None:
-            continue
-        found, members = list(layer.weights.shape), len(layer.gdf.region)
-        if found != [members]:
-            raise ValueError(f"weights of {layer.gdf.name} has shape {found}, expected [{members}]")
-        if members and not (float(layer.weights.min()) >= 0.0 and float(layer.weights.max()) <= 1.0):
-            raise ValueError(f"weights of {layer.gdf.name} has a number outside 0..1")
+
+
+def check_weights(layer: Layer) -> None:
+    """The part of `check_layers` that looks at one layer's weights."""
+    if layer.weights is None:
+        return
+    found, members = list(layer.weights.shape), len(layer.gdf.region)
+    if found != [members]:
+        raise ValueError(f"weights of {layer.gdf.name} has shape {found}, expected [{members}]")
+    if members and not (float(layer.weights.min()) >= 0.0 and float(layer.weights.max()) <= 1.0):
+        raise ValueError(f"weights of {layer.gdf.name} has a number outside 0..1")

@@ -267,6 +267,46 @@ def test_a_colour_gain_does_not_ask_for_a_new_depth_order(scene: Gaussians, shir
     assert not told.covariance_moved
 
 
+def test_an_edit_of_colours_alone_does_not_ask_for_a_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
+    told = Composer(scene, [hat]).update([Layer(hat, 0.5)])
+    assert told.attributes == ("sh0",)
+    assert told.largest_move == 0.0
+
+
+@pytest.mark.parametrize("count", [255, 256, 257, 700])
+def test_blocks_of_any_length_give_the_bits_of_compose(count: int) -> None:
+    scene = random_gaussians(900, seed=count)
+    edits = [
+        edit_of(scene, some_rows(scene, count, 1), curved_field(count, 1), "first"),
+        edit_of(scene, torch.arange(count), curved_field(count, 2, rank=3), "second"),
+    ]
+    composer = Composer(scene, edits)
+    for layers in ([Layer(edits[0], 0.3)], [Layer(edits[0], 0.3), Layer(edits[1], 0.4)]):
+        composer.update(layers)
+        assert bits(composer.gaussians) == bits(compose(scene, layers))
+
+
+def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt: Gdf) -> None:
+    still = {
+        name: replace(bases, coefficients=bases.coefficients.index_fill(0, torch.tensor([4]), 0.0))
+        for name, bases in shirt.field.attributes.items()
+    }
+    edit = edit_of(scene, shirt.region.members, replace(shirt.field, attributes=still))
+    layers = [Layer(edit, 0.5)]
+    composer = Composer(scene, [edit])
+    composer.update(layers)
+    assert bits(composer.gaussians) == bits(compose(scene, layers))
+
+
+def test_weights_outside_their_range_are_refused_while_painting(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    weights = torch.ones(150)
+    composer.update([Layer(shirt, 0.5, weights=weights)])
+    weights[3] = 1.5
+    with pytest.raises(ValueError, match="weights of shirt has a number outside"):
+        composer.update([Layer(shirt, 0.5, weights=weights)])
+
+
 def test_weights_painted_in_place_are_seen(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     weights = torch.ones(150)
