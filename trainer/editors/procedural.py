@@ -21,7 +21,7 @@ from trainer.editors.base import EditKind, EditorSettings
 from trainer.views import View, drawn, seen_colors
 
 _GREY, _COLOURED = 0.5, 1.1  # of the chroma of what is coloured: up to here a grey, from here a colour
-_KIN, _OTHER = math.radians(50), math.radians(100)  # from the typical hue: up to here its kin, from here another
+_KIN, _OTHER = math.radians(50), math.radians(100)  # from the region's hue: its kin up to here; another
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
 
