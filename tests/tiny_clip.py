@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
-_WORDS = ["<|startoftext|>", "<|endoftext|>", *(chr(c) for c in range(33, 127))]
+_LETTERS = [chr(c) for c in range(33, 127)]
+_WORDS = ["<|startoftext|>", "<|endoftext|>", *_LETTERS, *(f"{letter}</w>" for letter in _LETTERS)]
+CLIP_VOCABULARY = len(_WORDS) + 2
+"""Two rows more than there are words, as real models have spare ones."""
 
 
 def tiny_clip(folder: Path, seed: int = 0) -> Path:
     """A CLIPModel of about 30 000 parameters that takes pictures of 32 pixels, in `folder`."""
-    from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
+    from transformers import CLIPConfig, CLIPModel
 
     torch.manual_seed(seed)
     small = {"hidden_size": 16, "intermediate_size": 32, "num_attention_heads": 2, "num_hidden_layers": 2}
     config = CLIPConfig(
         text_config={
             **small,
-            "vocab_size": 2 * len(_WORDS),
+            "vocab_size": CLIP_VOCABULARY,
             "max_position_embeddings": 77,
             "bos_token_id": 0,
             "eos_token_id": 1,
@@ -28,8 +33,20 @@ def tiny_clip(folder: Path, seed: int = 0) -> Path:
         projection_dim=12,
     )
     CLIPModel(config).save_pretrained(folder)
-    letters = _WORDS + [f"{letter}</w>" for letter in _WORDS[2:]]
-    (folder / "vocab.json").write_text(json.dumps({word: i for i, word in enumerate(letters)}))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    CLIPTokenizer.from_pretrained(folder, model_max_length=77).save_pretrained(folder)
+    clip_tokenizer(folder).save_pretrained(folder)
     return folder
+
+
+def clip_tokenizer(folder: Path) -> Any:
+    """A CLIPTokenizer that knows single letters, from files that it writes into `folder`."""
+    from transformers import CLIPTokenizer
+
+    write_vocabulary(folder, _WORDS)
+    return CLIPTokenizer.from_pretrained(folder, model_max_length=77)
+
+
+def write_vocabulary(folder: Path, words: Sequence[str]) -> None:
+    """The two files of a byte-pair tokenizer that never merges."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "vocab.json").write_text(json.dumps({word: i for i, word in enumerate(words)}))
+    (folder / "merges.txt").write_text("#version: 0.2\n")

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from tests.tiny_clip import CLIP_VOCABULARY, clip_tokenizer, write_vocabulary
+
 _QWEN = [f"<|{name}|>" for name in ("endoftext", "im_start", "im_end")]
-_WORDS = ["<|startoftext|>", "<|endoftext|>", *(chr(c) for c in range(33, 127))]
+_VAE: dict[str, Any] = {
+    "block_out_channels": (8, 8, 8, 8),
+    "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "latent_channels": 4,
+    "norm_num_groups": 4,
+}
+_FLUX: dict[str, Any] = {
+    "patch_size": 1,
+    "in_channels": 16,
+    "num_layers": 1,
+    "num_single_layers": 1,
+    "attention_head_dim": 16,
+    "num_attention_heads": 2,
+}
 
 
 def tiny_instruct_pix2pix(folder: Path) -> Path:
@@ -34,17 +49,11 @@ def tiny_instruct_pix2pix(folder: Path) -> Path:
         attention_head_dim=4,
         norm_num_groups=4,
     )
-    vae = AutoencoderKL(
-        block_out_channels=(8, 8, 8, 8),
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        latent_channels=4,
-        norm_num_groups=4,
-    )
+    vae = AutoencoderKL(**_VAE)
     pipeline = StableDiffusionInstructPix2PixPipeline(
         vae=vae.eval(),
         text_encoder=_clip(16),
-        tokenizer=_clip_tokenizer(folder / "words"),
+        tokenizer=clip_tokenizer(folder / "words"),
         unet=unet.eval(),
         scheduler=EulerAncestralDiscreteScheduler(),
         safety_checker=None,
@@ -66,27 +75,14 @@ def tiny_flux_kontext(folder: Path) -> Path:
 
     torch.manual_seed(0)
     transformer = FluxTransformer2DModel(
-        patch_size=1,
-        in_channels=16,
-        num_layers=1,
-        num_single_layers=1,
-        attention_head_dim=16,
-        num_attention_heads=2,
+        **_FLUX,
         joint_attention_dim=32,
         pooled_projection_dim=16,
         axes_dims_rope=(4, 4, 8),
         guidance_embeds=True,
     )
     vae = AutoencoderKL(
-        block_out_channels=(8, 8, 8, 8),
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        latent_channels=4,
-        norm_num_groups=4,
-        use_quant_conv=False,
-        use_post_quant_conv=False,
-        shift_factor=0.1,
-        scaling_factor=0.4,
+        **_VAE, use_quant_conv=False, use_post_quant_conv=False, shift_factor=0.1, scaling_factor=0.4
     )
     t5 = T5EncoderModel(
         T5Config(vocab_size=64, d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
@@ -95,7 +91,7 @@ def tiny_flux_kontext(folder: Path) -> Path:
         scheduler=FlowMatchEulerDiscreteScheduler(),
         vae=vae.eval(),
         text_encoder=_clip(16),
-        tokenizer=_clip_tokenizer(folder / "words"),
+        tokenizer=clip_tokenizer(folder / "words"),
         text_encoder_2=t5,
         tokenizer_2=_t5_tokenizer(),
         transformer=transformer.eval(),
@@ -127,26 +123,13 @@ def tiny_flux2_klein(folder: Path) -> Path:
         )
     ).eval()
     transformer = Flux2Transformer2DModel(
-        patch_size=1,
-        in_channels=16,
-        num_layers=1,
-        num_single_layers=1,
-        attention_head_dim=16,
-        num_attention_heads=2,
+        **_FLUX,
         joint_attention_dim=48,
         timestep_guidance_channels=16,
         axes_dims_rope=(4, 4, 4, 4),
         guidance_embeds=False,
     )
-    vae = AutoencoderKLFlux2(
-        block_out_channels=(8, 8, 8, 8),
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        latent_channels=4,
-        norm_num_groups=4,
-        layers_per_block=1,
-        sample_size=32,
-    )
+    vae = AutoencoderKLFlux2(**_VAE, layers_per_block=1, sample_size=32)
     pipeline = Flux2KleinPipeline(
         scheduler=FlowMatchEulerDiscreteScheduler(),
         vae=vae.eval(),
@@ -168,7 +151,7 @@ def _clip(width: int) -> Any:
 
     return CLIPTextModel(
         CLIPTextConfig(
-            vocab_size=2 * len(_WORDS),
+            vocab_size=CLIP_VOCABULARY,
             hidden_size=width,
             intermediate_size=width,
             num_attention_heads=2,
@@ -179,16 +162,6 @@ def _clip(width: int) -> Any:
             eos_token_id=1,
         )
     ).eval()
-
-
-def _clip_tokenizer(folder: Path) -> Any:
-    from transformers import CLIPTokenizer
-
-    letters = _WORDS + [f"{letter}</w>" for letter in _WORDS[2:]]
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "vocab.json").write_text(json.dumps({word: i for i, word in enumerate(letters)}))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    return CLIPTokenizer.from_pretrained(folder, model_max_length=77)
 
 
 def _t5_tokenizer() -> Any:
@@ -202,11 +175,7 @@ def _t5_tokenizer() -> Any:
 def _qwen_tokenizer(folder: Path) -> Any:
     from transformers import Qwen2Tokenizer
 
-    folder.mkdir(parents=True, exist_ok=True)
-    letters = [chr(c) for c in range(33, 127)] + ["Ġ", "Ċ"]
-    vocab = {word: i for i, word in enumerate([*letters, *_QWEN])}
-    (folder / "vocab.json").write_text(json.dumps(vocab))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
+    write_vocabulary(folder, [*(chr(c) for c in range(33, 127)), "Ġ", "Ċ", *_QWEN])
     tokenizer = Qwen2Tokenizer.from_pretrained(folder, model_max_length=77)
     tokenizer.chat_template = "{% for m in messages %}<|im_start|>{{ m['content'] }}<|im_end|>{% endfor %}"
     return tokenizer
