@@ -9,17 +9,22 @@ from dataclasses import replace
 import moderngl
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stacks import Stack, bear_stack
 
-from progdf.compose import Gains, Layer, compose
+from progdf.compose import BLENDS, Gains, Layer, compose
 from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import render
 from viewer import engine as engine_module
+from viewer.editing import GpuEditing
 from viewer.engine import Engine, FrameTimings
+from viewer.gl import edit_pass
 from viewer.gl.screen import read_rgb
 from viewer.headless import headless_context, is_software
+from viewer.paint import encoded
 from viewer.state import LayerState, ViewState
 from viewer.turntable import first_camera, to_camera
 
@@ -40,16 +45,18 @@ def ctx() -> Iterator[moderngl.Context]:
     context.release()
 
 
-@pytest.fixture(params=["gl", "cpu"])
+@pytest.fixture(params=["gl", "cpu", "gl, edited by the GPU"])
 def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
-    made = Engine(ctx, stack.scene, stack.gdfs, draw=request.param)
+    draw, comma, _ = request.param.partition(",")
+    made = Engine(ctx, stack.scene, stack.gdfs, draw, edit_pass="gpu" if comma else "cpu")
     yield made
     made.release()
 
 
-@pytest.fixture
-def gl_engine(ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
-    made = Engine(ctx, stack.scene, stack.gdfs, draw="gl")
+@pytest.fixture(params=["cpu", "gpu"])
+def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+    """OpenGL, with what edits."""
+    made = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
     yield made
     made.release()
 
@@ -105,7 +112,7 @@ def test_the_picture_does_not_depend_on_the_way_to_it(
     for scarf, ears in path:
         gl_engine.image(view_of(stack, scarf, ears), SIZE)
     there = gl_engine.image(view_of(stack, 0.3, 0.6), SIZE).copy()
-    fresh = Engine(ctx, stack.scene, stack.gdfs, draw="gl")
+    fresh = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=gl_engine.edits_with)
     assert np.array_equal(there, fresh.image(view_of(stack, 0.3, 0.6), SIZE))
     fresh.release()
 
@@ -119,6 +126,69 @@ def test_both_ways_to_draw_give_the_same_picture(ctx: moderngl.Context, stack: S
         assert float((difference**2).mean()) <= 1e-7, "70 dB"
     by_gl.release()
     by_cpu.release()
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
+    ctx: moderngl.Context, stack: Stack, blend: str
+) -> None:
+    by_gpu, by_cpu = (
+        Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=where) for where in ("gpu", "cpu")
+    )
+    assert (by_gpu.edits_with, by_cpu.edits_with) == ("gpu", "cpu")
+    weights = np.linspace(0.0, 1.0, len(stack.gdfs[EARS].region), dtype=np.float32)
+    for scarf, ears, gains in ((1.0, 0.0, Gains()), (0.3, 1.2, Gains(geometry=0.5)), (0.0, 0.0, Gains())):
+        view = replace(view_of(stack, scarf, ears), blend=blend)
+        painted = replace(view.layers[EARS], paint=encoded(weights), gains=gains)
+        view = replace(view, layers=(view.layers[SCARF], painted))
+        apart = np.abs(by_gpu.image(view, SIZE) - by_cpu.image(view, SIZE))
+        assert float((apart**2).mean()) <= 1e-10, "100 dB; on llvmpipe they are the same"
+        assert by_gpu.edit_error() <= 1e-6
+        for name in ATTRIBUTES:
+            assert torch.equal(getattr(by_gpu.gaussians(view), name), getattr(by_cpu.gaussians(view), name))
+    by_gpu.release()
+    by_cpu.release()
+
+
+@pytest.mark.gl
+def test_beside_the_edit_pass_the_cpu_composes_means_only(ctx: moderngl.Context, stack: Stack) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    assert isinstance(engine._editing, GpuEditing)
+    engine.image(view_of(stack, 0.4, 0.4), SIZE)
+    engine.image(view_of(stack, 0.7, 0.7), SIZE)
+    assert engine._editing._composer is None
+    means = engine._editing._means.gaussians
+    assert torch.equal(means.sh0, stack.scene.sh0)
+    assert not torch.equal(means.means, stack.scene.means)
+    engine.release()
+
+
+@pytest.mark.gl
+def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    assert engine.edits_with == "cpu"
+    assert "too large" in engine.edit_obstacle
+    expected = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="cpu")
+    assert expected.edit_obstacle == ""
+    view = view_of(stack, 0.6, 0.6)
+    assert np.array_equal(engine.image(view, SIZE), expected.image(view, SIZE))
+    engine.release()
+    expected.release()
+
+
+@pytest.mark.gl
+def test_the_edit_pass_is_left_to_hardware_and_needs_opengl(ctx: moderngl.Context, stack: Stack) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl")
+    assert engine.edits_with == ("cpu" if is_software(ctx) else "gpu")
+    engine.release()
+    with pytest.raises(ProgdfError, match="the CPU draws here, so the GPU cannot edit"):
+        Engine(ctx, stack.scene, stack.gdfs, draw="cpu", edit_pass="gpu")
+    with pytest.raises(ValueError, match="edit_pass is 'fast'"):
+        Engine(ctx, stack.scene, draw="gl", edit_pass="fast")
 
 
 @pytest.mark.gl

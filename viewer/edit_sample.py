@@ -51,6 +51,8 @@ class EditSample:
             stack: layers with the indices of their edits, the lowest first
             blend: one of `progdf.layers.BLENDS`
         """
+        if not len(self._rows):
+            return 0.0
         layers = [
             replace(layer, gdf=self._gdfs[edit], weights=_some(layer.weights, self._chosen[edit]))
             for edit, layer in stack

@@ -181,18 +181,15 @@ class EditPass:
         self._lists["edit_numbers"].write(numbers)
 
     def _draw_base(self, plan: _Plan, attributes: Collection[str]) -> None:
-        """All attributes but shN; components of attributes that no edit moves are masked."""
-        masks = {name: [False] * 4 for name in SPLAT_TEXTURES}
-        for name in set(attributes) - {"shN"}:
-            place = PLACES[name]
-            for component in range(place.component, place.component + place.components):
-                masks[place.texture][component] = True
+        """All attributes but shN; textures in which nothing moves are masked."""
+        moved = {PLACES[name].texture for name in attributes}
+        wanted = [name in moved for name in SPLAT_TEXTURES]
         target = self._base_target
-        target.color_mask = tuple(tuple(mask) for mask in masks.values())  # type: ignore[assignment]
+        target.color_mask = tuple((want,) * 4 for want in wanted)  # type: ignore[assignment]
         target.use()
         target.viewport = (0, 0, *target.size)
         self._base["originals"] = self._packed.originals[:_SH]
-        self._base["wanted"] = tuple(int(any(mask)) for mask in masks.values())
+        self._base["wanted"] = tuple(map(int, wanted))
         plan.base.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=plan.spans)
 
     def _draw_sh(self, plan: _Plan, target: moderngl.Framebuffer) -> None:
