@@ -24,6 +24,7 @@ from .bench_scenes import edit_for, scenes_of
 from .engine import Engine, FrameTimings
 from .headless import headless_context
 from .state import LayerState, ViewState
+from .threads import one_thread
 from .turntable import first_camera, to_camera
 
 WARM_UP, STEPS = 2, 24
@@ -125,6 +126,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
         ctx.release()
 
 
+@one_thread()
 def rows(
     ctx: moderngl.Context,
     scene: Gaussians,

@@ -32,6 +32,7 @@ from .engine import Engine
 from .headless import headless_context
 from .panel import WIDTH_PX
 from .state import ViewState
+from .threads import one_thread
 from .turntable import first_camera
 
 WARM_UP, STEPS, STARTS, KEPT = 2, 20, 3, 4
@@ -75,10 +76,12 @@ class Start:
 
     Args:
         first_s: from the start of the process to the first picture on the screen
+        imports_s: of that, until Python has read the program and the libraries
         memory_mb: the most that the process has held by then
     """
 
     first_s: float
+    imports_s: float
     memory_mb: float
 
 
@@ -109,6 +112,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     return [frames_table(turnings, starts, renderer), coarse_table(turnings, renderer)]
 
 
+@one_thread()
 def turned(
     ctx: moderngl.Context, path: Path, steps: int = STEPS, size: tuple[int, int] = SIZE
 ) -> list[Turning]:
@@ -157,15 +161,14 @@ def started(path: Path, times: int = STARTS, size: tuple[int, int] = SIZE) -> St
     Raises:
         ProgdfError: Xvfb or xdotool is not installed, or the window does not open.
     """
-    firsts: list[float] = []
-    memory: list[float] = []
+    figures: list[dict[str, float]] = []
     wide = (size[0] + round(WIDTH_PX), size[1])
     with bench_display.display() as screen, tempfile.TemporaryDirectory() as folder:
         for _ in range(1 + times):
             with bench_display.window(screen, [path], wide, Path(folder), leave=True) as opened:
-                firsts.append(opened.figures["first_s"])
-                memory.append(opened.figures["memory_mb"])
-    return Start(statistics.median(firsts[1:]), statistics.median(memory[1:]))
+                figures.append(opened.figures)
+    names = ("first_s", "imports_s", "memory_mb")
+    return Start(*(statistics.median(figure[name] for figure in figures[1:]) for name in names))
 
 
 def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer: str) -> Table:
@@ -182,7 +185,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
                 f"**{middle:.1f}** / {late:.1f}",
                 f"{result.checked - result.wrong} of {result.checked}",
                 f"{result.opened_s:.2f}",
-                "-" if start is None else f"{start.first_s:.2f}",
+                "-" if start is None else f"{start.first_s:.2f} ({start.imports_s:.2f})",
                 "-" if start is None else f"{start.memory_mb:.0f}",
             )
         )
@@ -196,7 +199,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
             "whole frame p50 / p95, ms",
             "the same drawn afresh",
             "first picture of an opened file, s",
-            "of `progdf view`, s",
+            "of `progdf view`, s (imports)",
             "memory by then, MB",
         ),
         tuple(rows),

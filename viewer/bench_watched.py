@@ -2,7 +2,8 @@
 
     python -m viewer.bench_watched BEGAN WIDTHxHEIGHT leave|stay SCENE.ply [A.gdf …] …
 
-`first_s` and `memory_mb` once the first picture is on the screen, counted from BEGAN (seconds of the epoch);
+`imports_s`, `first_s` and `memory_mb` once the first picture is on the screen, counted from BEGAN
+(seconds of the epoch);
 `frames`, `pictures` and `slider_ms` (of the last 120 slider events to finished pixels) when it is closed.
 """
 
@@ -21,6 +22,7 @@ def main(arguments: list[str]) -> int:
     """Open the window and stay as `progdf view` does; "leave" closes it after the first picture."""
     from . import app as application  # where `progdf view` imports it
 
+    imported = time.time()
     began, size, stays = float(arguments[0]), arguments[1].split("x"), arguments[2] == "stay"
     watched: list[application.App] = []
 
@@ -33,6 +35,7 @@ def main(arguments: list[str]) -> int:
                 self.context.finish()
                 watched.append(self)
                 _say(
+                    imports_s=imported - began,
                     first_s=time.time() - began,
                     memory_mb=_most_mb(),
                     draws_with=self.engine.draws_with,
