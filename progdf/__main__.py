@@ -15,7 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
     "ablate": ("trainer.cli:ablate", "train a run again without each part of the method: one table"),
     "view": ("viewer.cli:view", "open the window: splats, layers, sliders"),
-    "render": ("viewer.cli:render", "write a picture, a sweep or a contact sheet without a window"),
+    "render": ("viewer.render:render", "write a picture, a sweep or a contact sheet without a window"),
     "export": ("viewer.cli:export", "write the edited scene as a 3DGS .ply file"),
     "check": ("progdf.check:main", "report what a .ply file holds and what had to be repaired"),
     "info": ("progdf.info:main", "tell what a .ply or .gdf file holds, with its error report"),

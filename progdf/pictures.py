@@ -23,6 +23,7 @@ def contact_sheet(
     column_labels: Sequence[str] = (),
     title: str = "",
     caption: str = "",
+    notes: Sequence[Sequence[str]] = (),
 ) -> Tensor:
     """Lay pictures out in a grid.
 
@@ -32,6 +33,7 @@ def contact_sheet(
         column_labels: a word above each column, or none
         title: a line at the top
         caption: a smaller line at the bottom
+        notes: a word under each picture, row by row, or none
 
     Returns:
         The sheet. [H',W',3] in 0..1
@@ -61,7 +63,8 @@ def contact_sheet(
         left + columns * (width + gap),
         *(_width(line, f) + 4 * gap for line, f in ((title, large), (caption, small))),
     )
-    full_height = grid_top + len(rows) * (height + gap) + (round(1.8 * text) if caption else 0)
+    step = height + gap + (round(1.4 * text) if notes else 0)
+    full_height = grid_top + len(rows) * step + (round(1.8 * text) if caption else 0)
 
     page = Image.new("RGB", (full_width, full_height), _PAPER)
     draw = ImageDraw.Draw(page)
@@ -71,7 +74,7 @@ def contact_sheet(
         middle = left + j * (width + gap) + width / 2
         draw.text((middle, top + 0.75 * text), label, _INK, font, anchor="mm")
     for i, row in enumerate(rows):
-        y = grid_top + i * (height + gap)
+        y = grid_top + i * step
         if i < len(row_labels):
             lines = row_labels[i].split("\n")
             for k, line in enumerate(lines):
@@ -80,6 +83,9 @@ def contact_sheet(
                 draw.text((left - 2 * gap, middle), line, ink, letters, anchor="rm")
         for j, image in enumerate(row):
             page.paste(to_picture(image), (left + j * (width + gap), y))
+        for j, note in enumerate(notes[i] if i < len(notes) else ()):
+            below = (left + j * (width + gap) + width / 2, y + height + 0.75 * text)
+            draw.text(below, note, _PALE_INK, small, anchor="mm")
     if caption:
         draw.text((left, full_height - 0.9 * text), caption, _PALE_INK, small, anchor="lm")
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)

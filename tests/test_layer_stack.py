@@ -365,4 +365,4 @@ def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
     monkeypatch.chdir(saved[1])
     edits = ("bear.ply", "scarf.gdf", "ears.gdf", "--solo", "ears")
     assert main(["render", *edits, "--sweep", "scarf", "-o", "a.gif"]) == 2
-    assert "add --solo scarf" in capsys.readouterr().err
+    assert "ears is shown alone and hides it; show scarf alone too" in capsys.readouterr().err

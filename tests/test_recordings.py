@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from stacks import recording_of
 from test_compare import BANNER, SIZE, beside_line
 from ui_rig import Rig, bear, first_view, rig
 
+from progdf.__main__ import main
 from progdf.checkpoint import save_gdf
 from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
@@ -264,3 +266,44 @@ def test_equal_pictures_are_told_as_such_and_figures_that_were_not_taken_are_lef
     split = Comparison("split", against="recorded")
     assert compare_labels.labels(split, math.inf, "recorded at 0").right == "field · no difference"
     assert compare_labels.labels(split, math.nan, "recorded at 0").right == "field"
+
+
+def rendered(*options: str) -> np.ndarray:
+    common = ("bear.ply", "scarf/scarf.gdf", "ears/ears.gdf", "--set", f"scarf={AT}", "--size", "96x72")
+    assert main(["render", *common, "--engine", "cpu", *options, "-o", "out.png"]) == 0
+    return np.asarray(Image.open("out.png")).astype(int)
+
+
+@pytest.mark.parametrize("options", [("--split", "0.7"), ("--difference", "8")])
+def test_render_compares_with_the_recording(
+    runs: list[Path],
+    options: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(runs[0].parent)
+    original, field = rendered(*options), rendered()
+    recorded = rendered(*options, "--against", "recorded")
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert told.startswith("PSNR of the field against what was recorded ")
+    assert told.endswith("dB (recorded, between 0.31 and 0.5)")
+    assert np.abs(recorded - original).max() > 20
+    if "--split" in options:
+        assert np.array_equal(recorded[26:, 71:], field[26:, 71:])
+        assert not np.array_equal(recorded[26:, :63], field[26:, :63])
+    else:
+        assert recorded[26:].sum() < 0.5 * original[26:].sum(), "the field is near to the recording"
+
+
+def test_render_says_in_one_line_why_there_is_no_recording(
+    runs: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(runs[0].parent)
+    for path in runs[1:]:
+        path.with_name(FILE_NAME).unlink()
+    argv = ["render", "bear.ply", "scarf/scarf.gdf", "--split", "--against", "recorded", "-o", "x.png"]
+    assert main([*argv, "--engine", "cpu"]) == 2
+    error = capsys.readouterr().err
+    assert f"there is no {FILE_NAME} beside scarf.gdf; give the .gdf in its run folder" in error
+    assert error.count("\n") == 1
+    assert not Path("x.png").exists()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 from progdf.camera import Camera
 from progdf.camera_files import load_cameras
@@ -16,9 +18,19 @@ from progdf.gaussians import Gaussians
 
 from .compare import MOST_AMPLIFIED
 from .state import Comparison, LayerState, Vec3, ViewCamera
+from .threads import all_threads
 from .turntable import FARTHEST
 
 LARGEST_SIDE = 16_384
+_BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
+
+
+class Named(Protocol):
+    """An edit, or the layer that shows one."""
+
+    @property
+    def name(self) -> str:
+        """No two of a stack share one."""
 
 
 def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tuple[Gdf, ...]:
@@ -29,7 +41,8 @@ def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tup
     """
     gdfs: list[Gdf] = []
     for path in paths:
-        gdf = load_gdf(path, scene, scene_path.name)
+        with all_threads():
+            gdf = load_gdf(path, scene, scene_path.name)
         taken = {other.name for other in gdfs}
         name, number = gdf.name, 2
         while name in taken:
@@ -44,16 +57,26 @@ def layers_of(gdfs: Sequence[Gdf], settings: Sequence[str], most: float = 1.0) -
     Raises:
         ProgdfError: there is no edit NAME, or S is no number from 0 to `most`.
     """
-    strengths = {gdf.name: 0.0 for gdf in gdfs}
+    strengths = strengths_of(gdfs, settings, most)
+    return tuple(LayerState(i, gdf.name, strengths.get(gdf.name, 0.0)) for i, gdf in enumerate(gdfs))
+
+
+def strengths_of(edits: Sequence[Named], settings: Sequence[str], most: float = 1.0) -> dict[str, float]:
+    """The strengths that settings `NAME=S` name.
+
+    Raises:
+        ProgdfError: see `layers_of`.
+    """
+    strengths = {}
     for setting in settings:
         name, equals, text = setting.rpartition("=")
         if not equals or not name:
-            raise ProgdfError(f"--set {setting} has no NAME=S; write for example --set {_example(gdfs)}=0.7")
-        strengths[known_edit(name, gdfs, "--set")] = _strength(setting, text, most)
-    return tuple(LayerState(i, gdf.name, strengths[gdf.name]) for i, gdf in enumerate(gdfs))
+            raise ProgdfError(f"--set {setting} has no NAME=S; write for example --set {_example(edits)}=0.7")
+        strengths[known_edit(name, edits, "--set")] = _strength(setting, text, most)
+    return strengths
 
 
-def known_edit(name: str, gdfs: Sequence[Gdf], option: str) -> str:
+def known_edit(name: str, gdfs: Sequence[Named], option: str) -> str:
     """`name`, when an edit has it.
 
     Raises:
@@ -154,6 +177,29 @@ def parse_comparison(split: str | None, amplify: str | None) -> Comparison:
     return Comparison()
 
 
+def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
+    """Raises ProgdfError where the result would take the place of what it is made from."""
+    for path in inputs:
+        if out.exists() and path.exists() and os.path.samefile(out, path):
+            raise ProgdfError(f"{out} is one of the files to read; choose another name for the result")
+
+
+def joined(argv: Sequence[str]) -> list[str]:
+    """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option.
+
+    `--split` and `--difference` without a number get theirs.
+    """
+    found: list[str] = []
+    for argument in argv:
+        if found and found[-1] == "--orbit":
+            found[-1] = f"--orbit={argument}"
+        elif found and found[-1] in _BARE and is_number(argument):
+            found[-1] = f"{found[-1]}={argument}"
+        else:
+            found.append(argument)
+    return [f"{argument}={_BARE[argument]}" if argument in _BARE else argument for argument in found]
+
+
 def is_number(text: str) -> bool:
     """Whether `text` is a finite number."""
     try:
@@ -182,9 +228,9 @@ def _strength(setting: str, text: str, most: float) -> float:
     return strength
 
 
-def _example(gdfs: Sequence[Gdf]) -> str:
+def _example(gdfs: Sequence[Named]) -> str:
     return gdfs[0].name if gdfs else "NAME"
 
 
-def _are(gdfs: Sequence[Gdf]) -> str:
+def _are(gdfs: Sequence[Named]) -> str:
     return "is" if len(gdfs) == 1 else "are"

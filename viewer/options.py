@@ -71,21 +71,22 @@ class RenderOptions(PictureOptions):
     """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
     sweep: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Move this edit's slider from 0 to 1 and back: an animation."""
-    sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]")] = None
-    """A contact sheet over this edit's slider, or a grid over two sliders."""
+    sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]|N")] = None
+    """A contact sheet over this edit's slider, a grid over two sliders, or N pictures of the --timeline."""
     split: Annotated[str | None, tyro.conf.arg(metavar="[X]")] = None
     """The original beside the edited picture, which begins at this share of the width (0.5)."""
     difference: Annotated[str | None, tyro.conf.arg(metavar="[AMPLIFY]")] = None
     """What differs from the original, amplified (4), with the PSNR."""
+    against: Literal["original", "recorded"] | None = None
+    """What --split and --difference set the picture against: the original, or what training recorded."""
     timeline: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
-    """A film of the keys in this file (Ctrl+K in the window): .gif, .mp4, or a folder for .png frames."""
+    """A film of the keys in this file (Ctrl+K in the window), or in the session: .gif, .mp4, or a folder for
+    .png frames; with --sheet N a contact sheet of N of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions(StackOptions):
     """Write a scene under its edits as a 3DGS .ply file."""
 
-    scene: Scene
-    """The scene, a 3DGS .ply file."""
     out: Out
     """The .ply file to write."""

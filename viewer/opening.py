@@ -1,0 +1,107 @@
+"""What `progdf view`, `render` and `export` open: a scene with edits, or a session that holds both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from progdf.errors import ProgdfError
+from progdf.info import kind_of
+
+from . import arguments, document, session, stack
+from .document import Document
+from .layer_arguments import stack_of
+from .options import PictureOptions, StackOptions
+from .snapshots import Snapshot
+from .state import ViewState
+
+NAME = "--session"
+_SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "blend", "background")
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What was opened, and how it shall look.
+
+    Args:
+        document: the scene and its edits
+        view: of a scene without the camera, which is for the command to choose
+        session: the file that holds all this; None for a scene
+        snapshots: those of the session
+    """
+
+    document: Document
+    view: ViewState
+    session: Path | None = None
+    snapshots: tuple[Snapshot, ...] = ()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All that was read."""
+        own = (self.document.path, self.session)
+        return (*(path for path in own if path is not None), *self.document.gdf_paths)
+
+    def layer(self, name: str) -> str:
+        """The layer of that name; else of the edit of that name, as a session's layers may be renamed."""
+        named = {self.document.gdfs[layer.gdf].name: layer.name for layer in self.view.layers}
+        return name if name in named.values() else named.get(name, name)
+
+
+def opened(options: StackOptions) -> Opened:
+    """Open what the options name.
+
+    Raises:
+        ProgdfError: a file is missing or broken, an edit was made for another scene, options name no edit;
+            or they say what a session says already.
+    """
+    if is_session(options.scene):
+        return _session(options)
+    view = ViewState(blend=options.blend, overshoot=options.overshoot)
+    if isinstance(options, PictureOptions):
+        view = replace(view, background=arguments.parse_background(options.background))
+    found = document.load(options.scene, options.gdfs)
+    layers = stack_of(found.gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint)
+    return Opened(found, replace(view, layers=layers))
+
+
+def is_session(path: Path) -> bool:
+    """Whether a file is a session, by its content; a file that cannot be read is none."""
+    return path.is_file() and kind_of(path) == "session"
+
+
+def without_name(argv: Sequence[str]) -> list[str]:
+    """`--session FILE` and `--session=FILE` as the FILE in the scene's place."""
+    found: list[str] = []
+    first: list[str] = []
+    rest = iter(argv)
+    for argument in rest:
+        if argument == NAME:
+            file = next(rest, None)
+            if file is None:
+                raise ProgdfError(f"{NAME} names no file; write {NAME} FILE")
+            first.append(file)
+        elif argument.startswith(f"{NAME}="):
+            first.append(argument.removeprefix(f"{NAME}="))
+        else:
+            found.append(argument)
+    return [*first, *found]
+
+
+def _session(options: StackOptions) -> Opened:
+    """The session with the strengths that were said beside it."""
+    defaults = {f.name: f.default for f in fields(options)}
+    for name in _SAID_BY_SESSION:
+        if name in defaults and getattr(options, name) != defaults[name]:
+            what = "an edit was given" if name == "gdfs" else f"--{name} was given"
+            raise ProgdfError(
+                f"{what} with the session {options.scene.name}, which says it too; leave it out"
+            )
+    kept = session.open_session(options.scene)
+    found = Opened(kept.document, kept.view, options.scene, kept.snapshots)
+    settings = [
+        f"{found.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in options.set)
+    ]
+    strengths = arguments.strengths_of(kept.view.layers, settings, stack.most(kept.view))
+    layers = (replace(l, strength=strengths.get(l.name, l.strength)) for l in kept.view.layers)
+    return replace(found, view=replace(kept.view, layers=tuple(layers)))
