@@ -1,16 +1,14 @@
-"""Runs that were stopped, as fixtures, and what stops them: keys, a full disk, a kill."""
+"""Runs that were stopped, as fixtures, and what stops them: keys, a kill."""
 
 from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -111,17 +109,6 @@ def saved_step() -> int:
     saved = RunFolder(OUT).state.load("training")
     assert saved is not None
     return int(saved.values["pgs"]["step"])
-
-
-@contextmanager
-def files_up_to(size: int) -> Iterator[None]:
-    """No file may grow beyond so many bytes: the system refuses, as it does where a disk is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def killed(bear_folder: Path, where: Path, moments: Sequence[float], **options: object) -> list[str]:

@@ -64,11 +64,32 @@ def test_a_model_is_read_with_or_without_its_points(tmp_path: Path, text: bool, 
         assert (camera.width, camera.height, camera.lens) == (320, 200, None)
 
 
-@pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "colmap/sparse/0"])
+@pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "0", "colmap/sparse/0"])
 def test_a_model_is_found_in_the_project_that_holds_it(tmp_path: Path, place: str) -> None:
     write_model(tmp_path / "project" / place, views())
     assert len(load_cameras(tmp_path / "project")) == 4
     assert len(load_cameras(tmp_path / "project" / place / "images.bin")) == 4
+
+
+def test_a_binary_model_goes_before_a_text_beside_it(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "m", views())
+    for name in ("cameras.txt", "images.txt"):
+        (model / name).write_text("left over from an export\n")
+    assert len(load_cameras(model)) == 4
+
+
+def test_a_model_in_which_no_image_is_registered_is_refused(tmp_path: Path) -> None:
+    assert "no registered image" in refusal(load_cameras, write_model(tmp_path / "m", []))
+
+
+def test_a_rotation_that_is_none_is_refused_with_the_name_of_its_image(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "m", views(), text=True)
+    for name in ("rigs.txt", "frames.txt"):
+        (model / name).unlink()
+    images = (model / "images.txt").read_text()
+    assert "\n1 1 0 -0 -0 " in images
+    (model / "images.txt").write_text(images.replace("\n1 1 0 -0 -0 ", "\n1 1 1 0 0 "))
+    assert "image left/9.jpg" in refusal(load_cameras, model)
 
 
 def test_a_model_older_than_rigs_is_read(tmp_path: Path) -> None:

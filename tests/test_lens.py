@@ -52,9 +52,15 @@ def test_a_photograph_is_straightened_to_what_a_pinhole_sees() -> None:
 def test_what_the_photograph_does_not_show_is_told() -> None:
     pincushion = Lens(k1=0.4)
     straight, shown = straightened(photograph(Lens()), K, pincushion)
-    assert not bool(shown[0, 0])
+    for row, column in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
+        assert not bool(shown[row, column]), "a corner, which the lens pulls out of the photograph"
     assert bool(shown[HEIGHT // 2, WIDTH // 2])
     assert float(straight[~shown].abs().max()) == 0.0
+
+
+def test_the_edge_of_a_photograph_is_not_darkened() -> None:
+    straight, shown = straightened(torch.ones(HEIGHT, WIDTH, 3), K, Lens(k1=0.1))
+    torch.testing.assert_close(straight[shown], torch.ones(int(shown.sum()), 3))
 
 
 def test_no_lens_changes_no_bit() -> None:
@@ -65,13 +71,30 @@ def test_no_lens_changes_no_bit() -> None:
 
 
 def test_where_the_formula_folds_back_nothing_is_shown() -> None:
-    folding = Lens(k1=-0.6)  # r (1 - 0.6 r²) turns round at r = sqrt(1 / 1.8)
-    assert abs(folding.valid_radius() - math.sqrt(1 / 1.8)) < 2e-3
+    folding = Lens(k1=-0.6)
     wide = torch.tensor([[40.0, 0.0, 64.0], [0.0, 40.0, 48.0], [0.0, 0.0, 1.0]])
     _, shown = straightened(torch.rand(HEIGHT, WIDTH, 3), wide, folding)
     assert not bool(shown[48, 0])
     assert bool(shown[48, 64])
-    assert Lens(k1=0.3).valid_radius() == math.inf
+
+
+@pytest.mark.parametrize(
+    ("lens", "radius"),
+    [
+        (Lens(k1=-0.6), (1 / 1.8) ** (1 / 2)),  # r (1 - 0.6 r²) turns round where 1 - 1.8 r² is 0
+        (Lens(k2=-0.3), (1 / 1.5) ** (1 / 4)),
+        (Lens(k3=-0.2), (1 / 1.4) ** (1 / 6)),
+        (Lens(k1=-0.05), (1 / 0.15) ** (1 / 2)),  # 69° to the side
+        (Lens(k1=0.3), math.inf),
+        (Lens(p1=0.1, p2=0.1), math.inf),
+    ],
+)
+def test_the_valid_radius_is_where_the_radial_part_turns_round_and_never_beyond(
+    lens: Lens, radius: float
+) -> None:
+    found = lens.valid_radius()
+    assert found <= radius
+    assert found == pytest.approx(radius, abs=2e-3)
 
 
 def test_a_lens_that_bends_nothing_is_false() -> None:
@@ -79,3 +102,5 @@ def test_a_lens_that_bends_nothing_is_false() -> None:
     assert Lens(p2=1e-9)
     with pytest.raises(ValueError, match="finite"):
         Lens(k1=math.nan)
+    with pytest.raises(ValueError, match="finite"):
+        Lens(p1=math.inf)

@@ -14,8 +14,9 @@ import torch
 import trainer.pgs
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from tests.full_disk import files_up_to
 from tests.stopped import OUT, small_run
-from tests.stopped_runs import NEVER, at_step, files_up_to, gone_on, saved_step, words
+from tests.stopped_runs import NEVER, at_step, gone_on, saved_step, words
 from trainer.artefacts import RunFolder, locked
 from trainer.run import train
 
