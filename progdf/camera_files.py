@@ -20,6 +20,7 @@ from progdf.camera import Camera
 from progdf.colmap import find_model, load_model
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
+from progdf.json_values import angle_at, matrix_at, number_at, pixels_at, table_at
 from progdf.lens import Lens
 
 _log = logging.getLogger(__name__)
@@ -138,35 +139,35 @@ def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> Non
 
 def _own(file: str, index: int, entry: object) -> Camera:
     where = f"camera {index} of {file}"
-    table = _table(where, entry)
+    table = table_at(where, entry)
     return _camera(
         where,
-        _matrix(where, table, "viewmat", (4,), 4),
-        _matrix(where, table, "K", (3,), 3),
-        _pixels(where, table, "width"),
-        _pixels(where, table, "height"),
+        _rigid(where, matrix_at(where, table, "viewmat", (4,), 4)),
+        matrix_at(where, table, "K", (3,), 3),
+        pixels_at(where, table, "width"),
+        pixels_at(where, table, "height"),
         str(table.get("name", "")),
-        _lens(where, _table(where, table.get("lens", {}))),
+        _lens(where, table_at(where, table.get("lens", {}))),
     )
 
 
 def _inria(file: str, index: int, entry: object) -> Camera:
     """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the centre."""
     where = f"camera {index} of {file}"
-    table = _table(where, entry)
+    table = table_at(where, entry)
     c2w = torch.eye(4, dtype=torch.float64)
-    c2w[:3, :3] = _matrix(where, table, "rotation", (3,), 3)
+    c2w[:3, :3] = matrix_at(where, table, "rotation", (3,), 3)
     position = table.get("position")
-    c2w[:3, 3] = _matrix(where, {"position": [position]}, "position", (1,), 3)[0]
-    width, height = _pixels(where, table, "width"), _pixels(where, table, "height")
-    K = _intrinsics(_number(where, table, "fx"), _number(where, table, "fy"), 0.5 * width, 0.5 * height)
+    c2w[:3, 3] = matrix_at(where, {"position": [position]}, "position", (1,), 3)[0]
+    width, height = pixels_at(where, table, "width"), pixels_at(where, table, "height")
+    K = _intrinsics(number_at(where, table, "fx"), number_at(where, table, "fy"), 0.5 * width, 0.5 * height)
     return _camera(where, _world_to_camera(where, c2w), K, width, height, str(table.get("img_name", "")))
 
 
 def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object, path: Path) -> Camera:
     """Intrinsics of the frame go before those of the file; axes are OpenGL's (y up, z backwards)."""
     where = f"frame {index} of {file}"
-    table = {**shared, **_table(where, frame)}
+    table = {**shared, **table_at(where, frame)}
     model = str(table.get("camera_model", "")).upper()
     if model not in _PINHOLES:
         raise ProgdfError(
@@ -174,20 +175,20 @@ def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object,
         )
     width, height = _image_size(where, table, path)
     if "fl_x" in table or "fl_y" in table:
-        focal_x = _number(where, table, "fl_x" if "fl_x" in table else "fl_y")
-        focal_y = _number(where, table, "fl_y" if "fl_y" in table else "fl_x")
+        focal_x = number_at(where, table, "fl_x" if "fl_x" in table else "fl_y")
+        focal_y = number_at(where, table, "fl_y" if "fl_y" in table else "fl_x")
     else:
         angles = [
-            0.5 * side / math.tan(0.5 * _angle(where, table, key))
+            0.5 * side / math.tan(0.5 * angle_at(where, table, key))
             for key, side in (("camera_angle_x", width), ("camera_angle_y", height))
             if key in table
         ]
         if not angles:
             raise ProgdfError(f"{where} has no focal length; fl_x, fl_y or camera_angle_x would be right")
         focal_x, focal_y = angles[0], angles[-1]
-    cx = _number(where, table, "cx") if "cx" in table else 0.5 * width
-    cy = _number(where, table, "cy") if "cy" in table else 0.5 * height
-    c2w = _matrix(where, table, "transform_matrix", (3, 4), 4)
+    cx = number_at(where, table, "cx") if "cx" in table else 0.5 * width
+    cy = number_at(where, table, "cy") if "cy" in table else 0.5 * height
+    c2w = matrix_at(where, table, "transform_matrix", (3, 4), 4)
     c2w = torch.cat([c2w[:3], torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)])
     c2w[:, 1:3] *= -1  # OpenGL -> OpenCV
     K = _intrinsics(focal_x, focal_y, cx, cy)
@@ -197,20 +198,20 @@ def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object,
 
 def _lens(where: str, table: Mapping[str, Any]) -> Lens | None:
     """The lens, if it bends anything."""
-    strange = [key for key in _STRANGE_LENS if key in table and _number(where, table, key) != 0]
+    strange = [key for key in _STRANGE_LENS if key in table and number_at(where, table, key) != 0]
     if strange:
         raise ProgdfError(
             f"{where} has lens distortion with {', '.join(strange)}, which programs read in different ways; "
             "undistort the images and give the new file"
         )
-    lens = Lens(**{key: _number(where, table, key) for key in _LENS if key in table})
+    lens = Lens(**{key: number_at(where, table, key) for key in _LENS if key in table})
     return lens if lens else None
 
 
 def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, int]:
     """From the file, else from the picture it names (synthetic NeRF scenes have no w and h)."""
     if "w" in table and "h" in table:
-        return _pixels(where, table, "w"), _pixels(where, table, "h")
+        return pixels_at(where, table, "w"), pixels_at(where, table, "h")
     from PIL import Image
 
     for suffix in _IMAGE_SUFFIXES:
@@ -227,14 +228,20 @@ def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, 
 
 
 def _world_to_camera(where: str, c2w: Tensor) -> Tensor:
-    rotation = c2w[:3, :3]
+    viewmat: Tensor = torch.linalg.inv(_rigid(where, c2w))
+    return viewmat
+
+
+def _rigid(where: str, matrix: Tensor) -> Tensor:
+    """The matrix, if it turns and moves and does nothing else. [4,4]"""
+    rotation = matrix[:3, :3]
     error = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max())
-    if not error < _NOT_A_ROTATION or float(torch.det(rotation)) < 0:
+    last = matrix[3].tolist() == [0, 0, 0, 1]
+    if not last or not error < _NOT_A_ROTATION or float(torch.det(rotation)) < 0:
         raise ProgdfError(
             f"{where} has a matrix that is no rotation and translation; export the cameras again"
         )
-    viewmat: Tensor = torch.linalg.inv(c2w)
-    return viewmat
+    return matrix
 
 
 def _camera(
@@ -248,53 +255,3 @@ def _camera(
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-
-
-def _table(where: str, entry: object) -> Mapping[str, Any]:
-    if not isinstance(entry, dict):
-        raise ProgdfError(f"{where} is no JSON object; export the cameras again")
-    return entry
-
-
-def _number(where: str, table: Mapping[str, Any], key: str) -> float:
-    value = table.get(key)
-    if not _is_number(value):
-        raise ProgdfError(f"{where} has {key} = {_shown(value)}; a number would be right")
-    return float(table[key])
-
-
-def _angle(where: str, table: Mapping[str, Any], key: str) -> float:
-    angle = _number(where, table, key)
-    if not 0 < angle < math.pi:
-        raise ProgdfError(f"{where} has {key} = {angle:g}; an angle between 0 and pi would be right")
-    return angle
-
-
-def _pixels(where: str, table: Mapping[str, Any], key: str) -> int:
-    number = _number(where, table, key)
-    if number != round(number) or not 1 <= number <= 1_000_000:
-        raise ProgdfError(f"{where} has {key} = {number:g}; a whole number of pixels would be right")
-    return int(number)
-
-
-def _matrix(where: str, table: Mapping[str, Any], key: str, rows: tuple[int, ...], columns: int) -> Tensor:
-    value = table.get(key)
-    good = (
-        isinstance(value, list)
-        and len(value) in rows
-        and all(isinstance(row, list) and len(row) == columns for row in value)
-        and all(_is_number(x) for row in value for x in row)
-    )
-    if not good:
-        shape = " or ".join(f"{count}x{columns}" for count in rows)
-        raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers would be right")
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def _is_number(value: object) -> bool:
-    """Finite, and within what float32 can hold (JSON has integers of any length)."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
-
-
-def _shown(value: object) -> str:
-    return "nothing" if value is None else repr(value)[:40]

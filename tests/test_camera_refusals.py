@@ -106,6 +106,17 @@ def test_any_other_json_is_one_line(content: str, tmp_path: Path) -> None:
     refusal(load_cameras, path)
 
 
+@pytest.mark.parametrize(
+    "viewmat",
+    [torch.zeros(4, 4), 2 * torch.eye(4), torch.diag(torch.tensor([-1.0, 1, 1, 1])), torch.ones(4, 4)],
+)
+def test_a_saved_camera_that_does_more_than_turn_and_move_is_refused(
+    viewmat: torch.Tensor, tmp_path: Path
+) -> None:
+    entry = {"width": 4, "height": 4, "K": torch.eye(3).tolist(), "viewmat": viewmat.tolist()}
+    assert "no rotation" in refusal(load_cameras, written(tmp_path / "one.json", entry))
+
+
 def test_a_missing_camera_file_is_one_line(tmp_path: Path) -> None:
     assert "does not exist" in refusal(load_cameras, tmp_path / "nowhere.json")
 

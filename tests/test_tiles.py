@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import rasterize
 from progdf.rasterize.binning import TILE_H, TILE_W
-from tests.scenes import hard_cases, orbit_camera, random_gaussians
+from tests.scenes import front_camera, hard_cases, orbit_camera, random_gaussians
 from tests.trained import WHITE, small
 from trainer.crops import CropScene, crop_scene, render_all
 from trainer.tiles import live_pixels, live_tiles, reaching
@@ -74,6 +75,36 @@ def test_live_tiles_are_those_of_the_full_image() -> None:
     rows, columns = pixels.nonzero().unbind(dim=1)
     assert (int(rows.min()) + 13, int(columns.min()) + 10) == (16, 32)
     assert (int(rows.max()) + 13, int(columns.max()) + 10) == (23, 63)
+
+
+def test_tiles_end_with_the_box() -> None:
+    assert live_tiles(torch.ones(40, 64, dtype=torch.bool), (0, 0, 64, 40)).shape == (
+        40 // TILE_H,
+        64 // TILE_W,
+    )
+    assert live_tiles(torch.ones(1, 1, dtype=torch.bool), (64, 40, 65, 41)).nonzero().tolist() == [[5, 2]]
+
+
+def test_needles_beyond_the_edge_of_an_off_centre_picture_are_not_left_out() -> None:
+    """They lie so that the projection stretches them most, beside the picture, where it is clamped."""
+    rng = torch.Generator().manual_seed(6)
+    camera = front_camera(160, 80, focal=60.0)
+    K = torch.tensor([[60.0, 0.0, 30.0], [0.0, 90.0, 65.0], [0.0, 0.0, 1.0]])
+    camera = replace(camera, K=K)
+    slopes = 8 * torch.rand(400, 2, generator=rng) - 4
+    depths = 1 + 2 * torch.rand(400, 1, generator=rng)
+    means = torch.cat([slopes * depths, depths], dim=1)
+    length = slopes.norm(dim=1, keepdim=True)
+    axis = torch.nn.functional.normalize(torch.cat([slopes / length, -length], dim=1), dim=1)
+    half = torch.nn.functional.normalize(axis + torch.tensor([1.0, 0.0, 0.0]), dim=1)
+    quats = torch.cat([torch.zeros(400, 1), half], dim=1)  # a half turn that takes x to the axis
+    scales = torch.tensor([[1.0, 1e-3, 1e-3]]) * (0.05 + torch.rand(400, 1, generator=rng))
+    _, _, found = rasterize(
+        means, quats, scales, torch.full((400,), 0.99), torch.zeros(400, 3), camera.viewmat, K, 160, 80,
+    )  # fmt: skip
+    every = torch.ones(80 // TILE_H, 160 // TILE_W, dtype=torch.bool)
+    assert 20 < int(found.visible.sum()) < 380
+    assert not bool((found.visible & ~reaching(means, scales, camera, every)).any())
 
 
 def _cases() -> dict[str, Callable[[], object]]:

@@ -96,5 +96,4 @@ def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor, near: 
     sums[1:, 1:] = live.long().cumsum(0).cumsum(1)
     (left, top), (right, bottom) = low.unbind(1), high.unbind(1)
     found = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    inside = (right > left) & (bottom > top)
-    return inside & (found > 0)
+    return found > 0

@@ -1,0 +1,70 @@
+"""Values in a table read from JSON, checked: what is wrong is told with its place, its name and what it is.
+
+`where` is how a message begins: "camera 3 of cameras.json".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+
+
+def table_at(where: str, entry: object) -> Mapping[str, Any]:
+    """The entry, which must be a JSON object."""
+    if not isinstance(entry, dict):
+        raise ProgdfError(f"{where} is no JSON object; export the cameras again")
+    return entry
+
+
+def number_at(where: str, table: Mapping[str, Any], key: str) -> float:
+    """A number that is finite in float32."""
+    value = table.get(key)
+    if not _is_number(value):
+        raise ProgdfError(f"{where} has {key} = {_shown(value)}; a number would be right")
+    return float(table[key])
+
+
+def angle_at(where: str, table: Mapping[str, Any], key: str) -> float:
+    """A field of view in radians, between 0 and pi."""
+    angle = number_at(where, table, key)
+    if not 0 < angle < math.pi:
+        raise ProgdfError(f"{where} has {key} = {angle:g}; an angle between 0 and pi would be right")
+    return angle
+
+
+def pixels_at(where: str, table: Mapping[str, Any], key: str) -> int:
+    """A whole number of pixels, from 1 to a million."""
+    number = number_at(where, table, key)
+    if number != round(number) or not 1 <= number <= 1_000_000:
+        raise ProgdfError(f"{where} has {key} = {number:g}; a whole number of pixels would be right")
+    return int(number)
+
+
+def matrix_at(where: str, table: Mapping[str, Any], key: str, rows: tuple[int, ...], columns: int) -> Tensor:
+    """Rows of numbers, as many as one of `rows`, each of so many columns. [R,C] float64"""
+    value = table.get(key)
+    good = (
+        isinstance(value, list)
+        and len(value) in rows
+        and all(isinstance(row, list) and len(row) == columns for row in value)
+        and all(_is_number(x) for row in value for x in row)
+    )
+    if not good:
+        shape = " or ".join(f"{count}x{columns}" for count in rows)
+        raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers would be right")
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def _is_number(value: object) -> bool:
+    """Finite, and within what float32 can hold (JSON has integers of any length)."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
+
+
+def _shown(value: object) -> str:
+    return "nothing" if value is None else repr(value)[:40]
