@@ -1,8 +1,9 @@
 """The .gdf file: one region's edit, bound to its scene. The only contract of trainer and viewer.
 
-On disk it is a safetensors file whose metadata hold one JSON header, `progdf`, and a SHA-256 of that header
-and of every tensor's name, type, shape and bytes. Nothing in it is ever executed, and a file that is not
-exactly what was saved is refused with one line.
+On disk it is a safetensors file whose metadata hold one JSON header, `progdf`, a SHA-256 of that header and
+of every tensor's name, type and shape, and another of these and of every tensor's bytes. So a file is opened
+by its header alone, and its numbers are checked when they are read. Nothing in it is ever executed, and a
+file that is not exactly what was saved is refused with one line.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from dataclasses import field as default
-from pathlib import Path
 from typing import Any
 
 import safetensors
@@ -28,24 +28,18 @@ from progdf.field.baked import BakedField
 from progdf.field_packing import packed_field, unpacked_field
 from progdf.files import open_failure, written_whole
 from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
+from progdf.gdf_head import (
+    FORMAT,
+    GdfHead,
+    SceneFingerprint,
+    contradiction,
+    damaged,
+    head_checksum,
+    read_head,
+)
 from progdf.region import Region
 from progdf.region_packing import packed_region, unpacked_region
-from progdf.tensor_file import write_tensors
-
-FORMAT = 2
-"""Newest version of the file format; those down to 1 are read. A file states the oldest that can hold it: 1,
-or 2 where it keeps a network."""
-
-MOST_GAUSSIANS = 1 << 28
-"""A header that claims a larger scene is not believed: the score would take gigabytes."""
-
-
-@dataclass(frozen=True)
-class SceneFingerprint:
-    """What binds a .gdf to its scene: number of Gaussians and SHA-256 of the means (float32 bytes)."""
-
-    count: int
-    means_sha256: str
+from progdf.tensor_file import table_of, write_tensors
 
 
 @dataclass(frozen=True)
@@ -100,17 +94,27 @@ def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "th
     Raises:
         ProgdfError: it was made for another scene.
     """
-    name = gdf_name or gdf.name
-    other = f"{name} was made for another scene"
-    if gdf.scene.count != len(scene):
-        raise ProgdfError(
-            f"{other}: it has {_grouped(gdf.scene.count)} Gaussians, {scene_name} has {_grouped(len(scene))}"
-        )
-    if gdf.scene.means_sha256 != fingerprint(scene).means_sha256:
-        raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other places")
+    _verify(gdf.scene, scene, gdf_name or gdf.name, scene_name)
+    _verify_channels(gdf, scene, gdf_name or gdf.name, scene_name)
+
+
+def _verify_channels(gdf: Gdf, scene: Gaussians, name: str, scene_name: str) -> None:
     channels = BASE_CHANNELS + 3 * scene.shN.shape[1]
     if gdf.field.channels not in (BASE_CHANNELS, channels):
-        raise ProgdfError(f"{other}: {scene_name} has SH degree {scene.sh_degree}, the edit another")
+        raise ProgdfError(
+            f"{name} was made for another scene: {scene_name} has SH degree {scene.sh_degree}, "
+            "the edit another"
+        )
+
+
+def _verify(made_for: SceneFingerprint, scene: Gaussians, name: str, scene_name: str) -> None:
+    other = f"{name} was made for another scene"
+    if made_for.count != len(scene):
+        raise ProgdfError(
+            f"{other}: it has {_grouped(made_for.count)} Gaussians, {scene_name} has {_grouped(len(scene))}"
+        )
+    if made_for.means_sha256 != fingerprint(scene).means_sha256:
+        raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other places")
 
 
 def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
@@ -128,11 +132,12 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = json.dumps(
         {
-            "format": 1 if gdf.field.origin is None else 2,
+            "format": 1 if gdf.field.origin is None else FORMAT,
             "name": gdf.name,
             "instruction": gdf.instruction,
             "scene": {"count": gdf.scene.count, "means_sha256": gdf.scene.means_sha256},
             "region": gdf.region.name,
+            "members": len(gdf.region),
             "field": described,
             "options": _plain(gdf.options),
             "report": _plain(gdf.report),
@@ -140,7 +145,11 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ensure_ascii=False,
         allow_nan=False,
     )
-    metadata = {"progdf": header, "sha256": _checksum(header, tensors)}
+    metadata = {
+        "progdf": header,
+        "header_sha256": head_checksum(header, table_of(tensors)),
+        "sha256": _checksum(header, tensors),
+    }
     try:
         with written_whole(path) as beside:
             write_tensors(beside, tensors, metadata)
@@ -164,10 +173,13 @@ def load_gdf(
         ProgdfError: it is no .gdf, from a newer version, damaged, or made for another scene; or it keeps a
             network and no scene is given.
     """
-    name = Path(path).name
-    gdf = peek_gdf(path)
+    head = read_head(path)
+    name = head.path.name
     if scene is not None:
-        verify(gdf, scene, name, scene_name)
+        _verify(head.scene, scene, name, scene_name)
+    gdf = _read(head)
+    if scene is not None:
+        _verify_channels(gdf, scene, name, scene_name)
     if gdf.field.origin is None:
         return gdf
     if scene is None:
@@ -180,98 +192,59 @@ def load_gdf(
     try:
         return replace(gdf, field=gdf.field.origin.baked(rows))
     except (ValueError, RuntimeError) as error:
-        raise _contradiction(name, error) from error
+        raise contradiction(name, error) from error
 
 
-def peek_gdf(path: str | os.PathLike[str]) -> Gdf:
-    """What a file holds, to be told and not to be run: a network stays as it is and moves nothing.
+def open_gdf(path: str | os.PathLike[str]) -> GdfHead:
+    """What a file holds, to be told and not to be run: reads its header only.
+
+    Files from before headers had a checksum of their own are read and checked as a whole.
 
     Raises:
-        ProgdfError: see `load_gdf`.
+        ProgdfError: it is no .gdf, from a newer version, or what was read of it is damaged.
     """
-    name = Path(path).name
+    head = read_head(path)
+    if head.verified and head.members is not None:
+        return head
+    return replace(head, verified=True, members=len(_read(head).region))
+
+
+def _read(head: GdfHead) -> Gdf:
+    """The whole edit, every byte checked; a network stays as it is and moves nothing."""
     try:
-        content = Path(path).read_bytes()
+        content = head.path.read_bytes()
     except OSError as error:
-        raise open_failure(path, error) from error
-    header, tensors = _parsed(name, content)
-    try:
-        return _assembled(json.loads(header), tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise _contradiction(name, error) from error
-
-
-def _contradiction(name: str, error: Exception) -> ProgdfError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return ProgdfError(f"{name} does not hold together ({reason}); make it again with progdf train")
-
-
-def _parsed(name: str, content: bytes) -> tuple[str, dict[str, Tensor]]:
-    """The JSON header and the tensors of a file that is what was saved."""
-    damaged = ProgdfError(f"{name} is damaged: its checksum does not fit; copy it again or make it again")
-    size = int.from_bytes(content[:8], "little")
-    if len(content) < 8 or not 2 <= size <= 100_000_000 or content[8:9] != b"{":
-        raise ProgdfError(f"{name} is not a .gdf file; give one that progdf train or progdf fit has written")
-    if 8 + size > len(content):
-        raise ProgdfError(f"{name} is cut short: {len(content)} bytes are not even its header; copy it again")
-    try:
-        outer = json.loads(content[8 : 8 + size])
-        metadata = outer.get("__metadata__", {})
-        header = metadata.get("progdf")
-        ends = [entry["data_offsets"][1] for key, entry in outer.items() if key != "__metadata__"]
-        needed = 8 + size + max(ends, default=0)
-    except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError):
-        raise damaged from None
-    if not isinstance(header, str):
-        raise ProgdfError(
-            f"{name} is a safetensors file, but not a .gdf; give one that progdf train has written"
-        )
-    version = _version(header)
-    if version is None:
-        raise damaged
-    if version > FORMAT:
-        raise ProgdfError(f"{name} has format {version}, this progdf reads up to {FORMAT}; update progdf")
-    if isinstance(needed, int) and needed > len(content):
-        raise ProgdfError(
-            f"{name} is cut short: it has {len(content)} of {needed} bytes; copy it again or make it again"
-        )
+        raise open_failure(head.path, error) from error
     try:
         tensors: dict[str, Tensor] = safetensors.torch.load(content)
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError, OverflowError):
-        raise damaged from None
-    if _checksum(header, tensors) != metadata.get("sha256"):
-        raise damaged
-    return header, tensors
-
-
-def _version(header: str) -> int | None:
-    """The format a header states; None where it states none."""
+        raise damaged(head.path.name) from None
+    if _checksum(head.text, tensors) != head.sha256:
+        raise damaged(head.path.name)
     try:
-        version = json.loads(header)["format"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return version if isinstance(version, int) and version >= 1 else None
+        return _assembled(head, tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise contradiction(head.path.name, error) from error
 
 
-def _assembled(header: dict[str, Any], tensors: dict[str, Tensor]) -> Gdf:
-    scene = SceneFingerprint(int(header["scene"]["count"]), str(header["scene"]["means_sha256"]))
-    if not 0 <= scene.count <= MOST_GAUSSIANS:
-        raise ValueError(f"a scene of {scene.count} Gaussians")
+def _assembled(head: GdfHead, tensors: dict[str, Tensor]) -> Gdf:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} has a number that is not finite")
-    field, form = unpacked_field(header["field"], tensors)
-    region = unpacked_region(str(header["region"]), tensors, scene.count)
+    field, form = unpacked_field(head.field, tensors)
+    region = unpacked_region(head.region, tensors, head.scene.count)
+    if head.members is not None and head.members != len(region):
+        raise ValueError(f"the header tells of {head.members} members, the region has {len(region)}")
     if form is not None and form.network.members != len(region):
         raise ValueError(f"the network has {form.network.members} members, the region {len(region)}")
     return Gdf(
-        name=str(header["name"]),
+        name=head.name,
         region=region,
         field=field,
-        scene=scene,
-        instruction=str(header["instruction"]),
-        options=dict(header["options"]),
-        report=dict(header["report"]),
+        scene=head.scene,
+        instruction=head.instruction,
+        options=head.options,
+        report=head.report,
     )
 
 

@@ -13,10 +13,10 @@ import tyro
 
 from progdf import session_file
 from progdf.camera_files import load_cameras
-from progdf.checkpoint import peek_gdf
+from progdf.checkpoint import open_gdf
 from progdf.errors import ProgdfError
-from progdf.field import BakedField
 from progdf.files import open_failure
+from progdf.gdf_head import GdfHead
 from progdf.load_report import counted, file_size, grouped
 from progdf.ply import load_ply_with_report
 from progdf.survey import survey
@@ -78,16 +78,16 @@ def _scene_lines(path: Path) -> Iterator[str]:
 
 
 def _edit_lines(path: Path) -> Iterator[str]:
-    gdf = peek_gdf(path)
-    members, count = len(gdf.region), gdf.scene.count
-    yield f"{path.name}: the edit '{gdf.name}', {file_size(path.stat().st_size)}"
+    gdf = open_gdf(path)
+    members, count = gdf.members or 0, gdf.scene.count
+    yield f"{path.name}: the edit '{gdf.name}', {file_size(gdf.size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
     yield f"scene: {counted(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-    yield f"region: {gdf.region.name}, {counted(members)} ({members / count:.1%})"
-    yield f"field: {gdf.field.kind}, {gdf.field.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf.field)}"
-    if gdf.field.recorded:
-        yield f"recorded: {len(gdf.field.recorded)} snapshots"
+    yield f"region: {gdf.region}, {counted(members)} ({members / max(1, count):.1%})"
+    yield f"field: {gdf.field['kind']}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf)}"
+    if gdf.field["recorded"]:
+        yield f"recorded: {len(gdf.field['recorded'])} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
         given = {name: value for name, value in content.items() if head == "report" or value is not None}
         for name, value in _flat(given):
@@ -120,17 +120,16 @@ def _timeline_lines(path: Path) -> Iterator[str]:
     yield f"keys at frames: {_shown(keys)}"
 
 
-def _form(field: BakedField) -> str:
+def _form(gdf: GdfHead) -> str:
     """What a field is made of."""
-    if field.origin is None:
-        bases = ", ".join(f"{name} {1 + part.rest.shape[0]}" for name, part in field.attributes.items())
-        return f"{len(field.nodes)} nodes; bases: {bases or 'none, nothing moves'}"
-    network, plan = field.origin.network, field.origin.plan
-    bases = ", ".join(f"{name} {1 + rank}" for name, rank in plan.ranks.items())
-    error = ", ".join(f"{name} {value:.4g}" for name, value in (field.origin.error or {}).items())
+    bases = ", ".join(f"{name} {count}" for name, count in gdf.bases().items())
+    if "network" not in gdf.field:
+        return f"{gdf.nodes} nodes; bases: {bases or 'none, nothing moves'}"
+    network = gdf.field["network"]
+    error = ", ".join(f"{name} {value:.4g}" for name, value in network["bake_error"].items())
     return (
-        f"{grouped(network.parameters)} numbers in {network.shape.layers} layers of {network.shape.width}; "
-        f"baked at {len(plan.nodes)} nodes with bases: {bases}; baking costs: {error}"
+        f"{grouped(gdf.parameters)} numbers in {network['shape']['layers']} layers of "
+        f"{network['shape']['width']}; baked at {gdf.nodes} nodes with bases: {bases}; baking costs: {error}"
     )
 
 

@@ -26,6 +26,15 @@ _TYPES = {
 }
 
 
+def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Shape and type of each tensor, as a file's header calls them.
+
+    Raises:
+        KeyError: a tensor of another type than those above.
+    """
+    return {name: (tuple(tensor.shape), _TYPES[tensor.dtype]) for name, tensor in tensors.items()}
+
+
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write a safetensors file: header size (8 bytes, little endian), JSON header, the tensors' bytes.
 

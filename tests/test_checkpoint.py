@@ -21,6 +21,7 @@ from progdf.checkpoint import (
     _checksum,
     fingerprint,
     load_gdf,
+    open_gdf,
     save_gdf,
     verify,
 )
@@ -287,3 +288,64 @@ def test_flipped_or_missing_bytes_give_the_same_edit_or_one_line(
     except ProgdfError as error:
         refused = str(error)
     assert "\n" not in refused if refused else same(found, shirt)
+
+
+# ---- files that are opened by their header
+
+
+def header_size(path: Path) -> int:
+    return 8 + int.from_bytes(path.read_bytes()[:8], "little")
+
+
+def test_an_edit_is_told_from_its_header_alone(saved: Path, shirt: Gdf, tmp_path: Path) -> None:
+    path = tmp_path / "shirt.gdf"
+    whole = saved.read_bytes()
+    path.write_bytes(whole[: header_size(saved)] + bytes(len(whole) - header_size(saved)))
+    head = open_gdf(path)
+    assert (head.name, head.instruction, head.scene) == (shirt.name, shirt.instruction, shirt.scene)
+    assert (head.options, head.report) == (shirt.options, shirt.report)
+    assert head.members == len(shirt.region)
+    assert head.bytes_per_member == shirt.field.bytes_per_member
+    assert head.nodes == len(shirt.field.nodes)
+    assert head.bases() == {name: 1 + len(bases.rest) for name, bases in shirt.field.attributes.items()}
+    with pytest.raises(ProgdfError, match="is damaged"):
+        load_gdf(path)
+
+
+def test_every_flipped_byte_of_a_header_is_noticed_when_it_is_opened(
+    saved: Path, shirt: Gdf, tmp_path: Path
+) -> None:
+    whole = saved.read_bytes()
+    told = open_gdf(saved)
+    for place in range(0, header_size(saved), 7):
+        content = bytearray(whole)
+        content[place] ^= 1 << (place % 8)
+        path = written(tmp_path, bytes(content))
+        try:
+            head = open_gdf(path)
+        except ProgdfError:
+            continue
+        assert replace(head, path=told.path, sha256=told.sha256) == told, place
+
+
+def test_an_edit_of_another_scene_is_refused_before_its_numbers_are_read(
+    saved: Path, scene: Gaussians, tmp_path: Path
+) -> None:
+    whole = saved.read_bytes()
+    path = written(tmp_path, whole[: header_size(saved)] + bytes(len(whole) - header_size(saved)))
+    with pytest.raises(ProgdfError, match="made for another scene"):
+        load_gdf(path, replace(scene, means=scene.means + 1))
+
+
+def test_a_file_without_a_checksum_of_its_header_is_checked_as_a_whole(saved: Path, tmp_path: Path) -> None:
+    path = rewritten(saved, tmp_path, name="shirt")  # as files were written before
+    assert open_gdf(path).members == 40
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(ProgdfError, match="is damaged"):
+        open_gdf(path)
+
+
+def test_a_header_that_tells_of_other_members_is_refused(saved: Path, tmp_path: Path) -> None:
+    assert "tells of 41 members" in refusal(rewritten(saved, tmp_path, members=41))
