@@ -84,6 +84,9 @@ def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
     assert asks == {"colour": 8, "style": 1, "geometry": 8}
     assert stages_to_ask(settled(asked("--stages", "4")), "style") == 4
     assert stages_to_ask(settled(asked("--quick")), "colour") == 4
+    assert stages_to_ask(settled(asked("--steps", "200")), "colour") == 4, "a stage needs its steps"
+    assert stages_to_ask(settled(asked("--steps", "320")), "colour") == 8
+    assert stages_to_ask(settled(asked("--steps", "32")), "style") == 1
     assert stages_to_ask(settled(asked("--quick", "--stages", "2")), "colour") == 2
 
 

@@ -40,7 +40,7 @@ from progdf.gaussians import BASE_CHANNELS
 from trainer.editors.base import EditKind
 from trainer.groups import GROWTH
 from trainer.objective import LossWeights, Sharpness
-from trainer.options import MOST_STAGES, QUICK_STAGES, TrainOptions
+from trainer.options import MOST_STAGES, QUICK_STAGES, STAGE_STEPS, TrainOptions
 from trainer.pgs import PgsSettings, learning_rates
 
 PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"colour": 0.1, "style": 0.3, "geometry": 0.3}
@@ -51,7 +51,9 @@ STAGES: dict[EditKind, int] = {"colour": MOST_STAGES, "style": 1, "geometry": MO
 
 def stages_to_ask(options: TrainOptions, kind: EditKind) -> int:
     """How many strengths an editor is asked for that pictures any."""
-    return options.stages or min(STAGES[kind], QUICK_STAGES if options.quick else STAGES[kind])
+    most = STAGES[kind]
+    hurried = options.quick or options.steps < STAGE_STEPS * most
+    return options.stages or min(most, QUICK_STAGES if hurried else most)
 
 
 def loss_weights(options: TrainOptions, kind: EditKind) -> LossWeights:
