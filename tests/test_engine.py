@@ -144,7 +144,11 @@ def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
         view = replace(view, layers=(view.layers[SCARF], painted))
         apart = np.abs(by_gpu.image(view, SIZE) - by_cpu.image(view, SIZE))
         assert float((apart**2).mean()) <= 1e-10, "100 dB; on llvmpipe they are the same"
-        assert by_gpu.edit_error() <= 1e-6
+        found = by_gpu.edits()
+        assert found is not None
+        assert found.where == "gpu"
+        assert found.error <= 1e-6
+        assert by_cpu.edits() is None
         for name in ATTRIBUTES:
             assert torch.equal(getattr(by_gpu.gaussians(view), name), getattr(by_cpu.gaussians(view), name))
     by_gpu.release()
@@ -171,9 +175,10 @@ def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why
     monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
     engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
     assert engine.edits_with == "cpu"
-    assert "too large" in engine.edit_obstacle
+    found = engine.edits()
+    assert found is not None
+    assert "too large" in found.obstacle
     expected = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="cpu")
-    assert expected.edit_obstacle == ""
     view = view_of(stack, 0.6, 0.6)
     assert np.array_equal(engine.image(view, SIZE), expected.image(view, SIZE))
     engine.release()

@@ -12,6 +12,7 @@ from imgui_bundle import imgui
 from PIL import Image
 from ui_rig import Rig, bear, first_view, rig
 
+from viewer.gl import edit_pass
 from viewer.inputs import Keys, Press
 from viewer.state import LayerState
 from viewer.turntable import axes, eye, frame
@@ -330,6 +331,23 @@ def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
     names = [name.strip() for name, _ in hand.stage.figures()]
     assert {"frame", "sort", "draw", "slider p50 / p95", "splats"} <= set(names)
     assert hand.stage.canvas.timings.total_ms > 0.0
+
+
+def test_f10_tells_the_error_of_the_gpus_edit_pass_or_why_the_cpu_does_its_work(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with rig(draw="gl", edit_pass="gpu") as by_gpu:
+        told = {name.strip(): figure for name, figure in by_gpu.stage.figures()}
+        assert told["edited by"].startswith("GPU, ")
+        assert "edit pass" in told
+        assert "upload" not in told
+    monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
+    with rig(draw="gl", edit_pass="gpu") as stood_back:
+        told = {name.strip(): figure for name, figure in stood_back.stage.figures()}
+        assert told["edited by"] == "CPU: the edits are too large for a texture of this GPU"
+        assert "upload" in told
+    with rig() as by_cpu:
+        assert "edited by" not in dict(by_cpu.stage.figures())
 
 
 def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> None:

@@ -19,7 +19,7 @@ from progdf.checkpoint import Gdf
 from progdf.compose_effects import Effects, changed_edits, effects_of
 from progdf.composer import Composer
 from progdf.gaussians import Gaussians
-from progdf.layers import Layer, check_layers
+from progdf.layers import Layer
 
 from .edit_sample import EditSample
 from .painters import GlPainter, Painter
@@ -139,10 +139,9 @@ class GpuEditing:
     def bring(self, stack: Stack, blend: str) -> Step:
         started = time.perf_counter()
         active = [(edit, layer) for edit, layer in stack if layer.active]
-        check_layers([layer for _, layer in stack], blend)
+        moved = self._means.update([replace(layer, gdf=self._movers[edit]) for edit, layer in stack], blend)
         effects = effects_of(active, blend)
         changed = changed_edits(self._effects, effects)
-        moved = self._means.update([replace(layer, gdf=self._movers[edit]) for edit, layer in stack], blend)
         composed = time.perf_counter()
         rows = self._pass.run(active, blend, changed) if changed else ()
         self._painter.finish()

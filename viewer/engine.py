@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
 from progdf.errors import ProgdfError
+from progdf.framing import near_plane
 from progdf.gaussians import Gaussians
 from progdf.layers import Gains
 
@@ -27,7 +28,7 @@ from .gl.edit_pass import EditPassError
 from .headless import is_software
 from .paint import layer_of
 from .painters import GlPainter, Image, Painter
-from .sort import back_to_front, near_plane
+from .sort import back_to_front
 from .stack import shown
 from .state import ViewState
 from .tint import Tint, tints
@@ -62,6 +63,22 @@ class FrameTimings:
     @property
     def total_ms(self) -> float:
         return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms
+
+
+@dataclass(frozen=True)
+class EditsBy:
+    """What worked out the attributes on screen, and how well.
+
+    Args:
+        where: "gpu" (the edit pass) or "cpu"
+        error: how far the attributes are from `progdf.compose`, in a sample that was read back: the largest
+            difference of a raw number, relative to it where it is larger than 1
+        obstacle: why the CPU does it though the GPU was wanted
+    """
+
+    where: str
+    error: float = 0.0
+    obstacle: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,8 +147,7 @@ class Engine:
         self._tinted: tuple[Tint, NDArray[np.uint8]] | None = None  # and the tints of its members
         if edit_pass == "gpu" and self.draws_with == "cpu":
             raise ProgdfError("the CPU draws here, so the GPU cannot edit; ask for drawing by OpenGL too: gl")
-        self.edit_obstacle = ""
-        """Why the CPU composes though the GPU's edit pass was wanted; empty where that is not so."""
+        self._edit_obstacle = ""
         self._edit_error: float | None = None
         wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))
         self._painter, self._editing = self._made(wants_pass and self.draws_with == "gl")
@@ -189,15 +205,16 @@ class Engine:
         return self._editing.where
 
     def edit_error(self) -> float:
-        """How far the attributes that are drawn are from `progdf.compose`, in a sample that is read back.
-
-        Returns:
-            The largest difference of a raw number, relative to it where it is larger than 1; 0 where the CPU
-            composes.
-        """
+        """How far the attributes that are drawn are from `progdf.compose`: see `EditsBy.error`."""
         if self._edit_error is None:
             self._edit_error = self._editing.error(*self._stack(self._edits))
         return self._edit_error
+
+    def edits(self) -> EditsBy | None:
+        """What worked out the attributes that are drawn; None where the CPU did, and nobody wanted more."""
+        if self.edits_with == "gpu":
+            return EditsBy("gpu", self.edit_error())
+        return EditsBy("cpu", obstacle=self._edit_obstacle) if self._edit_obstacle else None
 
     def forget(self) -> None:
         """Draw the next picture as a whole, though only a part of the last one has changed."""
@@ -220,7 +237,7 @@ class Engine:
                 return by_gl, GpuEditing(by_gl, self.scene, self.gdfs)
             except EditPassError as error:
                 by_gl.release()
-                self.edit_obstacle = str(error)
+                self._edit_obstacle = str(error)
         painter = GlPainter(self.ctx)
         return painter, CpuEditing(painter, self.scene, self.gdfs)
 
@@ -239,9 +256,8 @@ class Engine:
         if wanted == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
+        dye_ms = self._dye(tint)
         started = time.perf_counter()
-        self._dye(tint)
-        dyed = time.perf_counter()
         if self._painter.wants_order and self._ordered_for != wanted.viewmat:
             self._order = back_to_front(self._editing.means, camera, self.near)
             self._ordered_for = wanted.viewmat
@@ -251,8 +267,8 @@ class Engine:
         self._picture = wanted
         return FrameTimings(
             compose_ms,
-            upload_ms + 1e3 * (dyed - started),
-            1e3 * (sorted_at - dyed),
+            upload_ms + dye_ms,
+            1e3 * (sorted_at - started),
             1e3 * (drawn_at - sorted_at),
             changed,
             len(self._order) if self._painter.wants_order else len(self.scene),
@@ -272,10 +288,11 @@ class Engine:
             self._ordered_for = None
         return unpacked_ms + step.compose_ms, step.upload_ms, step.changed
 
-    def _dye(self, tint: Tint | None) -> None:
-        """Bring the tints up to date; the painter hears of those alone that are others than before."""
+    def _dye(self, tint: Tint | None) -> float:
+        """Bring the tints up to date, those alone that are others than before; gives the ms it took."""
         if tint == (self._tinted and self._tinted[0]):
-            return
+            return 0.0
+        started = time.perf_counter()
         if self._tinted is not None and (tint is None or tint.gdf != self._tinted[0].gdf):
             last, shown = self._tinted
             self._tinted = None
@@ -286,6 +303,7 @@ class Engine:
             others = slice(None) if self._tinted is None else (new != self._tinted[1]).any(1)
             self._tinted = tint, new
             self._painter.tint(members[others], new[others])
+        return 1e3 * (time.perf_counter() - started)
 
     def _stack(self, edits: _Edits) -> tuple[Stack, str]:
         """The layers and the blend rule of what was asked for."""

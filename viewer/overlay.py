@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from imgui_bundle import imgui
 
-from .engine import FrameTimings
+from .engine import EditsBy, FrameTimings
 from .ui_context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32
 from .widgets import grouped
 from .workspace import Message
@@ -29,6 +29,7 @@ def figures(
     draws_with: str,
     size: tuple[int, int],
     pixels: int = 1,
+    edits: EditsBy | None = None,
 ) -> list[tuple[str, str]]:
     """Names and figures of a picture.
 
@@ -39,11 +40,13 @@ def figures(
         draws_with: "gl" or "cpu"
         size: of the picture as drawn: width, height
         pixels: of the window that each of its pixels fills, each way; more than 1 while it is coarse
+        edits: where the attributes were worked out; None where the CPU does it as a matter of course
     """
+    by_gpu = edits is not None and edits.where == "gpu"
     lines = [
         ("frame", f"{timings.total_ms:.1f} ms"),
         ("  compose", f"{timings.compose_ms:.1f} ms"),
-        ("  upload", f"{timings.upload_ms:.1f} ms"),
+        ("  edit pass" if by_gpu else "  upload", f"{timings.upload_ms:.1f} ms"),
         ("  sort", f"{timings.sort_ms:.1f} ms"),
         ("  draw", f"{timings.draw_ms:.1f} ms"),
         ("redrawn", f"{100 * timings.share:.0f} %"),
@@ -53,7 +56,12 @@ def figures(
         median, late = np.percentile(latencies_ms, (50, 95))
         lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
     lines.append(("splats", f"{grouped(timings.drawn)} of {grouped(count)}"))
-    return [*lines, ("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with])]
+    lines.append(("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with]))
+    if by_gpu and edits is not None:
+        lines.append(("edited by", f"GPU, ±{edits.error:.1g}" if edits.error else "GPU, exactly"))
+    elif edits is not None:
+        lines.append(("edited by", f"CPU: {edits.obstacle}"))
+    return lines
 
 
 def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:

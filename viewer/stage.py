@@ -230,7 +230,8 @@ class Stage:
         """What the overlay shows of the picture on screen."""
         pixels, count, by = self.canvas.pixels, self.facts.count, self.engine.draws_with
         drawn = drawn_size(self._sight().size, pixels)
-        return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels)
+        edits = self.engine.edits()
+        return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels, edits)
 
     @property
     def drawn(self) -> int:
