@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from . import paint, stack
 from .state import ViewState
 
-SHARE = 0.8
+SHARE = 0.75
 """Of a member's colour that the ramp takes, so that the rest still tells its shape."""
 
 RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1.0, 0xF9E558))
