@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.framing import front, guess_up, is_surrounding, scene_sphere
+from progdf.framing import NEAR, front, guess_up, is_surrounding, scene_sphere
 from progdf.gaussians import Gaussians
 from progdf.lens import Lens
 
@@ -33,6 +33,7 @@ class Camera:
         height: image height in pixels, ≥ 1
         name: where it came from, for messages and file names
         lens: what bends photographs that this camera took; a render is straight, so nothing that draws asks
+        near: depth at and below which a training draws nothing, world units, see `framing.near_plane`
 
     Raises:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite.
@@ -44,6 +45,7 @@ class Camera:
     height: int
     name: str = ""
     lens: Lens | None = None
+    near: float = NEAR
 
     def __post_init__(self) -> None:
         for name, side in (("viewmat", 4), ("K", 3)):

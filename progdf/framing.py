@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 _SAMPLE = 100_000
 """Rows that are looked at; a scene with more is sampled evenly."""
 
+NEAR = 0.01
+"""Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
+
 _LONG_TAIL = 5.0
 _CEILING_COVER = 0.8
 _LEAST_CELLS = 16
@@ -37,6 +40,14 @@ def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
     nearest = max(round(0.97 * len(means)), 1)
     size = 2 * float(scene.log_scales.amax(dim=1).median().exp())
     return centre, max(float(distances.kthvalue(nearest).values), size, 1e-6)
+
+
+def near_plane(radius: float) -> float:
+    """Least depth at which a scene is drawn whose bulk has this radius, both in world units.
+
+    `NEAR` down to a radius of 1, as trainings draw; smaller scenes would vanish before it.
+    """
+    return NEAR * min(1.0, radius)
 
 
 def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:

@@ -106,6 +106,7 @@ class _Sight:
             camera.width,
             camera.height,
             background=torch.zeros(3),
+            near=camera.near,
             crop=scene.box,
             grad_rows=scene.rows,
         )[0]

@@ -102,6 +102,7 @@ class CropScene:
             camera.width,
             camera.height,
             background=self.background,
+            near=camera.near,
             crop=self.box,
             grad_rows=self.rows,
         )
@@ -155,6 +156,7 @@ def crop_scene(
         camera.width,
         camera.height,
         background=background,
+        near=camera.near,
         crop=box,
     )
     kept = seen.visible.clone()

@@ -141,7 +141,8 @@ def visibility(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Tens
     """
     total = torch.zeros(len(members))
     for view in views:
-        total += alpha_weights(scene, view.camera, torch.ones_like(view.mask))[members, 2].float()
+        camera, everywhere = view.camera, torch.ones_like(view.mask)
+        total += alpha_weights(scene, camera, everywhere, near=camera.near)[members, 2].float()
     return total / total.mean().clamp_min(1e-12) + 1e-3
 
 

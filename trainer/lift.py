@@ -58,7 +58,7 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     sums = torch.zeros(len(scene), 4, dtype=torch.float64)
     mean_weight = torch.zeros(len(scene))
     for camera, mask in zip(cameras, masks, strict=True):
-        found = alpha_weights(scene, camera, mask)
+        found = alpha_weights(scene, camera, mask, near=camera.near)
         sums += found
         mean_weight = torch.maximum(mean_weight, found[:, 2] / found[:, 3].clamp_min(1.0))
     # the mean α of a Gaussian of opacity o over the ellipse {α ≥ 1/255}, where nothing covers it

@@ -20,7 +20,7 @@ from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.progress import Advance
 from trainer.view_choice import choose_views, split_views
-from trainer.views import View, fit_size, named, region_rig
+from trainer.views import View, fit_size, named, near_enough, region_rig
 
 BACKGROUND = (1.0, 1.0, 1.0)
 _PROBES = 3
@@ -58,7 +58,8 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
     else:
         # half as many again, as some will find the region hidden
         cameras = region_rig(scene, region, options.views + options.views // 2, options.image_size)
-    choice = choose_views(scene, region, named(cameras), options.views, background)
+    cameras = near_enough(named(cameras), scene)
+    choice = choose_views(scene, region, cameras, options.views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [choice.line()] if len(choice.views) < choice.offered else []
     if any(view.camera.lens for view in choice.views):

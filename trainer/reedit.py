@@ -15,14 +15,13 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import pack
-from progdf.rasterize import render
 from trainer.artefacts import RunFolder
 from trainer.editors import Painter, make_editor
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.preparation import Stand, editor_settings, eight_bits, to_confine
 from trainer.progress import RunLog
-from trainer.views import crop
+from trainer.views import crop, pictured
 
 
 class Reedit:
@@ -58,7 +57,7 @@ class Reedit:
             rows = pack(stand.scene[members], with_shN=stand.scene.sh_degree > 0) + offsets
             scene = stand.scene.replace_rows(members, rows)
             with torch.no_grad():
-                renders = [render(scene, view.camera, stand.background).clamp(0, 1) for view in stand.train]
+                renders = [pictured(scene, view.camera, stand.background).clamp(0, 1) for view in stand.train]
             self._log.say(f"step {step}: the editor looks at {len(renders)} renders again")
         targets = []
         for view, now in zip(stand.train, renders, strict=True):

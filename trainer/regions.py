@@ -17,7 +17,6 @@ from progdf.camera_files import load_cameras, save_cameras
 from progdf.errors import ProgdfError
 from progdf.framing import guess_up, is_surrounding
 from progdf.gaussians import Gaussians
-from progdf.rasterize import render
 from progdf.region import Region
 from progdf.region_spec import Kind
 from trainer.artefacts import claim
@@ -27,7 +26,7 @@ from trainer.options import TrainOptions
 from trainer.preparation import BACKGROUND
 from trainer.segmenters import SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
-from trainer.views import fit_size, named, region_rig
+from trainer.views import fit_size, named, near_enough, pictured, region_rig
 
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
@@ -137,7 +136,7 @@ def _lifted(
     told = [
         (fit_size(c, LIFTED_AT), mask) for c, mask in zip(cameras, masks, strict=True) if mask is not None
     ]
-    small = [camera for camera, _ in told]
+    small = near_enough([camera for camera, _ in told], scene)
     scaled = [_scaled(mask, camera) for camera, mask in told]
     region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold)
     if not len(region):
@@ -185,9 +184,9 @@ def _segmented(
 
     kept = KeptPictures(folder)
     masks = []
-    for camera in track(cameras, description=f"segment '{prompt}'", disable=settings.quiet, transient=True):
-        with torch.no_grad():
-            picture = render(scene, camera, BACKGROUND).clamp(0.0, 1.0)
+    views = near_enough(cameras, scene)
+    for camera in track(views, description=f"segment '{prompt}'", disable=settings.quiet, transient=True):
+        picture = pictured(scene, camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
         masks.append(kept.picture(camera.name, picture, recipe, paint)[..., 0])
     return masks
 

@@ -17,7 +17,7 @@ from progdf.region import Region
 from progdf.trajectory import Trajectory, load_trajectory
 from trainer.artefacts import RunFolder
 from trainer.preparation import Stand
-from trainer.views import make_view
+from trainer.views import make_view, near_enough
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def its_views(run: FinishedRun) -> Stand:
     """The run's views, rendered; their boxes hold the region, not what an edit may show beside it."""
     background = torch.tensor(run.about["background"])
     held_out = set(run.about["held_out"])
-    cameras = load_cameras(run.folder.cameras)
+    cameras = near_enough(load_cameras(run.folder.cameras), run.scene)
     views = [make_view(run.scene, run.region, camera, background) for camera in cameras]
     return Stand(
         run.scene,

@@ -13,7 +13,7 @@ from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.ply import load_ply
-from progdf.rasterize import render, set_threads
+from progdf.rasterize import set_threads
 from progdf.region import Region
 from progdf.region_spec import parse_region
 from progdf.trajectory import load_trajectory, save_trajectory
@@ -46,6 +46,7 @@ from trainer.reopen import its_views, reopened
 from trainer.resume import kept_region, one_line, open_session, plain_options, still_there
 from trainer.settings import loss_weights, stages_to_ask
 from trainer.training import retimed, trained
+from trainer.views import pictured
 
 __all__ = ["RunResult", "refit", "train", "use_threads"]
 
@@ -230,9 +231,8 @@ def _record(
     save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(stand, trajectory))
-        with torch.no_grad():
-            views = [*stand.train, *stand.held_out]
-            finals = {v.camera.name: render(edited_scene, v.camera, stand.background) for v in views}
+        views = [*stand.train, *stand.held_out]
+        finals = {v.camera.name: pictured(edited_scene, v.camera, stand.background) for v in views}
         write_views(folder, "final", finals)
 
 

@@ -59,7 +59,7 @@ def live_pixels(live: Tensor, box: Crop) -> Tensor:
     return live.repeat_interleave(TILE_H, dim=0).repeat_interleave(TILE_W, dim=1)[y0:y1, x0:x1]
 
 
-def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor, near: float = 0.01) -> Tensor:
+def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Tensor:
     """Which Gaussians may reach into a live tile; too many rather than too few.
 
     The bound: the largest axis, through the Jacobian of the projection at the place where the rasteriser
@@ -74,7 +74,7 @@ def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor, near: 
         [n] bool
     """
     seen = means.double() @ camera.viewmat[:3, :3].T.double() + camera.viewmat[:3, 3].double()
-    z = seen[:, 2].clamp_min(near)
+    z = seen[:, 2].clamp_min(camera.near)
     K = camera.K.double()
     focal = torch.stack([K[0, 0], K[1, 1]])
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)

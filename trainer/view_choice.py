@@ -206,7 +206,7 @@ def _looked_through(
     weights = torch.zeros(len(cameras), len(rows))
     for i, camera in enumerate(cameras):
         small = fit_size(camera, _LOOK)
-        found = alpha_weights(scene, small, torch.ones(small.height, small.width))[:, 2]
+        found = alpha_weights(scene, small, torch.ones(small.height, small.width), near=small.near)[:, 2]
         cover[i] = found[region.members].sum() / (small.width * small.height)
         weights[i] = found[rows]
     return cover, weights

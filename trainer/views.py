@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at, orbit_rig
-from progdf.framing import guess_up, scene_sphere
+from progdf.framing import guess_up, near_plane, scene_sphere
 from progdf.gaussians import Gaussians
 from progdf.rasterize import Crop, rasterize
 from progdf.region import Region
@@ -100,8 +100,14 @@ def drawn(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) 
             camera.width,
             camera.height,
             background=background,
+            near=camera.near,
         )[0]
     return image
+
+
+def pictured(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
+    """The scene as it is seen from there, without gradients. [H,W,3]"""
+    return drawn(scene, seen_colors(scene, camera), camera, background)
 
 
 def region_box(mask: Tensor, margin: int = 6) -> Crop:
@@ -147,6 +153,12 @@ def region_rig(scene: Gaussians, region: Region, count: int, image_size: int) ->
         aimed = look_at(camera.position, centre, up)
         cameras.append(replace(camera, viewmat=aimed, K=intrinsics(fov, image_size, image_size)))
     return cameras
+
+
+def near_enough(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
+    """The cameras with a near plane for the size of the scene: a tiny one would vanish before a fixed one."""
+    near = near_plane(scene_sphere(scene)[1])
+    return [replace(camera, near=near) for camera in cameras]
 
 
 def fit_size(camera: Camera, image_size: int) -> Camera:

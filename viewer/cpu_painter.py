@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.framing import NEAR
 from progdf.gaussians import Gaussians
 from progdf.pixel_cells import mark_cells, no_cells
 from progdf.rasterize import Crop, rasterize
@@ -19,7 +20,6 @@ from progdf.sh import C0
 from .gl.layout import SPLATS_PER_ROW
 from .gl.present import Presenter
 from .gl.scene_textures import row_runs
-from .sort import NEAR
 from .state import Vec3
 from .touched import area, boxes
 

@@ -13,17 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
-
-NEAR = 0.01
-"""Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
-
-
-def near_plane(radius: float) -> float:
-    """Least depth for a scene whose bulk has this radius, both in world units.
-
-    `NEAR`, as trainings draw, down to a radius of 1; smaller scenes would vanish before it.
-    """
-    return NEAR * min(1.0, radius)
+from progdf.framing import NEAR
 
 
 def back_to_front(means: NDArray[np.float32], camera: Camera, near: float = NEAR) -> NDArray[np.uint32]:
