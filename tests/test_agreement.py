@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cache
 
 import pytest
@@ -11,9 +12,10 @@ from torch import Tensor
 
 from progdf.rasterize import render
 from tests.trained import WHITE, Small, small
-from trainer.agreement import Agreement, measured
+from trainer.agreement import Agreement, _best_colors, measured
 from trainer.editors import make_editor
 from trainer.preparation import Stand
+from trainer.views import crop, drawn
 
 
 @cache
@@ -111,3 +113,57 @@ def test_the_line_tells_decibels_share_and_remedy() -> None:
 def test_measuring_twice_gives_the_same_figures() -> None:
     pictures = edited("recolor:#3060d0")
     assert judged(pictures) == judged(pictures)
+
+
+def test_a_smooth_change_that_colours_can_make_is_explained() -> None:
+    case = body()
+    change = torch.zeros(len(case.scene), 3)
+    change[case.region.members] = 0.3 * case.scene.means[case.region.members, 1:2]
+    pictures = [v.image + drawn(case.scene, change, v.camera, torch.zeros(3)) for v in case.views]
+    assert judged(pictures).unexplained < 0.04, "without conjugate directions it is .055"
+
+
+@dataclass(frozen=True)
+class LinearSight:
+    """A view of which the picture is a known matrix [P,M] times the colours."""
+
+    matrix: Tensor
+    change: Tensor
+
+    def shown(self, colors: Tensor) -> Tensor:
+        return self.matrix @ colors
+
+    def gathered(self, picture: Tensor, members: int) -> Tensor:
+        return self.matrix.T @ picture
+
+
+def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trainer.agreement._DAMPING", 0.2)
+    rng = torch.Generator().manual_seed(5)
+    sights = [
+        LinearSight(torch.randn(9, 5, generator=rng), torch.randn(9, 3, generator=rng)) for _ in range(2)
+    ]
+    A, b = torch.cat([s.matrix for s in sights]), torch.cat([s.change for s in sights])
+    slope = A.T @ b
+    damping = 0.2 * (A @ slope).square().sum() / slope.square().sum()
+    expected = torch.linalg.solve(A.T @ A + damping * torch.eye(5), slope)
+    found = _best_colors(sights, 5)  # type: ignore[arg-type]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_decibels_are_of_what_the_fit_leaves_where_the_held_out_views_change() -> None:
+    count = len(stand().train)
+    pictures = [view.image for view in body().views]
+    for view, i in zip(stand().held_out, range(count, len(pictures)), strict=True):
+        pictures[i] = view.image + 0.1 * (view.mask < 0.01)[..., None]  # all around the region
+    found = judged(pictures)
+    assert found.unexplained == pytest.approx(1.0)
+    changed = sum(float(crop(v.mask < 0.01, v.box).sum()) for v in stand().held_out)
+    counted = sum(float(crop((v.mask < 0.01) | (v.mask > 0.05), v.box).sum()) for v in stand().held_out)
+    assert found.psnr == pytest.approx(20 + 10 * math.log10(counted / changed), abs=0.1)
+
+
+def test_views_that_nothing_changed_agree_with_nothing_to_explain() -> None:
+    found = judged([view.image for view in body().views])
+    assert found == Agreement(99.0, 0.0)
+    assert found.figures() == {"psnr_best": 99.0, "unexplained": 0.0, "agree": True}
