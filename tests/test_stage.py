@@ -338,7 +338,7 @@ def test_f10_tells_the_error_of_the_gpus_edit_pass_or_why_the_cpu_does_its_work(
 ) -> None:
     with rig(draw="gl", edit_pass="gpu") as by_gpu:
         told = {name.strip(): figure for name, figure in by_gpu.stage.figures()}
-        assert told["edited by"].startswith("GPU, ")
+        assert told["edited by"].startswith("GPU ±")
         assert "edit pass" in told
         assert "upload" not in told
     monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)

@@ -26,6 +26,8 @@ def run(
     size: tuple[int, int] = SIZE,
     session: Path | None = None,
     snapshots: tuple[Snapshot, ...] = (),
+    draw: str = "auto",
+    edit_pass: str = "auto",
 ) -> int:
     """Open the window and stay until it is closed.
 
@@ -36,16 +38,17 @@ def run(
         size: of the window, at 1×
         session: the file it was opened from and is saved to
         snapshots: kept states
+        draw, edit_pass: what draws and what edits, see `Engine`
 
     Returns:
         The exit status, 0.
 
     Raises:
-        ProgdfError: there is no display, or no OpenGL 3.3 on it.
+        ProgdfError: there is no display, or no OpenGL 3.3 on it; or the GPU shall edit what the CPU draws.
     """
     window = Window(_window_title(document.title), size)
     try:
-        app = App(window, document, state, pictures, session)
+        app = App(window, document, state, pictures, session, draw=draw, edit_pass=edit_pass)
         app.stage.restart(state, snapshots)
         app.desk.mention_autosave()
         try:
@@ -69,10 +72,13 @@ class App:
         pictures: Path,
         session: Path | None = None,
         memory: Path | None = None,
+        draw: str = "auto",
+        edit_pass: str = "auto",
     ) -> None:
         self.window, self.document = window, document
         self.context = window.context()
-        self.engine = Engine(self.context, document.scene, document.gdfs)
+        self._draw, self._edit_pass = draw, edit_pass
+        self.engine = self._engine(document)
         self.stage = Stage(self.context, self.engine, document.facts(), state, window.ui_scale, pictures)
         self.desk = Desk(self, session, memory)
         self._left = False
@@ -147,11 +153,14 @@ class App:
 
     def show(self, document: Document) -> None:
         """Draw another document from now on; the state is the caller's to change."""
-        engine = Engine(self.context, document.scene, document.gdfs)
+        engine = self._engine(document)
         self.engine.release()
         self.document, self.engine = document, engine
         self.stage.serve(engine, document.facts())
         self.window.rename(_window_title(document.title))
+
+    def _engine(self, document: Document) -> Engine:
+        return Engine(self.context, document.scene, document.gdfs, self._draw, self._edit_pass)
 
     def leave(self) -> None:
         """Close the window, without a question."""

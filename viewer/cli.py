@@ -33,9 +33,17 @@ def view(argv: Sequence[str]) -> int:
     found = opening.opened(options)
     from .app import run  # imgui and glfw, which render and export do without
 
-    if found.session is not None:
-        return run(found.document, found.view, session=found.session, snapshots=found.snapshots)
-    return run(found.document, replace(found.view, camera=first_camera(found.document.scene)))
+    state = found.view
+    if found.session is None:
+        state = replace(state, camera=first_camera(found.document.scene))
+    return run(
+        found.document,
+        state,
+        session=found.session,
+        snapshots=found.snapshots,
+        draw=options.engine,
+        edit_pass=options.edit_pass,
+    )
 
 
 def export(argv: Sequence[str]) -> int:

@@ -80,6 +80,11 @@ class EditsBy:
     error: float = 0.0
     obstacle: str = ""
 
+    @property
+    def told(self) -> str:
+        """In words that fit after "edited by"."""
+        return f"CPU: {self.obstacle}" if self.where == "cpu" else f"GPU ±{self.error:.1g}"
+
 
 @dataclass(frozen=True)
 class _Edits:
@@ -146,7 +151,7 @@ class Engine:
         """What `draw` shows over the members of an edit; `image` never does."""
         self._tinted: tuple[Tint, NDArray[np.uint8]] | None = None  # and the tints of its members
         if edit_pass == "gpu" and self.draws_with == "cpu":
-            raise ProgdfError("the CPU draws here, so the GPU cannot edit; ask for drawing by OpenGL too: gl")
+            raise ProgdfError("the CPU draws here, so the GPU cannot edit; add --draw gl to --edit-pass gpu")
         self._edit_obstacle = ""
         self._edit_error: float | None = None
         wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))

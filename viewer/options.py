@@ -46,6 +46,10 @@ class PictureOptions(StackOptions):
 
     background: str = "white"
     """#rrggbb, white or black."""
+    engine: Annotated[Literal["auto", "gl", "cpu"], tyro.conf.arg(aliases=["--draw"])] = "auto"
+    """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
+    edit_pass: Literal["auto", "gpu", "cpu"] = "auto"
+    """What works out the attributes of a new strength; auto takes the GPU where a graphics card draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +71,6 @@ class RenderOptions(PictureOptions):
     """What fills the picture: an edit's region, or the whole scene; else what stands in the scene."""
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
     """Pixels; else the camera's own, or 640x480."""
-    engine: Literal["auto", "gl", "cpu"] = "auto"
-    """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
     sweep: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Move this edit's slider from 0 to 1 and back: an animation."""
     sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]|N")] = None

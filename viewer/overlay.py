@@ -57,10 +57,8 @@ def figures(
         lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
     lines.append(("splats", f"{grouped(timings.drawn)} of {grouped(count)}"))
     lines.append(("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with]))
-    if by_gpu and edits is not None:
-        lines.append(("edited by", f"GPU, ±{edits.error:.1g}" if edits.error else "GPU, exactly"))
-    elif edits is not None:
-        lines.append(("edited by", f"CPU: {edits.obstacle}"))
+    if edits is not None:
+        lines.append(("edited by", edits.told))
     return lines
 
 

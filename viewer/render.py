@@ -43,19 +43,19 @@ def render(argv: Sequence[str]) -> int:
     camera = asked_camera(options, scene, gdfs, size, None if found.session is None else view.camera)
     if options.timeline is not None:
         keys, count = _keys(options, found), _count(options.sheet)
-        with _engine(scene, gdfs, options.engine) as engine:
+        with _engine(scene, gdfs, options) as engine:
             print(timeline_film.write(options.out, keys, view, camera, engine, count))
         return 0
     swept = _swept(options, found)
-    with _engine(scene, gdfs, options.engine) as engine:
+    with _engine(scene, gdfs, options) as engine:
         if swept:
             _moving(options, swept, view, camera, engine)
             told = ""
         else:
             told = _still(options, found, view, camera, engine)
-        drawn_with = engine.draws_with
+        drawn_by = _drawn_by(engine)
     each = "each " if options.sheet is not None else ""
-    print(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_with})")
+    print(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
     if told:
         print(told)
     if gdfs and not swept and not any(layer.strength for layer in view.layers):
@@ -158,22 +158,28 @@ def _showing(name: str, view: ViewState, option: str) -> str:
 
 
 @contextmanager
-def _engine(scene: Gaussians, gdfs: Sequence[Gdf], draw: str) -> Iterator[Engine]:
+def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> Iterator[Engine]:
     """An engine for pictures without a window; "auto" does without OpenGL where there is none."""
     ctx = None
-    if draw != "cpu":
+    if options.engine != "cpu":
         try:
             ctx = headless_context()
         except ProgdfError:
-            if draw == "gl":
+            if options.engine == "gl":
                 raise
-    engine = Engine(ctx, scene, gdfs, draw)
+    engine = Engine(ctx, scene, gdfs, options.engine, options.edit_pass)
     try:
         yield engine
     finally:
         engine.release()
         if ctx is not None:
             ctx.release()
+
+
+def _drawn_by(engine: Engine) -> str:
+    """The engine in words, with its edit pass if that had a part in the picture, or why it had none."""
+    edits = engine.edits()
+    return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.told}"
 
 
 def _check_output(options: RenderOptions) -> None:
