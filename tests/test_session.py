@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from null_app import null_app, press
 from PIL import Image
 from ui_rig import bear, first_view, rig
 
@@ -24,7 +25,6 @@ from progdf.ply import save_ply
 from progdf.session_file import read_session, sha256
 from viewer import app as application
 from viewer import desk, document, paint, plain, recent, session, snapshots, workspace
-from viewer.inputs import Keys, Press
 from viewer.session import Session
 from viewer.state import Comparison, Keyframe, Timeline, ViewState
 from viewer.turntable import eye, from_camera, to_camera
@@ -269,34 +269,9 @@ def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
 
 @pytest.fixture
 def window(folder: Path, saved: Path) -> Iterator[application.App]:
-    """The application with files, on a window of glfw's null platform."""
-    from viewer.window import Window, glfw
-
-    glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
-    if not glfw.init():
-        pytest.skip("glfw has no null platform here")
-    glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
-    try:
-        made = Window("test", (900, 640))
-    finally:
-        glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
-    view = first_view(bear(), 0.5, 0.5)
-    app = application.App(made, opened_document(folder), view, folder, memory=folder / "memory")
-    app.draw()
-    yield app
-    app.close()
-    made.close()
-
-
-def press(app: application.App, *chords: str) -> None:
-    """Keys as the window hears them."""
-    for chord in chords:
-        app.window.take_keys = lambda c=chord: Keys((Press(c),))  # type: ignore[method-assign]
-        app.stage.wake()
-        app.draw()
-        app.window.take_keys = lambda: Keys()  # type: ignore[method-assign]
-        for _ in range(3):
-            app.draw()
+    """The application with files."""
+    with null_app(opened_document(folder), first_view(bear(), 0.5, 0.5), folder) as app:
+        yield app
 
 
 def message(app: application.App) -> str:

@@ -88,6 +88,7 @@ class App:
         window.listen(self.stage.wake, self._remember_dropped, self._redraw)
 
     def close(self) -> None:
+        self.desk.release()
         self.stage.ui.make_current()
         imgui.backends.glfw_shutdown()
         self.stage.close()
@@ -99,7 +100,7 @@ class App:
         self.stage.greet(self.context.screen)
         self.window.present()
         while not self._left:
-            waits = [wait for wait in (self.stage.patience(), self._autosave()) if wait is not None]
+            waits = [wait for wait in self._waits() if wait is not None]
             self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
@@ -130,8 +131,10 @@ class App:
             else:
                 self.desk.serve(request)
 
-    def _autosave(self) -> float | None:
-        return self.desk.autosave(time.perf_counter())
+    def _waits(self) -> tuple[float | None, ...]:
+        """How long the next look at each part may take, seconds; None is for ever."""
+        choosing = self.desk.choosing()  # first: what was chosen wakes the stage
+        return choosing, self.stage.patience(), self.desk.autosave(time.perf_counter())
 
     def _redraw(self) -> None:
         try:

@@ -17,7 +17,7 @@ from progdf.info import kind_of
 from progdf.session_file import SUFFIX
 
 from . import document as documents
-from . import recent, session, timeline_file, workspace
+from . import native, recent, session, timeline_file, workspace
 from .document import Document
 from .playback import Player
 from .session import Session
@@ -65,6 +65,7 @@ class Desk:
         self._app, self.path, self._memory = app, path, memory
         self._due: _Due | None = None
         self._autosaved: object = None  # what the autosave file holds
+        self._browser = native.Browser()
         opened = app.document
         files = (*opened.gdf_paths, *((opened.path,) if opened.path else ()), *((path,) if path else ()))
         app.stage.recent = self._remember(*files)
@@ -78,12 +79,26 @@ class Desk:
             self._told(lambda: self.save(Path(argument).expanduser()))
         elif name == "open":
             self._app.stage.ask(Dialog("open"))
+        elif name == "browse":
+            self._browse()
         elif name == "open_file":
             self.open(Path(argument).expanduser())
         elif name == "discard":
             self._app.stage.work = workspace.as_saved(self._app.stage.work)
         elif name == "quit":
             self._leave()
+
+    def choosing(self) -> float | None:
+        """Look whether a file was chosen in the desktop's own dialog, and take it.
+
+        Returns:
+            Seconds until it has to be called again; None if no such dialog is on screen.
+        """
+        stage = self._app.stage
+        looked = self._browser.looked(stage.work.dialog)
+        if looked is not None and looked != stage.work.dialog:
+            stage.ask(looked)
+        return native.POLL_S if self._browser.on_screen else None
 
     @property
     def unsaved(self) -> bool:
@@ -139,6 +154,10 @@ class Desk:
     def closed(self) -> None:
         """The window closes, and nothing is lost: the autosave has done its work."""
         self._drop_autosave()
+
+    def release(self) -> None:
+        """Take away what of the desktop's is still on screen."""
+        self._browser.close()
 
     def _open(self, path: Path, kind: str) -> None:
         if kind == "cameras":
@@ -227,6 +246,13 @@ class Desk:
         path = self.path
         if self._told(lambda: self.save(path)) and then:
             self._app.stage.request(then)
+
+    def _browse(self) -> None:
+        """The desktop's own dialog beside the question that is open."""
+        stage = self._app.stage
+        if stage.work.dialog is not None:
+            near = self.path or self._app.document.path or Path("file")
+            stage.ask(self._browser.begun(stage.work.dialog, near))
 
     def _leave(self) -> None:
         if self.unsaved:

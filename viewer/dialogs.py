@@ -13,7 +13,7 @@ from imgui_bundle import imgui
 
 from .overlay import Area
 from .ui_context import PALETTE, SMALL_PX, UiContext
-from .widgets import elided, section
+from .widgets import elided, section, small, tip
 from .workspace import Dialog
 
 WIDTH_PX = 520.0  # at 1×
@@ -75,13 +75,25 @@ def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui:
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
+    if dialog.chosen:
+        return _given(dialog, dialog.chosen)
     if dialog.kind == "leave":
         return _leaving(dialog, pressed, ui)
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
-    imgui.set_next_item_width(-1.0)
+    more, gap = 36.0 * ui.scale, 6.0 * ui.scale
+    imgui.set_next_item_width(-more - gap)
     _, text = imgui.input_text("##path", dialog.text)
     dialog = replace(dialog, text=text)
+    imgui.same_line(0.0, gap)
+    imgui.begin_disabled(dialog.choosing)
+    browse = imgui.button("…", imgui.ImVec2(more, 0.0))
+    imgui.end_disabled()
+    tip("Choose in the desktop's own dialog (Ctrl+B)")
+    if browse or ("Ctrl+B" in pressed and not dialog.choosing):
+        return Answer(dialog, ("browse",))
+    if dialog.notice:
+        small(dialog.notice, PALETTE.warning)
     if dialog.kind == "open":
         chosen = _recent(recent, ui)
         if chosen is not None:
@@ -93,10 +105,14 @@ def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui:
         return Answer(None)
     path = text.strip().strip("\"'")
     if path and (button == name or "Enter" in pressed):
-        request = {"save": "save_to", "open": "open_file"}[dialog.kind]
-        then = (dialog.then,) if dialog.then else ()
-        return Answer(None, (f"{request}:{path}", *then))
+        return _given(dialog, path)
     return Answer(dialog)
+
+
+def _given(dialog: Dialog, path: str) -> Answer:
+    """The file that was asked for."""
+    request = {"save": "save_to", "open": "open_file"}[dialog.kind]
+    return Answer(None, (f"{request}:{path}", *((dialog.then,) if dialog.then else ())))
 
 
 def _leaving(dialog: Dialog, pressed: Sequence[str], ui: UiContext) -> Answer:

@@ -64,11 +64,17 @@ class Dialog:
         kind: "save", "open" or "leave"
         text: what stands in the path field; for "leave" the session's file
         then: the request that was put off for this, "" for none
+        notice: a line about the desktop's own dialog, "" for none
+        choosing: that dialog is on screen
+        chosen: the file that was chosen in it
     """
 
     kind: str
     text: str = ""
     then: str = ""
+    notice: str = ""
+    choosing: bool = False
+    chosen: str = ""
 
 
 @dataclass(frozen=True)
@@ -343,9 +349,10 @@ def _snapshot(workspace: Workspace, _: str) -> Workspace:
 
 REQUESTS = (
     *("picture", "window_picture", "timeline_file", "full_screen", "quit"),
-    *("save", "save_as", "save_to", "open", "open_file", "discard"),
+    *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
 )
-"""What only the window can do: `save_to:PATH`, `open_file:PATH`; `save:THEN` asks for THEN afterwards."""
+"""What only the window can do: `save_to:PATH`, `open_file:PATH`; `save:THEN` asks for THEN afterwards;
+`browse` shows the desktop's own dialog beside the question that is open."""
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": lambda workspace, _: replace(workspace, focus=None),
