@@ -9,6 +9,7 @@ import moderngl
 import numpy as np
 import pytest
 import torch
+from stacks import Stack
 from ui_rig import bear, first_view, rig
 
 from progdf.gaussians import Gaussians
@@ -50,7 +51,7 @@ def shown(engine: Engine, state: ViewState, ctx: moderngl.Context) -> np.ndarray
 def dyed(scene: Gaussians, shade: Tint) -> Gaussians:
     """The plain way: another scene, in which the members have the mixed colours."""
     members = bear().gdfs[shade.gdf].region.members
-    over = torch.from_numpy(tint.tints(shade, len(members)).astype(np.float32)) / 255.0
+    over = torch.from_numpy(tint.tints(shade, bear().gdfs).astype(np.float32)) / 255.0
     share = over[:, 3:]
     sh0, shN = scene.sh0.clone(), scene.shN.clone()
     sh0[members] = (1 - share) * sh0[members] + share * (over[:, :3] - 0.5) / C0
@@ -159,3 +160,32 @@ def test_c_hides_the_weights_and_saved_pictures_never_show_them() -> None:
         hand.key("C")
         assert (hand.picture() == weights).all()
         assert hand.stage.work.past.past == (), "looking is no edit"
+
+
+def test_an_overlap_colours_what_both_edits_have_and_nothing_else() -> None:
+    scarf, ears = bear().gdfs
+    moved = torch.cat([scarf.region.members[10:40], torch.arange(len(scarf.region) - 30)]).unique()
+    assert len(moved) == len(scarf.region), "the bear's first splats are not of its scarf"
+    part = replace(scarf, region=replace(scarf.region, members=moved))
+    found = tint.tints(Tint(0, others=(1, 2)), (scarf, part, ears))
+    assert found.shape == (len(scarf.region), 4)
+    assert (np.flatnonzero(found[:, 3]) == np.arange(10, 40)).all()
+    assert (found[10, :3] == (0xFF, 0x3F, 0xA0)).all()
+    assert (tint.tints(Tint(1, others=(0,)), (scarf, part))[:, 3] > 0).sum() == 30
+
+
+@pytest.mark.gl
+def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
+    scarf = bear().gdfs[0]
+    stack = Stack(bear().demo, (scarf, replace(scarf, name="frost")))
+    with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:
+        before, saved = hand.picture().astype(int), hand.stage.work.past
+        hand.move(700 - 300 + 60, 166.0)
+        hand.frame(60)
+        assert hand.stage.work.overlap == 0
+        assert np.abs(hand.picture() - before).max() > 60
+        hand.move(700 - 300 + 60, 136.0)
+        hand.frame(3)
+        assert hand.stage.work.overlap is None
+        assert (hand.picture() == before).all()
+        assert hand.stage.work.past == saved

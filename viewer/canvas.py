@@ -45,11 +45,13 @@ class Canvas:
         held: bool,
         now: float,
         focus: int | None = None,
+        overlap: int | None = None,
     ) -> None:
         """Show `view` in the lower left `size` pixels of `screen`.
 
         Args:
             focus: the layer whose painted weights are shown while the brush is out, or None
+            overlap: the layer of which is shown what it shares with the others, or None
             held: a hand is on something, so that more will follow
             now: seconds on the stage's clock
 
@@ -63,7 +65,7 @@ class Canvas:
         self._last = aim, edits
         mode = "off" if view.compare.mode == "difference" else view.draft
         self._draft = draft.begun(self._draft, mode, held, turned, slid, now)
-        self.comparer.engine.tint = tint.wanted(view, focus)
+        self.comparer.engine.tint = tint.wanted(view, focus, overlap)
         new = self.comparer.needs_draw(view, size, self.pixels)
         timings = self.comparer.draw(view, screen, size, self.pixels)
         if new:

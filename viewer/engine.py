@@ -304,7 +304,7 @@ class Engine:
             self._painter.tint(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
         if tint is not None:
             members = self._gdf(tint.gdf).region.members.numpy()
-            new = tints(tint, len(members))
+            new = tints(tint, self.gdfs)
             others = slice(None) if self._tinted is None else (new != self._tinted[1]).any(1)
             self._tinted = tint, new
             self._painter.tint(members[others], new[others])

@@ -39,6 +39,7 @@ def panels(work: Workspace, sight: Sight, cards: tuple[SnapshotCard, ...], revea
     )
     result = panel.draw(work.view, shown, sight.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
+    work = replace(work, overlap=result.overlap)
     work = _performed(work, result.actions, sight)
     if work.player.shown:
         work = _performed(

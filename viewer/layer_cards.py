@@ -43,13 +43,24 @@ class Cards:
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """What became of the state: the focused layer, the one being renamed, the one asked about."""
+
+    state: ViewState
+    focus: int | None
+    renaming: int | None = None
+    overlap: int | None = None
+
+
+@dataclass(frozen=True)
 class _Card:
-    """What one card made of the state: the layer touched, being renamed, dragged or dropped."""
+    """What one card made of the state: the layer touched, being renamed, dragged or dropped, asked about."""
 
     state: ViewState
     touched: bool = False
     renaming: bool = False
     drag: str = ""
+    overlap: bool = False
 
 
 def heading(state: ViewState, ui: UiContext) -> ViewState:
@@ -93,13 +104,13 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
     return state
 
 
-def draw(state: ViewState, cards: Cards, ui: UiContext) -> tuple[ViewState, int | None, int | None]:
-    """All cards; the changed state, the focused layer, and the layer being renamed."""
+def draw(state: ViewState, cards: Cards, ui: UiContext) -> Drawn:
+    """All cards."""
     if not state.layers:
         imgui.push_text_wrap_pos(0.0)
         imgui.text_disabled("No edits are loaded. Drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
-    focus, renaming = cards.focus, None
+    focus, renaming, overlap = cards.focus, None, None
     dragged: int | None = None
     dropped = False
     spans: list[tuple[float, float]] = []
@@ -112,6 +123,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> tuple[ViewState, int 
             imgui.set_scroll_here_y(0.5)
         focus = i if card.touched else focus
         renaming = i if card.renaming else renaming
+        overlap = i if card.overlap else overlap
         if card.drag:
             dragged, dropped = i, card.drag == "dropped"
     if dragged is not None:
@@ -120,7 +132,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> tuple[ViewState, int 
             state, focus = stack.moved(state, dragged, to), to
         else:
             _show_place(dragged, to, spans, ui)
-    return state, focus, renaming
+    return Drawn(state, focus, renaming, overlap)
 
 
 def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:
@@ -182,7 +194,7 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
     touched = imgui.is_item_active()
     imgui.end_disabled()
     card = replace(card, state=stack.changed(card.state, index, lambda old: replace(old, strength=strength)))
-    card = replace(card, state=_foot(card.state, index, row, ui))
+    card = _foot(card, index, row, ui)
     if layer.gdf in card.state.unfolded:
         dial = cards.dial if focused else None
         unfolded = layer_fold.draw(card.state.layers[index], row, dial, stack.most(state), ui)
@@ -272,8 +284,9 @@ def _typed_name(layer: LayerState, room: float) -> str | None:
     return text if entered or imgui.is_item_deactivated_after_edit() else ""
 
 
-def _foot(state: ViewState, index: int, row: LayerRow, ui: UiContext) -> ViewState:
+def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
     """Count, overlap and instruction; at the right alone, lock and the fold."""
+    state = card.state
     layer, wide = state.layers[index], TOGGLE_PX * ui.scale
     right, left = right_edge(), imgui.get_cursor_pos_x()
     overlaps = [
@@ -283,13 +296,16 @@ def _foot(state: ViewState, index: int, row: LayerRow, ui: UiContext) -> ViewSta
     ]
     note = f"{grouped(row.count)} splats"
     if len(overlaps) == 1:
-        note += f"  ·  {grouped(overlaps[0][1])} in {overlaps[0][0]}"
+        name, count = overlaps[0]
+        note += f"  ·  {'all' if count == row.count else grouped(count)} in {name}"
     elif overlaps:
-        note += f"  ·  shared with {len(overlaps)} layers"
+        note += f"  ·  overlaps {len(overlaps)} layers"
     elif row.instruction:
         note += f"  ·  {row.instruction}"
     small(note, PALETTE.dim, right - left - 3 * wide - 6.0 * ui.scale)
-    shared = (f"{grouped(count)} of its splats are also in {name}" for name, count in overlaps)
+    asked = bool(overlaps) and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
+    shared = [f"{grouped(count)} of its splats are also in {name}" for name, count in overlaps]
+    shared += ["The picture shows them in pink"] if overlaps else []
     tip("\n".join((f"{grouped(row.count)} splats", *filter(None, [row.instruction]), *shared)))
     imgui.same_line(right - 3 * wide)
     if small_toggle("solo", "S", layer.solo, wide, ui):
@@ -303,7 +319,7 @@ def _foot(state: ViewState, index: int, row: LayerRow, ui: UiContext) -> ViewSta
     if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
         state = stack.folded(state, index)
     tip("Gains, and the curve of visible change (G)")
-    return state
+    return replace(card, state=state, overlap=asked)
 
 
 def _swatch(colour: tuple[float, float, float], active: bool, ui: UiContext) -> None:

@@ -58,6 +58,7 @@ class PanelInput:
 class PanelResult:
     """The changed state, the focused layer, the one being renamed, and the actions asked for.
 
+    `overlap`: the layer of which to show what it shares with the others, while the mouse rests on that line.
     Actions are named as in `controls.KEYS`.
     """
 
@@ -65,6 +66,7 @@ class PanelResult:
     focus: int | None
     actions: tuple[str, ...] = ()
     renaming: int | None = None
+    overlap: int | None = None
 
 
 def width(ui: UiContext) -> float:
@@ -94,7 +96,8 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     _begin_body(footer)
     state = layer_cards.heading(state, ui)
     cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
-    state, focus, renaming = layer_cards.draw(state, cards, ui)
+    drawn = layer_cards.draw(state, cards, ui)
+    state, focus = drawn.state, drawn.focus
     if state.brush.active:
         state, asked = brush.section(state, focus, ui)
         actions += [asked] if asked else []
@@ -103,7 +106,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     _end_body()
     _footer(state, shown, ui, actions)
     imgui.end()
-    return PanelResult(state, focus, tuple(actions), renaming)
+    return PanelResult(state, focus, tuple(actions), drawn.renaming, drawn.overlap)
 
 
 def _begin_body(footer: float) -> None:

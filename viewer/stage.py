@@ -153,7 +153,8 @@ class Stage:
         if self.work != before:
             self.wake()
         shown, area = self._shown(), self._sight().size
-        self.canvas.draw(shown, screen, area, self._held(), self._clock, self.work.focus)
+        focus, overlap = self.work.focus, self.work.overlap if shown.panel else None
+        self.canvas.draw(shown, screen, area, self._held(), self._clock, focus, overlap)
         self._draw_overlays()
         imgui.render()
         screen.use()

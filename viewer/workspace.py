@@ -95,6 +95,7 @@ class Workspace:
         dialog: the question being asked, or None
         requests: what the window has still to do, see `REQUESTS`
         player: the playhead of `view.timeline`
+        overlap: the layer of which the panel asks to see what it shares with the others, or None
     """
 
     view: ViewState
@@ -110,6 +111,7 @@ class Workspace:
     dialog: Dialog | None = None
     requests: tuple[str, ...] = ()
     player: Player = Player()
+    overlap: int | None = None
 
 
 def opened(view: ViewState, kept: tuple[Snapshot, ...] = ()) -> Workspace:
