@@ -105,10 +105,21 @@ class Opened:
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def close(self) -> None:
-        """End it as Ctrl+C in a terminal does, and take its last figures."""
+        """End it as Ctrl+C in a terminal does, and take its last figures.
+
+        Raises:
+            ProgdfError: it does not end by itself.
+        """
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
-        said, _ = self.process.communicate(timeout=PATIENCE_S)
+        try:
+            said, _ = self.process.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.communicate()
+            raise ProgdfError(
+                f"the window did not close within {PATIENCE_S:g} s; try `progdf view`"
+            ) from None
         for line in said.splitlines():
             self.figures |= json.loads(line)
 

@@ -106,7 +106,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
                 path = Path(folder) / "scene.ply"
                 save_ply(path, scene)
                 turnings += turned(ctx, path)
-                starts += [] if bench_display.missing() else [started(path)]
+                starts += [] if bench_display.missing() else [started(path, way) for way in WAYS]
     finally:
         ctx.release()
     return [frames_table(turnings, starts, renderer), coarse_table(turnings, renderer)]
@@ -155,8 +155,8 @@ def turned(
     return results
 
 
-def started(path: Path, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
-    """`progdf view` of a scene's file, so many times, after one more that fills the caches.
+def started(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
+    """`progdf view --draw` of a scene's file, so many times, after one more that fills the caches.
 
     Raises:
         ProgdfError: Xvfb or xdotool is not installed, or the window does not open.
@@ -165,18 +165,19 @@ def started(path: Path, times: int = STARTS, size: tuple[int, int] = SIZE) -> St
     wide = (size[0] + round(WIDTH_PX), size[1])
     with bench_display.display() as screen, tempfile.TemporaryDirectory() as folder:
         for _ in range(1 + times):
-            with bench_display.window(screen, [path], wide, Path(folder), leave=True) as opened:
+            arguments = [path, "--draw", way]
+            with bench_display.window(screen, arguments, wide, Path(folder), leave=True) as opened:
                 figures.append(opened.figures)
     names = ("first_s", "imports_s", "memory_mb")
     return Start(*(statistics.median(figure[name] for figure in figures[1:]) for name in names))
 
 
 def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer: str) -> Table:
-    """Frames while turning, and first pictures. `starts`: one per scene in their order, or none."""
+    """Frames while turning, and first pictures. `starts`: one for each in their order, or none."""
     rows = []
     for i, result in enumerate(turnings):
         middle, late = np.percentile(result.frames_ms, (50, 95))
-        start = starts[i // len(WAYS)] if starts and result.way == "cpu" else None
+        start = starts[i] if starts else None
         rows.append(
             (
                 f"{result.count:,}".replace(",", " "),
@@ -205,8 +206,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
         tuple(rows),
         f"OpenGL by {renderer}. Every frame turns three degrees and has its own exact depth order; a whole "
         "frame goes from the mouse's event to finished pixels of picture and panel. A file is opened in a "
-        "window that is there; `progdf view` counts from the start of its process, kernels compiled before, "
-        "and draws with what it chooses by itself.",
+        "window that is there; `progdf view` counts from the start of its process, kernels compiled before.",
     )
 
 

@@ -10,9 +10,11 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import time
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from .cli import view
@@ -23,6 +25,7 @@ def main(arguments: list[str]) -> int:
     from . import app as application  # where `progdf view` imports it
 
     imported = time.time()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start deaf to it
     began, size, stays = float(arguments[0]), arguments[1].split("x"), arguments[2] == "stay"
     watched: list[application.App] = []
 
@@ -59,13 +62,13 @@ def main(arguments: list[str]) -> int:
 
 
 def _most_mb() -> float:
-    """The most memory that this process has held so far, MB of 1e6 bytes; 0 where nobody tells."""
-    try:
-        import resource
-    except ImportError:
-        return 0.0
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    """The most memory that this process has held so far, MB of 1e6 bytes.
+
+    Not `resource.getrusage`: its figure begins with what the parent held when it started this process.
+    """
+    status = Path("/proc/self/status").read_text()
+    (most,) = [line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:")]
+    return 1024 * int(most) / 1e6
 
 
 def _say(**figures: Any) -> None:

@@ -63,9 +63,10 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
         assert turning.checked >= 2
         assert 10.0 < turning.coarse_db < 60.0
         assert turning.at_rest == 0
-    frames = bench_frames.frames_table(turnings, [bench_frames.Start(1.5, 0.9, 300.0)], "a renderer")
+    starts = [bench_frames.Start(2.5, 0.8, 200.0), bench_frames.Start(1.5, 0.9, 300.0)]
+    frames = bench_frames.frames_table(turnings, starts, "a renderer")
     coarse = bench_frames.coarse_table(turnings, "a renderer")
-    assert [row[-2:] for row in frames.rows] == [("-", "-"), ("1.50 (0.90)", "300")]
+    assert [row[-2:] for row in frames.rows] == [("2.50 (0.80)", "200"), ("1.50 (0.90)", "300")]
     assert all(len(row) == len(table.columns) for table in (frames, coarse) for row in table.rows)
 
 
@@ -168,7 +169,7 @@ def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path
     if not (shutil.which("Xvfb") and shutil.which("xdotool")):
         pytest.skip("Xvfb and xdotool are not installed")
     save_ply(tmp_path / "bear.ply", bear(600).gaussians)
-    start = bench_frames.started(tmp_path / "bear.ply", times=1, size=SIZE)
+    start = bench_frames.started(tmp_path / "bear.ply", "gl", times=1, size=SIZE)
     assert 0.0 < start.imports_s < start.first_s < 300.0
     assert start.memory_mb > 50.0
 

@@ -1,0 +1,37 @@
+"""torch works on one thread while the viewer draws, on all while edits are read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from ui_rig import bear
+
+from progdf.checkpoint import Gdf, load_gdf
+from progdf.gaussians import Gaussians
+from viewer import arguments, render, threads
+
+
+def test_a_command_draws_on_one_thread_and_reads_edits_on_all(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[tuple[str, int]] = []
+
+    def reading(path: Path, scene: Gaussians | None = None, name: str = "") -> Gdf:
+        seen.append(("read", torch.get_num_threads()))
+        return load_gdf(path, scene, name)
+
+    def drawing(self: object, *_: object, **__: object) -> None:
+        seen.append(("draw", torch.get_num_threads()))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threads, "_MOST", 3)
+    monkeypatch.setattr(arguments, "load_gdf", reading)
+    monkeypatch.setattr(render.Engine, "image", drawing)
+    before = torch.get_num_threads()
+    scene, edit, *_ = bear().save(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        render.render([str(scene), str(edit), "--engine", "cpu", "-o", str(tmp_path / "out.png")])
+    assert seen == [("read", 3), ("draw", 1)]
+    assert torch.get_num_threads() == before
