@@ -169,6 +169,6 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
 def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:
     view = replace(first_view(bear(), 1.0, 0.5), brush=Brush(active=True, radius=25.0))
     with rig(view, SMALLEST) as hand:
-        hand.drag((350.0, 235.0), (375.0, 275.0))
+        hand.drag((360.0, 300.0), (420.0, 320.0))
         hand.frame(3)
         screenshot("ui_paint", hand.image())
