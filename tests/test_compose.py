@@ -286,6 +286,18 @@ def test_blocks_of_any_length_give_the_bits_of_compose(count: int) -> None:
         assert bits(composer.gaussians) == bits(compose(scene, layers))
 
 
+def test_rows_that_begin_within_a_block_give_the_bits_of_compose() -> None:
+    scene = random_gaussians(800, seed=8)
+    low, high = (
+        edit_of(scene, rows, curved_field(len(rows), 3)) for rows in torch.arange(700).split(300)[:2]
+    )
+    composer = Composer(scene, [low, high])
+    composer.update([Layer(low, 0.3)])
+    layers = [Layer(low, 0.3), Layer(high, 0.4)]
+    composer.update(layers)  # rewrites rows 300 to 599 alone
+    assert bits(composer.gaussians) == bits(compose(scene, layers))
+
+
 def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt: Gdf) -> None:
     still = {
         name: replace(bases, coefficients=bases.coefficients.index_fill(0, torch.tensor([4]), 0.0))

@@ -161,6 +161,23 @@ def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
     assert again.report["field"]["psnr_worst"] > result.report["field"]["psnr_worst"]
 
 
+def test_members_that_no_view_shows_are_left_out_only_when_asked(
+    folder: Path, done: RunResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "dropped" not in done.report["field"]
+    monkeypatch.setattr("trainer.active.PIXEL", 0.05)  # a bear has hardly any that do not show at all
+    found = train(quick_options(folder, "fewer", steps=16, stages=2, drop_invisible=True), quiet=True)
+    dropped = found.report["field"]["dropped"]
+    gdf = load_gdf(found.gdf, load_ply(folder / "scene.ply"))
+    assert 0 < dropped["members"] < dropped["of"] == dropped["members"] + len(gdf.region)
+    assert dropped["largest_change"] <= 0.05
+    assert found.report["field"]["psnr_worst"] == dropped["psnr_worst"]["without"]
+    assert found.report["field"]["endpoint_error"] == 0.0  # of those that are left
+    assert "members that no view shows" in found.folder.log.read_text(encoding="utf-8")
+    with pytest.raises(ProgdfError, match="--drop-invisible means nothing to --field neural"):
+        settled(quick_options(folder, "fewer", field="neural", drop_invisible=True))
+
+
 def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
     result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
     before = result.folder.trajectory.read_bytes()

@@ -16,6 +16,7 @@ from progdf.compose import Layer, compose
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.pictures import write_image
 from progdf.trajectory import Trajectory
+from trainer.active import Dropped, dropped_of
 from trainer.artefacts import RunFolder, read_views, write_json
 from trainer.fit import fit_field, judged_field, visibility
 from trainer.judge import Judge, make_judge
@@ -63,6 +64,7 @@ def finished(
     """Fit, measure, and write NAME.gdf, report.json and report.png. `begun`: see `network.fit_network`."""
     options = about["options"]
     scene, region = stand.scene, stand.region
+    dropped: Dropped | None = None
     with log.stage("fit"):
         channels = trajectory.end.shape[1]
         judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
@@ -77,6 +79,10 @@ def finished(
             target, budget = options["target_psnr"], options.get("bytes_budget")
             refine = options.get("refine", False)
             fitted = fit_field(trajectory, seen, judge, weights, choice, target, budget, refine)
+            if options.get("drop_invisible", False):
+                dropped = dropped_of(stand, trajectory, judge, fitted)
+                fitted = dropped.fitted
+                log.say(dropped.line())
     field = fitted.chosen.field
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
@@ -93,13 +99,18 @@ def finished(
         if clip.reason and (options.get("text_before") or options.get("text_after")):
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         measured = measure(judge, trajectory, fitted, perceptual, clip)
+        end = end_rows(stand, trajectory)
+        if dropped is not None:
+            region, field, end = dropped.region(region), dropped.field(field), end[dropped.kept]
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
-        endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
+        endpoint, outside = exactness(scene, gdf, end)
         title = f"{options['name']}: {options['editor']}"
         picture = report_picture(judge, measured, about["losses"], title)
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
+    if dropped is not None:
+        measures["field"]["dropped"] = dropped.figures()
     report = {
         **measures,
         "trajectory": {
