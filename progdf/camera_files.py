@@ -205,7 +205,7 @@ def _lens(where: str, table: Mapping[str, Any]) -> Lens | None:
             "undistort the images and give the new file"
         )
     lens = Lens(**{key: number_at(where, table, key) for key in _LENS if key in table})
-    return lens if lens else None
+    return lens or None
 
 
 def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, int]:

@@ -124,4 +124,4 @@ def _lens(where: str, camera: Any) -> Lens | None:
             "run colmap image_undistorter and give its sparse folder"
         )
     lens = Lens(**dict(zip(names, numbers, strict=False)))
-    return lens if lens else None
+    return lens or None
