@@ -1,6 +1,8 @@
 """Takes the README's tour: the real interface on a real scene, drawn without a window.
 
 usage: python assets/tour.py NAME SCENE.ply EDIT.gdf... -o OUT.png
+
+"recorded" needs the edits in their run folders.
 """
 
 from __future__ import annotations
@@ -49,6 +51,13 @@ def difference(hand: Rig) -> None:
     _whole(hand)
     _wheel_in(hand)
     hand.key("Shift+Y")
+
+
+def recorded(hand: Rig) -> None:
+    """The field beside what training recorded at the same strengths, with the PSNR."""
+    hand.key("F")
+    hand.wheel(200.0, 200.0, -1.5)
+    hand.key("Alt+Y")
 
 
 def session(hand: Rig) -> None:
@@ -122,6 +131,7 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
     "paint": painted,
     "compare": compare,
     "difference": difference,
+    "recorded": recorded,
     "session": session,
     "timeline": timeline,
     "timings": timings,
@@ -145,7 +155,7 @@ def main() -> None:
     scene = load_ply(asked.scene)
     gdfs = load_edits(asked.gdfs, scene, asked.scene)
     view = replace(first_state(gdfs), camera=first_camera(scene, aspect=980 / 800))
-    with rig(view, SIZE, stack=_Opened(scene, gdfs)) as hand:
+    with rig(view, SIZE, stack=_Opened(scene, gdfs), gdf_paths=asked.gdfs) as hand:
         hand.stage.facts = replace(hand.stage.facts, title=asked.scene.name)
         SHOTS[asked.name](hand)
         hand.frame(3)
