@@ -122,6 +122,7 @@ def finished(
         "objective": about["objective"],
         "losses": about["losses"],
         "agreement": about.get("agreement"),
+        "followed": about.get("followed", 0),
         "time": {**(_earlier(folder, "time") if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.memory.peak(),
         "memory_by_stage_mb": {

@@ -76,13 +76,21 @@ def surface_vote(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
     Returns:
         −1 none does .. 1 all do, 0 where no decided Gaussian is in reach. [U]
     """
-    near, distances = nearest_rows(scene.means, undecided, _NEIGHBOURS)
-    weights = _likeness(scene, undecided, near, distances)
+    near, weights = surface_likeness(scene, undecided)
     vote = 2.0 * member.float() - 1.0
     vote[undecided] = 0.0
     for _ in range(_ROUNDS):
         vote[undecided] = (weights * vote[near]).sum(dim=1)
     return vote[undecided]
+
+
+def surface_likeness(scene: Gaussians, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest others of some Gaussians [Q,k] int64, and how likely each lies on the same surface [Q,k].
+
+    The likelihoods of each add up to 1; see `surface_vote` for what they go by.
+    """
+    near, distances = nearest_rows(scene.means, rows, _NEIGHBOURS)
+    return near, _likeness(scene, rows, near, distances)
 
 
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:

@@ -106,6 +106,9 @@ class TrainOptions:
     group_steps: int = 120
     """geometry: first the connected parts of the region are moved as wholes, in so many steps per strength
     or twice as many; 0: every Gaussian finds its own way, which smears what moves far."""
+    follow: bool = True
+    """colour: members that no training view shows take on what their neighbours along the surface do, so that
+    they keep no old colour for whoever looks from elsewhere."""
     stages: int = 0
     """Strengths that an editor with a dial is asked for; 0: 8, or 4 for fewer than 320 steps, but 1 for a
     style, which is the paper's way, towards the end alone. instruct is asked for strengths, by rising

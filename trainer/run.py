@@ -23,6 +23,7 @@ from trainer.editors import VIEW_BY_VIEW, check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
+from trainer.followers import followers_of
 from trainer.interrupts import stopping
 from trainer.losses import Perceptual, perceptual_loss
 from trainer.network import PART as NETWORK
@@ -206,7 +207,12 @@ def _record(
     log.say(f"loss: {objective}")
     with log.stage("optimise"):
         renewal = reedit(options, stand, kind, folder, log)
-        trajectory, losses = trained(options, stand, edited, kind, perceptual, folder.state, log, renewal)
+        followers = followers_of(options, stand, kind)
+        if followers.places.numel():
+            log.say(f"{len(followers.places)} members that no view shows follow their neighbours")
+        trajectory, losses = trained(
+            options, stand, edited, kind, perceptual, folder.state, log, renewal, followers
+        )
     with log.stage("retime"):
         channels = trajectory.end.shape[1]
         judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
@@ -226,6 +232,7 @@ def _record(
         "losses": losses,
         "attribute_worth_db": costs,
         "agreement": agreement.figures() if agreement is not None else None,
+        "followed": len(followers.places),
     }
     scene, region = stand.scene, stand.region
     save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)

@@ -16,6 +16,7 @@ from progdf.trajectory import Trajectory
 from trainer.crops import GEOMETRY, CropScene, crop_scene, moving_attributes, render_all
 from trainer.descent import PgsState
 from trainer.editors.base import EditKind
+from trainer.followers import Followers
 from trainer.groups import Groups, group_stage, restored_groups, way
 from trainer.interrupts import held
 from trainer.losses import Perceptual, eroded
@@ -96,6 +97,7 @@ def trained(
     folder: StateFolder,
     log: RunLog,
     renewal: Renewal | None = None,
+    followers: Followers | None = None,
 ) -> tuple[Trajectory, Losses]:
     """Optimise the members, from the beginning or from where the saved state stands.
 
@@ -108,6 +110,7 @@ def trained(
         folder: where the state is saved
         log: where progress is told
         renewal: see `pgs.Renewal`
+        followers: members that take their colours from others
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -157,6 +160,8 @@ def trained(
             for found in optimise(
                 original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
             ):
+                if followers is not None:
+                    found = replace(found, offsets=followers.led(found.offsets))
                 recordings.add(found)
                 if beside is not None:
                     beside.add(found.step, found.offsets)
@@ -175,6 +180,8 @@ def trained(
     log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
     end = stages[-1].place(state.average).clone()
+    if followers is not None:
+        end = followers.led(end)
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
