@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import pytest
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.rasterize import render
 from tests.trained import WHITE, Small, small
-from trainer.agreement import Agreement, _best_colors, measured
+from trainer.agreement import Agreement, _best_colors, _sight, measured
 from trainer.editors import make_editor
 from trainer.preparation import Stand
 from trainer.views import crop, drawn
@@ -167,3 +167,13 @@ def test_views_that_nothing_changed_agree_with_nothing_to_explain() -> None:
     found = judged([view.image for view in body().views])
     assert found == Agreement(99.0, 0.0)
     assert found.figures() == {"psnr_best": 99.0, "unexplained": 0.0, "agree": True}
+
+
+def test_a_box_at_half_size_holds_all_of_its_odd_pixels_in_their_place() -> None:
+    view = replace(body().views[0], box=(11, 20, 61, 75))
+    x, y = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="xy")
+    ramp = torch.stack([0.1 + x / 200, 0.1 + y / 200, torch.full_like(x, 0.2)], dim=2)
+    sight = _sight(stand(), view, view.image + ramp)
+    halved = torch.nn.functional.avg_pool2d(ramp.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)
+    torch.testing.assert_close(sight.change, halved[10:38, 5:31], atol=1e-5, rtol=0)
+    assert sight.scene.box == (5, 10, 31, 38)

@@ -18,11 +18,11 @@ from progdf.lens import Lens
 from progdf.ply import save_ply
 from progdf.region import from_mask
 from progdf.scenes import room
-from tests.scenes import concatenate, front_camera, one_gaussian, orbit_camera
+from tests.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.trained import WHITE, Small, small
 from trainer.options import TrainOptions
 from trainer.preparation import make_stand
-from trainer.view_choice import Choice, _framed, choose_views, split_views
+from trainer.view_choice import Choice, _framed, _sampled, choose_views, split_views
 
 
 def test_a_camera_that_looks_away_is_left_out() -> None:
@@ -178,8 +178,9 @@ def picked(likeness: Tensor, held_out: int) -> list[int]:
 
 def test_views_that_show_what_the_others_show_are_held_out_one_from_each_side() -> None:
     likeness = torch.eye(6)
-    likeness[:3, 1] = 0.9  # view 1 shows what 0 and 2 show, but they do not show all that it shows
+    likeness[:3, 1] = 0.95  # view 1 shows what 0 and 2 show, but they do not show all that it shows
     likeness[3:, 5] = 1.0
+    likeness[3:, 0] = 0.65  # which is nothing new once 5 is held out
     assert picked(likeness, 1) == [5]
     assert picked(likeness, 2) == [1, 5], "in the order of the list"
     assert picked(likeness.T.contiguous(), 2) != [1, 5]
@@ -233,3 +234,32 @@ def test_places_are_framed_as_far_as_half_a_picture_beside_it() -> None:
     rays[5] *= -1  # behind
     places = rays @ camera.c2w[:3, :3].T + camera.position
     assert _framed(places, camera).tolist() == [True, True, False, True, False, False]
+
+
+def test_as_many_views_as_are_asked_for_even_where_all_show_the_same() -> None:
+    case = small("head")
+    same = [replace(case.views[0].camera, name=str(i)) for i in range(5)]
+    assert len(choose_views(case.scene, case.region, same, 3, WHITE).views) == 3
+
+
+def test_a_wide_view_shows_what_a_narrow_one_does_and_not_the_other_way_round() -> None:
+    left, right = (one_gaussian(mean=(x, 0.0, 4.0), scales=(0.3, 0.3, 0.3)) for x in (-0.7, 0.7))
+    scene = concatenate(left, right)
+    wide = front_camera(64, 64, focal=80.0)
+    narrow = replace(
+        wide, K=wide.K + torch.tensor([[0.0, 0, 40], [0, 0, 0], [0, 0, 0]])
+    )  # the left one alone
+    region = from_mask("both", torch.ones(2, dtype=torch.bool))
+    likeness = choose_views(scene, region, [wide, narrow], 2, WHITE).likeness
+    assert float(likeness[1, 0]) > 0.9
+    assert float(likeness[0, 1]) < 0.6
+
+
+def test_members_are_sampled_all_over_the_region() -> None:
+    scene = random_gaussians(2000, scale=0.01)
+    scene = replace(scene, log_scales=torch.full((2000, 3), -4.0), logit_opacities=torch.zeros(2000))
+    rows = _sampled(scene, from_mask("half", torch.arange(2000) >= 1000))
+    assert len(rows) == 256
+    assert int(rows[0]) - 1000 <= 4
+    assert 1999 - int(rows[-1]) <= 4
+    assert int(rows.diff().max()) <= 5
