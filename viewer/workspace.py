@@ -24,7 +24,7 @@ from .state import Comparison, ViewCamera, ViewState
 from .turntable import FARTHEST, Bounds
 
 MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
-FEATHER = 0.15
+FEATHER = 0.1
 """How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
 
 
