@@ -5,66 +5,36 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from null_app import null_app, press
 from PIL import Image
-from ui_rig import bear, first_view, rig
+from sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from ui_rig import bear, first_view
 
 from progdf.__main__ import main
-from progdf.camera_files import save_cameras
 from progdf.errors import ProgdfError
 from progdf.info import kind_of
-from progdf.layers import Gains
 from progdf.ply import save_ply
 from progdf.session_file import read_session, sha256
 from viewer import app as application
-from viewer import desk, document, paint, plain, recent, session, snapshots, workspace
+from viewer import plain, session
 from viewer.session import Session
-from viewer.state import Comparison, Keyframe, Timeline, ViewState
+from viewer.state import Comparison
 from viewer.turntable import eye, from_camera, to_camera
-
-
-def full_view() -> ViewState:
-    """A view in which nothing is as it is by default."""
-    view = first_view(bear(), 0.25, 0.75)
-    ears = bear().gdfs[1].region
-    painted = paint.encoded(np.linspace(0, 1, len(ears)))
-    layers = (
-        replace(view.layers[1], name="ears → gold", gains=Gains(0.5, 0.25, 0.125), solo=True, paint=painted),
-        replace(view.layers[0], enabled=False),
-    )
-    camera = replace(view.camera, azimuth=33.5, mode="fly")
-    film = Timeline((Keyframe(3, ((0, 0.5),), camera, "linear"),), length=30)
-    compare = Comparison("split", 0.3, 8.0)
-    return replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "edits").mkdir()
-    scene, *edits = bear().save(tmp_path)
-    for edit in edits:
-        edit.rename(tmp_path / "edits" / edit.name)
-    assert scene.name == "bear.ply"
-    return tmp_path
-
-
-def opened_document(folder: Path) -> document.Document:
-    return document.load(folder / "bear.ply", [folder / "edits" / f"{g.name}.gdf" for g in bear().gdfs])
+    return bear_files(tmp_path)
 
 
 @pytest.fixture
 def saved(folder: Path) -> Path:
-    view = full_view()
-    kept = snapshots.taken((), replace(view, blend="sum"))
-    session.save(folder / "work.session.json", Session(opened_document(folder), view, kept))
-    return folder / "work.session.json"
+    return saved_session(folder)
 
 
 def test_a_session_brings_back_exactly_what_was_saved(saved: Path) -> None:
@@ -85,18 +55,6 @@ def test_a_session_can_be_read_by_people_and_moves_with_its_folder(saved: Path, 
     tmp_path.rename(elsewhere)
     assert session.open_session(elsewhere / saved.name).view == full_view()
     elsewhere.rename(tmp_path)
-
-
-def spoilt(path: Path, *keys: str | int, value: Any = None, **more: Any) -> Path:
-    """The session with another value at a place, under another name."""
-    table = json.loads(path.read_text())
-    place = table
-    for key in keys[:-1]:
-        place = place[key]
-    place[keys[-1]] = value
-    other = path.with_name("spoilt.session.json")
-    other.write_text(json.dumps(table))
-    return other
 
 
 BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
@@ -224,238 +182,6 @@ def test_an_option_that_a_session_says_itself_is_refused(
 ) -> None:
     assert main(["render", "--session", str(saved), "--blend", "sum", "-o", "a.png"]) == 2
     assert "--blend was given" in capsys.readouterr().err
-
-
-def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
-    work = workspace.opened(first_view(bear(), 0.5, 0.5))
-    facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
-
-    def act(work: workspace.Workspace, action: str) -> workspace.Workspace:
-        return workspace.settled(workspace.perform(work, action, facts))
-
-    work = act(work, "snapshot")
-    assert act(work, "snapshot").snapshots == work.snapshots, "the same twice is once"
-    work = act(work, "nudge:0.25")
-    work = act(work, "snapshot")
-    assert [s.name for s in snapshots.shown(work.snapshots, work.view)] == ["original", "1", "2"]
-    entries = len(work.past.past)
-    back = act(work, "restore:1")
-    assert [layer.strength for layer in back.view.layers] == [0.5, 0.5]
-    assert back.view.blend == work.view.blend
-    assert len(back.past.past) == entries + 1
-    assert act(back, "undo").view == work.view
-    assert [layer.strength for layer in act(work, "restore:0").view.layers] == [0.0, 0.0]
-    assert [s.name for s in act(work, "forget:1").snapshots] == ["2"]
-
-
-def test_going_back_keeps_edits_that_were_opened_since_at_zero() -> None:
-    view = first_view(bear(), 0.5, 0.5)
-    kept = snapshots.taken((), replace(view, layers=view.layers[:1]))
-    back = snapshots.back_to(view, kept[0])
-    assert [(layer.name, layer.strength) for layer in back.layers] == [("scarf", 0.5), ("ears", 0.0)]
-
-
-def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in ("a.ply", "b.gdf", "c.ply")]
-    for file in files:
-        file.touch()
-    recent.remember(files[:2], tmp_path / "memory")
-    assert recent.remember([files[2], files[0]], tmp_path / "memory") == (files[0], files[2], files[1])
-    files[2].unlink()
-    assert recent.read(tmp_path / "memory") == (files[0], files[1])
-    (tmp_path / "blocked").touch()
-    assert recent.remember([files[0]], tmp_path / "blocked") == (files[0],), "no place for it is no error"
-
-
-@pytest.fixture
-def window(folder: Path, saved: Path) -> Iterator[application.App]:
-    """The application with files."""
-    with null_app(opened_document(folder), first_view(bear(), 0.5, 0.5), folder) as app:
-        yield app
-
-
-def message(app: application.App) -> str:
-    return app.stage.work.message.text if app.stage.work.message else ""
-
-
-@pytest.mark.gl
-def test_ctrl_s_asks_where_once_and_then_saves_there(window: application.App, folder: Path) -> None:
-    press(window, "Ctrl+S")
-    asked = window.stage.work.dialog
-    assert asked is not None
-    assert asked.text == str(folder / "bear.session.json")
-    press(window, "Enter")
-    assert window.stage.work.dialog is None
-    assert (folder / "bear.session.json").is_file()
-    assert "Saved" in message(window)
-    press(window, "Shift+Left")
-    assert window.desk.unsaved
-    press(window, "Ctrl+S")
-    assert not window.desk.unsaved
-    again = session.open_session(folder / "bear.session.json")
-    assert again.view.layers == window.stage.work.view.layers
-
-
-@pytest.mark.gl
-def test_keys_do_nothing_behind_a_question_and_escape_takes_it_away(window: application.App) -> None:
-    press(window, "Ctrl+O", "V", "Shift+Left")
-    assert window.stage.work.view.camera.mode == "orbit"
-    assert window.stage.work.view.layers[0].strength == 0.5
-    press(window, "Escape")
-    assert window.stage.work.dialog is None
-    press(window, "V")
-    assert window.stage.work.view.camera.mode == "fly"
-
-
-@pytest.mark.gl
-def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: Path) -> None:
-    from imgui_bundle import imgui
-
-    press(window, "Ctrl+O")
-    imgui.get_io().add_input_characters_utf8(str(saved))
-    for _ in range(3):
-        window.draw()
-    press(window, "Enter")
-    assert window.stage.work.view == full_view()
-    assert window.desk.path == saved
-    assert [s.name for s in window.stage.work.snapshots] == ["1"]
-
-
-@pytest.mark.gl
-def test_quitting_asks_only_when_something_would_be_lost(window: application.App, folder: Path) -> None:
-    press(window, "Ctrl+Q")
-    assert window._left
-    window._left = False
-    press(window, "Shift+Left", "Ctrl+Q")
-    asked = window.stage.work.dialog
-    assert asked is not None
-    assert asked.kind == "leave"
-    press(window, "Escape")
-    assert not window._left
-    press(window, "Ctrl+Q", "S", "Enter")  # save, under the name that is offered
-    assert (folder / "bear.session.json").is_file()
-    assert window._left
-
-
-@pytest.mark.gl
-def test_discarding_leaves_and_writes_nothing(window: application.App, folder: Path) -> None:
-    press(window, "Shift+Left", "Ctrl+Q", "D")
-    assert window._left
-    assert not (folder / "bear.session.json").exists()
-
-
-@pytest.mark.gl
-def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
-    window: application.App, folder: Path
-) -> None:
-    assert window.desk.autosave(0.0) is None, "nothing to lose"
-    press(window, "Shift+Left")
-    waits = window.desk.autosave(10.0)
-    assert waits == desk.AUTOSAVE_S
-    beside = folder / "bear.autosave.session.json"
-    assert not beside.exists()
-    assert window.desk.autosave(10.0 + desk.AUTOSAVE_S) is None
-    assert session.open_session(beside).view.layers == window.stage.work.view.layers
-    assert window.desk.autosave(99.0) is None, "the same again is not written again"
-    window.desk.save(folder / "bear.session.json")
-    assert not beside.exists()
-
-
-@pytest.mark.gl
-def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
-    press(window, "Shift+Left")
-    window.desk.autosave(0.0)
-    window.desk.autosave(desk.AUTOSAVE_S)
-    beside = folder / "bear.autosave.session.json"
-    kept = beside.read_bytes()
-    window.desk.serve("discard")
-    window.desk.save(folder / "bear.session.json")
-    beside.write_bytes(kept)
-    window.open(folder / "bear.session.json")
-    assert "Unsaved work was kept in bear.autosave.session.json" in message(window)
-    window.open(beside)
-    assert window.desk.path == folder / "bear.session.json"
-    assert window.desk.unsaved
-
-
-@pytest.mark.gl
-def test_files_are_told_apart_by_content_however_they_are_called(
-    window: application.App, folder: Path, saved: Path
-) -> None:
-    saved.rename(folder / "session.txt")
-    window.open(folder / "session.txt")
-    assert window.stage.work.view == full_view(), message(window)
-    (folder / "edits" / "scarf.gdf").rename(folder / "scarf.bin")
-    window.open(folder / "scarf.bin")
-    assert [layer.name for layer in window.stage.work.view.layers][-1] == "scarf-2", message(window)
-    window.desk.serve("discard")
-    (folder / "bear.ply").rename(folder / "scene.dat")
-    window.open(folder / "scene.dat")
-    assert window.stage.facts.title == "scene.dat", message(window)
-
-
-@pytest.mark.gl
-def test_a_dropped_camera_file_is_looked_through(window: application.App, folder: Path) -> None:
-    camera = bear().demo.cameras[2]
-    save_cameras(folder / "cameras.json", [camera])
-    window.open(folder / "cameras.json")
-    shown = to_camera(window.stage.work.view.camera, camera.width, camera.height)
-    assert np.abs(shown.viewmat.numpy() - camera.viewmat.numpy()).max() < 1e-4
-    assert np.abs(shown.K.numpy() - camera.K.numpy()).max() < 1e-2
-
-
-@pytest.mark.gl
-def test_a_scene_dropped_on_unsaved_work_asks_first(window: application.App, folder: Path) -> None:
-    save_ply(folder / "half.ply", bear().scene[:700])
-    press(window, "Shift+Left")
-    window.open(folder / "half.ply")
-    window.draw()
-    assert window.stage.facts.title == "bear.ply"
-    press(window, "D")
-    assert window.stage.facts.title == "half.ply"
-    assert window.stage.work.dialog is None
-    assert window.stage.recent[0] == folder / "half.ply"
-
-
-@pytest.mark.gl
-def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
-    window: application.App, folder: Path, saved: Path
-) -> None:
-    before = window.stage.work.view
-    window.open(spoilt(saved, "scene", "sha256", value="0" * 64))
-    assert window.stage.work.view == before
-    assert "saved with another bear.ply" in message(window)
-
-
-@pytest.mark.gl
-def test_saving_never_writes_over_another_kind_of_file(window: application.App, folder: Path) -> None:
-    save_cameras(folder / "cameras.json", list(bear().demo.cameras[:1]))
-    before = (folder / "cameras.json").read_bytes()
-    window.desk.serve(f"save_to:{folder / 'cameras.json'}")
-    assert (folder / "cameras.json").read_bytes() == before
-    assert "no session" in message(window)
-
-
-@pytest.mark.gl
-def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_a_right_click_forgets_it() -> None:
-    with rig(first_view(bear(), 0.5, 0.5), (1024, 640)) as hand:
-        first = hand.picture()
-        for chord in ("F3", "Shift+Left", "Shift+Left", "F3"):
-            hand.key(chord)
-        hand.wheel(900.0, 400.0, -100.0)
-        hand.frame(5)
-        assert hand.stage.patience() is None, "the small pictures are there"
-        entries, drawn = len(hand.stage.work.past.past), hand.image()[515:565, 745:1005]
-        assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
-        hand.move(874.0, 540.0)
-        hand.press()
-        hand.release()
-        assert hand.strengths == [0.5, 0.5]
-        assert np.array_equal(hand.picture(), first)
-        assert len(hand.stage.work.past.past) == entries + 1
-        hand.press(1)
-        hand.release(1)
-        assert [kept.name for kept in hand.stage.work.snapshots] == ["2"]
 
 
 def test_a_pinhole_camera_becomes_the_windows_camera() -> None:

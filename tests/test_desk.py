@@ -1,0 +1,209 @@
+"""The desk of the window: what is asked, saved, opened, dropped and remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from null_app import null_app, press
+from sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from ui_rig import bear, first_view
+
+from progdf.camera_files import save_cameras
+from progdf.ply import save_ply
+from viewer import app as application
+from viewer import desk, recent, session
+from viewer.turntable import to_camera
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return bear_files(tmp_path)
+
+
+@pytest.fixture
+def saved(folder: Path) -> Path:
+    return saved_session(folder)
+
+
+@pytest.fixture
+def window(folder: Path, saved: Path) -> Iterator[application.App]:
+    """The application with files."""
+    with null_app(opened_document(folder), first_view(bear(), 0.5, 0.5), folder) as app:
+        yield app
+
+
+def message(app: application.App) -> str:
+    return app.stage.work.message.text if app.stage.work.message else ""
+
+
+def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("a.ply", "b.gdf", "c.ply")]
+    for file in files:
+        file.touch()
+    recent.remember(files[:2], tmp_path / "memory")
+    assert recent.remember([files[2], files[0]], tmp_path / "memory") == (files[0], files[2], files[1])
+    files[2].unlink()
+    assert recent.read(tmp_path / "memory") == (files[0], files[1])
+    (tmp_path / "blocked").touch()
+    assert recent.remember([files[0]], tmp_path / "blocked") == (files[0],), "no place for it is no error"
+
+
+@pytest.mark.gl
+def test_ctrl_s_asks_where_once_and_then_saves_there(window: application.App, folder: Path) -> None:
+    press(window, "Ctrl+S")
+    asked = window.stage.work.dialog
+    assert asked is not None
+    assert asked.text == str(folder / "bear.session.json")
+    press(window, "Enter")
+    assert window.stage.work.dialog is None
+    assert (folder / "bear.session.json").is_file()
+    assert "Saved" in message(window)
+    press(window, "Shift+Left")
+    assert window.desk.unsaved
+    press(window, "Ctrl+S")
+    assert not window.desk.unsaved
+    again = session.open_session(folder / "bear.session.json")
+    assert again.view.layers == window.stage.work.view.layers
+
+
+@pytest.mark.gl
+def test_keys_do_nothing_behind_a_question_and_escape_takes_it_away(window: application.App) -> None:
+    press(window, "Ctrl+O", "V", "Shift+Left")
+    assert window.stage.work.view.camera.mode == "orbit"
+    assert window.stage.work.view.layers[0].strength == 0.5
+    press(window, "Escape")
+    assert window.stage.work.dialog is None
+    press(window, "V")
+    assert window.stage.work.view.camera.mode == "fly"
+
+
+@pytest.mark.gl
+def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: Path) -> None:
+    from imgui_bundle import imgui
+
+    press(window, "Ctrl+O")
+    imgui.get_io().add_input_characters_utf8(str(saved))
+    for _ in range(3):
+        window.draw()
+    press(window, "Enter")
+    assert window.stage.work.view == full_view()
+    assert window.desk.path == saved
+    assert [s.name for s in window.stage.work.snapshots] == ["1"]
+
+
+@pytest.mark.gl
+def test_quitting_asks_only_when_something_would_be_lost(window: application.App, folder: Path) -> None:
+    press(window, "Ctrl+Q")
+    assert window._left
+    window._left = False
+    press(window, "Shift+Left", "Ctrl+Q")
+    asked = window.stage.work.dialog
+    assert asked is not None
+    assert asked.kind == "leave"
+    press(window, "Escape")
+    assert not window._left
+    press(window, "Ctrl+Q", "S", "Enter")  # save, under the name that is offered
+    assert (folder / "bear.session.json").is_file()
+    assert window._left
+
+
+@pytest.mark.gl
+def test_discarding_leaves_and_writes_nothing(window: application.App, folder: Path) -> None:
+    press(window, "Shift+Left", "Ctrl+Q", "D")
+    assert window._left
+    assert not (folder / "bear.session.json").exists()
+
+
+@pytest.mark.gl
+def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
+    window: application.App, folder: Path
+) -> None:
+    assert window.desk.autosave(0.0) is None, "nothing to lose"
+    press(window, "Shift+Left")
+    waits = window.desk.autosave(10.0)
+    assert waits == desk.AUTOSAVE_S
+    beside = folder / "bear.autosave.session.json"
+    assert not beside.exists()
+    assert window.desk.autosave(10.0 + desk.AUTOSAVE_S) is None
+    assert session.open_session(beside).view.layers == window.stage.work.view.layers
+    assert window.desk.autosave(99.0) is None, "the same again is not written again"
+    window.desk.save(folder / "bear.session.json")
+    assert not beside.exists()
+
+
+@pytest.mark.gl
+def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
+    press(window, "Shift+Left")
+    window.desk.autosave(0.0)
+    window.desk.autosave(desk.AUTOSAVE_S)
+    beside = folder / "bear.autosave.session.json"
+    kept = beside.read_bytes()
+    window.desk.serve("discard")
+    window.desk.save(folder / "bear.session.json")
+    beside.write_bytes(kept)
+    window.open(folder / "bear.session.json")
+    assert "Unsaved work was kept in bear.autosave.session.json" in message(window)
+    window.open(beside)
+    assert window.desk.path == folder / "bear.session.json"
+    assert window.desk.unsaved
+
+
+@pytest.mark.gl
+def test_files_are_told_apart_by_content_however_they_are_called(
+    window: application.App, folder: Path, saved: Path
+) -> None:
+    saved.rename(folder / "session.txt")
+    window.open(folder / "session.txt")
+    assert window.stage.work.view == full_view(), message(window)
+    (folder / "edits" / "scarf.gdf").rename(folder / "scarf.bin")
+    window.open(folder / "scarf.bin")
+    assert [layer.name for layer in window.stage.work.view.layers][-1] == "scarf-2", message(window)
+    window.desk.serve("discard")
+    (folder / "bear.ply").rename(folder / "scene.dat")
+    window.open(folder / "scene.dat")
+    assert window.stage.facts.title == "scene.dat", message(window)
+
+
+@pytest.mark.gl
+def test_a_dropped_camera_file_is_looked_through(window: application.App, folder: Path) -> None:
+    camera = bear().demo.cameras[2]
+    save_cameras(folder / "cameras.json", [camera])
+    window.open(folder / "cameras.json")
+    shown = to_camera(window.stage.work.view.camera, camera.width, camera.height)
+    assert np.abs(shown.viewmat.numpy() - camera.viewmat.numpy()).max() < 1e-4
+    assert np.abs(shown.K.numpy() - camera.K.numpy()).max() < 1e-2
+
+
+@pytest.mark.gl
+def test_a_scene_dropped_on_unsaved_work_asks_first(window: application.App, folder: Path) -> None:
+    save_ply(folder / "half.ply", bear().scene[:700])
+    press(window, "Shift+Left")
+    window.open(folder / "half.ply")
+    window.draw()
+    assert window.stage.facts.title == "bear.ply"
+    press(window, "D")
+    assert window.stage.facts.title == "half.ply"
+    assert window.stage.work.dialog is None
+    assert window.stage.recent[0] == folder / "half.ply"
+
+
+@pytest.mark.gl
+def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
+    window: application.App, folder: Path, saved: Path
+) -> None:
+    before = window.stage.work.view
+    window.open(spoilt(saved, "scene", "sha256", value="0" * 64))
+    assert window.stage.work.view == before
+    assert "saved with another bear.ply" in message(window)
+
+
+@pytest.mark.gl
+def test_saving_never_writes_over_another_kind_of_file(window: application.App, folder: Path) -> None:
+    save_cameras(folder / "cameras.json", list(bear().demo.cameras[:1]))
+    before = (folder / "cameras.json").read_bytes()
+    window.desk.serve(f"save_to:{folder / 'cameras.json'}")
+    assert (folder / "cameras.json").read_bytes() == before
+    assert "no session" in message(window)
