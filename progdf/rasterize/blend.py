@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import Number, kernel
+from progdf.rasterize.lanes import WIDTH, choose, count, load, store
 from progdf.rasterize.pixels import (
     BATCH,
     BLUE,
@@ -18,7 +18,6 @@ from progdf.rasterize.pixels import (
     END,
     FIRST,
     GREEN,
-    LANES,
     PEAK,
     PLANE,
     RED,
@@ -31,6 +30,7 @@ from progdf.rasterize.pixels import (
     make_cards,
     tile_bounds,
 )  # fmt: skip
+from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
 
@@ -46,27 +46,26 @@ _G, _B, _LAST = PLANE * np.uint64(2), PLANE * np.uint64(3), PLANE * np.uint64(4)
 @kernel(fast=True, inline=True)
 def blend_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> None:
     """Blend one row of a splat into a tile's state; `card` is where its card begins, see `pixels`."""
-    start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
+    start, stop = cards[card + START + row], cards[card + STOP + row]
     peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
     top = cards[card + TOP + row]
     red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    begin = np.uint64(start)
-    end = begin + (np.uint64(stop - start) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
-    for j in range(begin, end):
-        p = row * np.uint64(TILE_W) + j
-        column = np.int32(j)
-        u = u_peak + step * (np.float32(column) - peak)
-        alpha = min(_ALPHA_MAX, exp2(top - u * u))
-        alpha = alpha if (column < stop) else _ZERO
-        before = state[p]
+    for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
+        p = row * np.uint64(TILE_W) + np.uint64(j)
+        column = np.float32(j) + count()
+        u = u_peak + step * (column - peak)
+        alpha = exp2(top - u * u)
+        alpha = choose(alpha < _ALPHA_MAX, alpha, _ALPHA_MAX)
+        alpha = choose(column < stop, alpha, _ZERO)
+        before = load(state, p)
         after = before * (_ONE - alpha)
         taken = after > _T_MIN
-        weight = alpha * before if taken else _ZERO
-        state[p] = after if taken else -abs(before)
-        state[p + PLANE] += weight * red
-        state[p + _G] += weight * green
-        state[p + _B] += weight * blue
-        state[p + _LAST] = place if weight > _ZERO else state[p + _LAST]
+        weight = choose(taken, alpha * before, _ZERO)
+        store(state, p, choose(taken, after, choose(before < _ZERO, before, _ZERO - before)))
+        store(state, p + PLANE, load(state, p + PLANE) + weight * red)
+        store(state, p + _G, load(state, p + _G) + weight * green)
+        store(state, p + _B, load(state, p + _B) + weight * blue)
+        store(state, p + _LAST, choose(weight > _ZERO, place, load(state, p + _LAST)))
 
 
 @kernel(fast=True, inline=True)
@@ -107,10 +106,10 @@ def blend_tile(
             break
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def blend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array,
-    background: Array, workers: int, image: Array, transmittance: Array, last: Array,
+    background: Array, image: Array, transmittance: Array, last: Array, claims: Array,
 ) -> None:  # fmt: skip
     """Blend all tiles.
 
@@ -120,29 +119,33 @@ def blend(
         grid: first tile column and row, and how many of each. [4] int64
         tile_starts, members: the tiles' lists, see `binning`
         background: [3] float32
-        workers: in how many shares to work at once
         image: out, [h,w,3] float32
         transmittance: out, [h,w] float32
         last: out, place in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
+        claims: as `shares.claim` wants it
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
-    for worker in prange(workers):
-        state, cards = np.empty(5 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
-        bounds = np.empty(4, np.int64)
-        for tile in range(worker, tiles, workers):
-            x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
-            tile_bounds(x, y, window, bounds)
-            listed = members[tile_starts[tile] : tile_starts[tile + 1]]
-            blend_tile(state, x, y, listed, splats, rgb, bounds, cards)
-            tile_bounds(x, y, window, bounds)  # blending shrank it
-            for row in range(y + bounds[1], y + bounds[3]):
-                for column in range(x + bounds[0], x + bounds[2]):
-                    p = (row - y) * TILE_W + column - x
-                    i, j = row - window[1], column - window[0]
-                    left = abs(state[p])
-                    transmittance[i, j] = left
-                    last[i, j] = state[4 * plane + p]
-                    image[i, j, 0] = state[plane + p] + left * background[0]
-                    image[i, j, 1] = state[2 * plane + p] + left * background[1]
-                    image[i, j, 2] = state[3 * plane + p] + left * background[2]
+    state, cards = np.empty(5 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
+    bounds = np.empty(4, np.int64)
+    tile = claim(claims)
+    while tile < tiles:
+        x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
+        tile_bounds(x, y, window, bounds)
+        listed = members[tile_starts[tile] : tile_starts[tile + 1]]
+        blend_tile(state, x, y, listed, splats, rgb, bounds, cards)
+        tile_bounds(x, y, window, bounds)  # blending shrank it
+        left, width = np.uint64(x + bounds[0] - window[0]), np.uint64(bounds[2] - bounds[0])
+        for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
+            i = np.uint64(y - window[1]) + row
+            p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
+            for k in range(width):
+                transmittance[i, left + k] = abs(state[p + k])
+            for k in range(width):
+                last[i, left + k] = state[p + _LAST + k]
+            for k in range(width):
+                through = abs(state[p + k])
+                image[i, left + k, 0] = state[p + PLANE + k] + through * background[0]
+                image[i, left + k, 1] = state[p + _G + k] + through * background[1]
+                image[i, left + k, 2] = state[p + _B + k] + through * background[2]
+        tile = claim(claims)

@@ -10,12 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX
 from progdf.rasterize.jit import Number, kernel
+from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total, totals
 from progdf.rasterize.pixels import (
     BATCH,
     BLUE,
@@ -23,7 +23,6 @@ from progdf.rasterize.pixels import (
     END,
     FIRST,
     GREEN,
-    LANES,
     PEAK,
     PLANE,
     RED,
@@ -37,6 +36,7 @@ from progdf.rasterize.pixels import (
     make_cards,
     tile_bounds,
 )  # fmt: skip
+from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
 
@@ -53,60 +53,63 @@ _G2, _LAST = PLANE * np.uint64(4), PLANE * np.uint64(5)
 
 
 @kernel(fast=True, inline=True)
-def unblend_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> tuple[Number, ...]:
-    """Take one row of a splat off a tile's state; as `blend_row`. Returns Σ colour (3), Σg, Σg·u, Σg·u²."""
-    start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
-    sum_r = sum_g = sum_b = sum_0 = sum_u = sum_uu = _ZERO
-    peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
-    top = cards[card + TOP + row]
-    red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    begin = np.uint64(start)
-    end = begin + (np.uint64(stop - start) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
-    for j in range(begin, end):
-        p = row * np.uint64(TILE_W) + j
-        column = np.int32(j)
-        u = u_peak + step * (np.float32(column) - peak)
-        raw = exp2(top - u * u)
-        alpha = min(_ALPHA_MAX, raw)
-        alpha = alpha if (column < stop) & (place <= state[p + _LAST]) else _ZERO
-        inverse = _ONE / (_ONE - alpha)
-        before = state[p] * inverse
-        g0, g1, g2 = state[p + _G0], state[p + _G1], state[p + _G2]
-        shown = red * g0 + green * g1 + blue * g2
-        behind = state[p + _BEHIND]
-        weight = alpha * before
-        g = alpha * (before * shown - behind * inverse)
-        g = g if raw <= _ALPHA_MAX else _ZERO
-        state[p] = before
-        state[p + _BEHIND] = behind + weight * shown
-        sum_r += weight * g0
-        sum_g += weight * g1
-        sum_b += weight * g2
-        sum_0 += g
-        sum_u += g * u
-        sum_uu += g * u * u
-    return sum_r, sum_g, sum_b, sum_0, sum_u, sum_uu
+def unblend_splat(state: Array, cards: Array, card: Number, place: Number, sums: Array, slot: Number) -> None:
+    """Take one splat off a tile's state and write its row of `sums`; the rest as in `blend_row`."""
+    red, green, blue, step = cards[card + RED], cards[card + GREEN], cards[card + BLUE], cards[card + STEP]
+    s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = spread(_ZERO)
+    for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
+        start, stop, top = cards[card + START + row], cards[card + STOP + row], cards[card + TOP + row]
+        peak, u_peak, v = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + V + row]
+        for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
+            p = row * np.uint64(TILE_W) + np.uint64(j)
+            column = np.float32(j) + count()
+            u = u_peak + step * (column - peak)
+            raw = exp2(top - u * u)
+            alpha = choose(raw < _ALPHA_MAX, raw, _ALPHA_MAX)
+            alpha = choose((column < stop) & (place <= load(state, p + _LAST)), alpha, _ZERO)
+            inverse = _ONE / (_ONE - alpha)
+            before = load(state, p) * inverse
+            g0, g1, g2 = load(state, p + _G0), load(state, p + _G1), load(state, p + _G2)
+            shown = red * g0 + green * g1 + blue * g2
+            behind = load(state, p + _BEHIND)
+            weight = alpha * before
+            g = alpha * (before * shown - behind * inverse)
+            g = choose(raw <= _ALPHA_MAX, g, _ZERO)
+            store(state, p, before)
+            store(state, p + _BEHIND, behind + weight * shown)
+            s_r += weight * g0
+            s_g += weight * g1
+            s_b += weight * g2
+            g_u, g_v = g * u, g * v
+            s_0 += g
+            s_u += g_u
+            s_v += g_v
+            s_uu += g_u * u
+            s_uv += g_u * v
+            s_vv += g_v * v
+    at = np.uint64(slot) * np.uint64(SUMS)
+    store(sums, at, totals(s_r, s_g, s_b, s_0, s_u, s_v, s_uu, s_uv))
+    sums[slot, 8] = total(s_vv)
 
 
 @kernel(fast=True, inline=True)
-def pass_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> None:
-    """As `unblend_row` for a splat whose own gradient nobody wants."""
-    start, stop = np.int32(cards[card + START + row]), np.int32(cards[card + STOP + row])
-    peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
-    top = cards[card + TOP + row]
-    red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    begin = np.uint64(start)
-    end = begin + (np.uint64(stop - start) + LANES - np.uint64(1)) // LANES * LANES if start < stop else begin
-    for j in range(begin, end):
-        p = row * np.uint64(TILE_W) + j
-        column = np.int32(j)
-        u = u_peak + step * (np.float32(column) - peak)
-        alpha = min(_ALPHA_MAX, exp2(top - u * u))
-        alpha = alpha if (column < stop) & (place <= state[p + _LAST]) else _ZERO
-        before = state[p] / (_ONE - alpha)
-        shown = red * state[p + _G0] + green * state[p + _G1] + blue * state[p + _G2]
-        state[p] = before
-        state[p + _BEHIND] += alpha * before * shown
+def pass_splat(state: Array, cards: Array, card: Number, place: Number) -> None:
+    """As `unblend_splat` for a splat whose own gradient nobody wants."""
+    red, green, blue, step = cards[card + RED], cards[card + GREEN], cards[card + BLUE], cards[card + STEP]
+    for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
+        start, stop, top = cards[card + START + row], cards[card + STOP + row], cards[card + TOP + row]
+        peak, u_peak = cards[card + PEAK + row], cards[card + U_PEAK + row]
+        for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
+            p = row * np.uint64(TILE_W) + np.uint64(j)
+            column = np.float32(j) + count()
+            u = u_peak + step * (column - peak)
+            alpha = exp2(top - u * u)
+            alpha = choose(alpha < _ALPHA_MAX, alpha, _ALPHA_MAX)
+            alpha = choose((column < stop) & (place <= load(state, p + _LAST)), alpha, _ZERO)
+            before = load(state, p) / (_ONE - alpha)
+            shown = red * load(state, p + _G0) + green * load(state, p + _G1) + blue * load(state, p + _G2)
+            store(state, p, before)
+            store(state, p + _BEHIND, load(state, p + _BEHIND) + alpha * before * shown)
 
 
 @kernel(fast=True)
@@ -129,34 +132,17 @@ def unblend_tile(
         make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
         for place in range(end - 1, begin - 1, -1):
             card = np.uint64(place - begin) * CARD
-            if not wanted[members[place]]:
-                for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-                    pass_row(state, cards, card, row, np.float32(place))
-                continue
-            s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = _ZERO
-            for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-                r, g, b, g_0, g_u, g_uu = unblend_row(state, cards, card, row, np.float32(place))
-                v = cards[card + V + row]
-                s_r += r
-                s_g += g
-                s_b += b
-                s_0 += g_0
-                s_u += g_u
-                s_v += g_0 * v
-                s_uu += g_uu
-                s_uv += g_u * v
-                s_vv += g_0 * v * v
-            slot = slots[place]
-            sums[slot, 0], sums[slot, 1], sums[slot, 2] = s_r, s_g, s_b
-            sums[slot, 3], sums[slot, 4], sums[slot, 5] = s_0, s_u, s_v
-            sums[slot, 6], sums[slot, 7], sums[slot, 8] = s_uu, s_uv, s_vv
+            if wanted[members[place]]:
+                unblend_splat(state, cards, card, np.float32(place), sums, slots[place])
+            else:
+                pass_splat(state, cards, card, np.float32(place))
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
-    background: Array, workers: int, transmittance: Array, last: Array, grad_image: Array,
-    grad_transmittance: Array, sums: Array, wanted: Array,
+    background: Array, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
+    sums: Array, wanted: Array, claims: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same arguments.
 
@@ -165,34 +151,34 @@ def unblend(
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
         sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
         wanted: splats whose gradients are wanted. [V] bool
+        claims: as `shares.claim` wants it
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
-    for worker in prange(workers):
-        state, cards = np.empty(6 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
-        bounds = np.empty(4, np.int64)
-        for tile in range(worker, tiles, workers):
-            x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
-            state[:plane] = _ONE
-            state[plane : 5 * plane] = _ZERO
-            state[5 * plane :] = -_ONE
-            tile_bounds(x, y, window, bounds)
-            for row in range(y + bounds[1], y + bounds[3]):
-                for column in range(x + bounds[0], x + bounds[2]):
-                    p = (row - y) * TILE_W + column - x
-                    i, j = row - window[1], column - window[0]
-                    g0, g1, g2 = grad_image[i, j, 0], grad_image[i, j, 1], grad_image[i, j, 2]
-                    seen = (
-                        g0 * background[0]
-                        + g1 * background[1]
-                        + g2 * background[2]
-                        + grad_transmittance[i, j]
-                    )
-                    state[p] = transmittance[i, j]
-                    state[plane + p] = transmittance[i, j] * seen
-                    state[2 * plane + p], state[3 * plane + p], state[4 * plane + p] = g0, g1, g2
-                    state[5 * plane + p] = last[i, j]
-            listed = slice(tile_starts[tile], tile_starts[tile + 1])
-            unblend_tile(
-                state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted
-            )
+    state, cards = np.empty(6 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
+    bounds = np.empty(4, np.int64)
+    tile = claim(claims)
+    while tile < tiles:
+        x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
+        state[:plane] = _ONE
+        state[plane : 5 * plane] = _ZERO
+        state[5 * plane :] = -_ONE
+        tile_bounds(x, y, window, bounds)
+        left, width = np.uint64(x + bounds[0] - window[0]), np.uint64(bounds[2] - bounds[0])
+        for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
+            i = np.uint64(y - window[1]) + row
+            p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
+            for k in range(width):
+                state[p + _G0 + k] = grad_image[i, left + k, 0]
+                state[p + _G1 + k] = grad_image[i, left + k, 1]
+                state[p + _G2 + k] = grad_image[i, left + k, 2]
+            for k in range(width):
+                state[p + k] = transmittance[i, left + k]
+                state[p + _LAST + k] = last[i, left + k]
+            for k in range(width):
+                seen = state[p + _G0 + k] * background[0] + state[p + _G1 + k] * background[1]
+                seen += state[p + _G2 + k] * background[2] + grad_transmittance[i, left + k]
+                state[p + _BEHIND + k] = state[p + k] * seen
+        listed = slice(tile_starts[tile], tile_starts[tile + 1])
+        unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted)
+        tile = claim(claims)

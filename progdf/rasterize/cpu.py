@@ -7,6 +7,7 @@ The picture and the gradients are the same bits in every run and for every numbe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from progdf.rasterize.blend_backward import SUMS, unblend
 from progdf.rasterize.conventions import RasterInfo
 from progdf.rasterize.jit import running
 from progdf.rasterize.projection_backward import CAMERA, PARTS, project_backward
+from progdf.rasterize.shares import at_once, share
 
 Array = NDArray[Any]
 
@@ -105,9 +107,10 @@ def alpha_weights(
     with running("weights", 2) as workers:
         lists, _ = _list_splats(view, gaussians, workers, for_gradients=True)
         sums = np.zeros((len(lists.members), weights.SUMS))
-        weights.weigh(
+        share(
+            workers, weights.weigh,
             lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
-            _float32(mask).numpy(), workers, sums,
+            _float32(mask).numpy(), sums,
         )  # fmt: skip
         weights.gather(lists.ids, lists.ranks, lists.per_splat, sums, totals)
     return torch.from_numpy(totals.astype(np.float32))
@@ -123,12 +126,12 @@ def _view(
     antialiased: bool,
     crop: tuple[int, int, int, int],
 ) -> _View:
-    k = K.detach().cpu().double()
+    k = K.detach().cpu().numpy()
     x0, y0, x1, y1 = crop
     column, row = x0 // TILE_W, y0 // TILE_H
     return _View(
-        viewmat=np.ascontiguousarray(viewmat.detach().cpu().double().numpy()),
-        intrinsics=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+        viewmat=np.ascontiguousarray(viewmat.detach().cpu().numpy(), np.float64),
+        intrinsics=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.float64),
         size=np.array([width, height], np.int64),
         window=np.array(crop, np.int64),
         grid=np.array([column, row, -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row], np.int64),
@@ -150,38 +153,51 @@ def _list_splats(
     n = len(means)
     centres, depths, candidates = np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_)
     visible = np.zeros(n, np.bool_)
-    tiles = int(view.grid[2] * view.grid[3])
-    tile_starts = np.empty(tiles + 1, np.int64)
+    tile_starts = np.empty(int(view.grid[2] * view.grid[3]) + 1, np.int64)
+    found = [centres, depths, visible]
     if n <= FEW:
-        ids, ranks, splats, rgb, counts, per_splat, total = few.list_few(
+        ids, ranks, splats, rgb, per_splat, members, slots, total = few.list_few(
             means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
-            view.window, view.near, view.antialiased, view.grid, centres, depths, candidates, visible,
-            tile_starts,
+            view.window, view.near, view.antialiased, view.grid, MOST_INTERSECTIONS, for_gradients, centres,
+            depths, candidates, visible, tile_starts,
         )  # fmt: skip
-    else:
-        projection.cull(
-            means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
-            centres, depths, candidates,
-        )  # fmt: skip
-        ids, ranks = binning.depth_order(depths, candidates, workers)
-        splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
-        projection.project(
-            ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
-            view.size, view.window, view.antialiased, splats, rgb, visible,
-        )  # fmt: skip
-        counts, per_splat = np.empty((workers, tiles), np.int64), np.empty(len(ids) + 1, np.int64)
-        binning.count_tiles(splats, view.window, view.grid, counts, per_splat)
-        total = binning.place_tiles(counts, tile_starts, per_splat)
+        _check_intersections(len(ids), total)
+        return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), found
+    share(
+        workers, projection.cull,
+        means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
+        centres, depths, candidates,
+    )  # fmt: skip
+    ids, ranks = binning.depth_order(depths, candidates, workers)
+    splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
+    share(
+        workers, projection.project,
+        ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
+        view.size, view.window, view.antialiased, splats, rgb, visible,
+    )  # fmt: skip
+    counts, per_splat = np.empty((workers, len(tile_starts) - 1), np.int64), np.empty(len(ids) + 1, np.int64)
+    tiles = at_once(
+        partial(
+            binning.find_tiles, splats, part, view.window, view.grid, MOST_INTERSECTIONS, counts, per_splat
+        )
+        for part in range(workers)
+    )
+    total = binning.place_tiles(counts, tile_starts, per_splat)
+    _check_intersections(len(ids), total)
+    members, slots = np.empty(total, np.int32), np.empty(total if for_gradients else 0, np.int64)
+    at_once(
+        partial(binning.fill_tiles, tiles[part], part, counts, per_splat, members, slots)
+        for part in range(workers)
+    )
+    return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), found
+
+
+def _check_intersections(splats: int, total: int) -> None:
     if total > MOST_INTERSECTIONS:
         raise ProgdfError(
-            f"{len(ids)} Gaussians meet {total} tiles of the image, more than {MOST_INTERSECTIONS}; "
+            f"{splats} Gaussians meet {total} tiles of the image, more than {MOST_INTERSECTIONS}; "
             "draw a smaller image or a crop, or take giant Gaussians out of the scene"
         )
-    members = np.empty(total, np.int32)
-    slots = np.empty(total if for_gradients else 0, np.int64)
-    fill = few.fill_few if n <= FEW else binning.fill_tiles
-    fill(splats, view.window, view.grid, counts, per_splat, members, slots)
-    return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), [centres, depths, visible]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -194,11 +210,12 @@ class _Rasterize(torch.autograd.Function):
         x0, y0, x1, y1 = view.window
         image = np.empty((y1 - y0, x1 - x0, 3), np.float32)
         transmittance, last = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
-        with running("forward", 15) as workers:
+        with running("forward", 12) as workers:
             lists, found = _list_splats(view, gaussians, workers, any(ctx.needs_input_grad))
-            blend(
+            share(
+                workers, blend,
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
-                background, workers, image, transmittance, last,
+                background, image, transmittance, last,
             )  # fmt: skip
         results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
         ctx.mark_non_differentiable(*results[2:])
@@ -223,13 +240,15 @@ class _Rasterize(torch.autograd.Function):
         by_means, by_quats, by_scales, by_opacities, by_colors = gradients
         grad_camera = np.zeros((PARTS, CAMERA))
         wanted = _wanted_splats(lists, len(means), ctx.grad_rows)
-        with running("backward", 7) as workers:
-            unblend(
+        with running("backward", 5) as workers:
+            share(
+                workers, unblend,
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
-                lists.slots, background, workers, transmittance, ctx.last, grad_image, grad_transmittance,
+                lists.slots, background, transmittance, ctx.last, grad_image, grad_transmittance,
                 sums, wanted,
             )  # fmt: skip
-            project_backward(
+            share(
+                workers, project_backward,
                 lists.ids, lists.ranks, means, quats, scales, opacities, colors, view.degree,
                 view.viewmat, view.intrinsics, view.size,
                 view.antialiased, lists.splats, lists.per_splat, sums, wanted,
@@ -240,12 +259,16 @@ class _Rasterize(torch.autograd.Function):
         ]
         needs = ctx.needs_input_grad[7:]
         results.append(_background_gradient(transmittance, grad_image) if needs[0] else None)
-        camera = torch.from_numpy(grad_camera.sum(axis=0))
-        viewmat, K = tensors[6:]
-        grad_viewmat, grad_K = torch.zeros(4, 4, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
-        grad_viewmat[:3] = camera[:12].reshape(3, 4)
-        grad_K[0, 0], grad_K[1, 1], grad_K[0, 2], grad_K[1, 2] = camera[12:]
-        return None, None, *results, grad_viewmat.to(viewmat), grad_K.to(K)
+        results += _camera_gradients(grad_camera, *tensors[6:]) if any(needs[1:]) else (None, None)
+        return None, None, *results
+
+
+def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    camera = parts.sum(axis=0)
+    by_viewmat, by_K = np.zeros((4, 4)), np.zeros((3, 3))
+    by_viewmat[:3] = camera[:12].reshape(3, 4)
+    by_K[0, 0], by_K[1, 1], by_K[0, 2], by_K[1, 2] = camera[12:]
+    return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
 
 
 def _wanted_splats(lists: _Lists, count: int, grad_rows: Tensor | None) -> Array:

@@ -11,48 +11,68 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize import binning, projection
-from progdf.rasterize.jit import kernel, without_threads
+from progdf.rasterize.binning import (
+    BUCKETS,
+    DIGITS,
+    count_digits,
+    fill_tiles,
+    find_tiles,
+    gather_keys,
+    move_digits,
+    place_digits,
+    place_tiles,
+    rank_items,
+)
+from progdf.rasterize.jit import kernel
+from progdf.rasterize.projection import cull, project
 
 Array = NDArray[Any]
 
-_cull = without_threads(projection.cull)
-_project = without_threads(projection.project)
-_depth_order = without_threads(binning.depth_order)
-_count_tiles = without_threads(binning.count_tiles)
-_place_tiles = without_threads(binning.place_tiles)
-_fill_tiles = without_threads(binning.fill_tiles)
+
+@kernel(cache=True)
+def _depth_order(depths: Array, candidates: Array) -> tuple[Array, Array]:
+    ids, keys, items = gather_keys(depths, candidates)
+    new_keys, new_items = np.empty_like(keys), np.empty_like(items)
+    places = np.empty((1, BUCKETS), np.int64)
+    for digit in range(DIGITS):
+        count_digits(keys, digit, places, np.zeros(1, np.int64))
+        place_digits(places)
+        move_digits(keys, items, digit, places, new_keys, new_items, np.zeros(1, np.int64))
+        keys, new_keys, items, new_items = new_keys, keys, new_items, items
+    return ids, rank_items(items)
 
 
 @kernel(cache=True)
 def list_few(
     means: Array, quats: Array, scales: Array, opacities: Array, colors: Array, degree: int, viewmat: Array,
-    intrinsics: Array, size: Array, window: Array, near: float, antialiased: bool, grid: Array,
-    centres: Array, depths: Array, candidates: Array, visible: Array, tile_starts: Array,
-) -> tuple[Array, Array, Array, Array, Array, Array, int]:  # fmt: skip
-    """From Gaussians to counted tiles; arguments as in `projection.project` and `binning.count_tiles`.
+    intrinsics: Array, size: Array, window: Array, near: float, antialiased: bool, grid: Array, most: int,
+    for_gradients: bool, centres: Array, depths: Array, candidates: Array, visible: Array, tile_starts: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, int]:  # fmt: skip
+    """From Gaussians to lists of tiles; arguments as in `projection.project` and `binning.find_tiles`.
+
+    Args:
+        for_gradients: whether slots are wanted
 
     Returns:
-        ids, ranks, splats, rgb, counts, per_splat, and the number of (splat, tile) intersections
+        ids, ranks, splats, rgb, per_splat, members, slots, and the number of (splat, tile) intersections;
+        where that is more than `most`, members and slots are empty
     """
-    _cull(
-        means, scales, opacities, viewmat, intrinsics, size, window, near, centres, depths, candidates
+    claims = np.zeros(2, np.int64)
+    cull(
+        means, scales, opacities, viewmat, intrinsics, size, window, near, centres, depths, candidates,
+        claims[:1],
     )  # fmt: skip
-    ids, ranks = _depth_order(depths, candidates, 1)
+    ids, ranks = _depth_order(depths, candidates)
     splats, rgb = np.empty((ids.size, 8)), np.empty((ids.size, 4), np.float32)
-    _project(
+    project(
         ids, ranks, means, quats, scales, opacities, colors, degree, viewmat, intrinsics, size, window,
-        antialiased, splats, rgb, visible,
+        antialiased, splats, rgb, visible, claims[1:],
     )  # fmt: skip
     counts, per_splat = np.empty((1, grid[2] * grid[3]), np.int64), np.empty(ids.size + 1, np.int64)
-    _count_tiles(splats, window, grid, counts, per_splat)
-    total = _place_tiles(counts, tile_starts, per_splat)
-    return ids, ranks, splats, rgb, counts, per_splat, total
-
-
-@kernel(cache=True)
-def fill_few(
-    splats: Array, window: Array, grid: Array, places: Array, per_splat: Array, members: Array, slots: Array
-) -> None:
-    """As `binning.fill_tiles`."""
-    _fill_tiles(splats, window, grid, places, per_splat, members, slots)
+    tiles = find_tiles(splats, 0, window, grid, most, counts, per_splat)
+    total = place_tiles(counts, tile_starts, per_splat)
+    listed = total if total <= most else 0
+    members, slots = np.empty(listed, np.int32), np.empty(listed if for_gradients else 0, np.int64)
+    if listed:
+        fill_tiles(tiles, 0, counts, per_splat, members, slots)
+    return ids, ranks, splats, rgb, per_splat, members, slots, total

@@ -23,16 +23,12 @@ log = logging.getLogger("progdf")
 FAST = {"nnan", "ninf", "nsz", "contract", "reassoc", "afn"}
 """Float flags of the pixel loops: all but `arcp`, which costs gradients a decimal and buys no time."""
 
-if config.THREADING_LAYER == "default":
-    # OpenMP's threads spin between launches: with a busy neighbour, or torch's own threads, 1 ms becomes 90
-    # ms
-    config.THREADING_LAYER = "workqueue"
-
 Number = Any
 """A number inside a kernel, of the type numba infers: python's int and float cannot say float32 or uint64."""
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _lock = threading.RLock()
+_ready: set[Path] = set()  # markers seen
 
 
 def _source_version() -> str:
@@ -70,7 +66,6 @@ def kernel(
     *,
     fast: bool = False,
     contract: bool = False,
-    parallel: bool = False,
     cache: bool = False,
     inline: bool = False,
 ) -> Callable[[_F], _F]:
@@ -79,7 +74,6 @@ def kernel(
     Args:
         fast: with the flags of the pixel loops (`FAST`); otherwise strict IEEE
         contract: strict but for fused multiply-adds
-        parallel: `prange` runs on several threads
         cache: keep the machine code on disk; for functions that Python calls
         inline: always inline into the calling kernel
     """
@@ -93,7 +87,6 @@ def kernel(
         try:
             compiled: _F = numba.njit(
                 fastmath=flags,
-                parallel=parallel,
                 cache=cache,
                 nogil=True,
                 error_model="numpy",
@@ -106,36 +99,25 @@ def kernel(
     return decorate
 
 
-def without_threads(compiled: _F) -> _F:
-    """The same kernel, for other kernels to call on their own thread."""
-    alone: _F = numba.njit(nogil=True, error_model="numpy")(compiled.py_func)  # type: ignore[attr-defined]
-    return alone
-
-
 @contextmanager
 def running(stage: str, seconds: int) -> Iterator[int]:
-    """Hold the kernels for one call and give the number of threads to use.
-
-    numba's `workqueue` layer aborts when two Python threads launch kernels at once, so one waits for the
-    other.
+    """Tell of kernels that have yet to be compiled, and give the number of threads to use.
 
     Args:
         stage: names the kernels that will run, to tell a cold start from a warm one
         seconds: about how long these take to compile
     """
     marker = CACHE / f"{stage}.ready"
+    if marker in _ready:
+        yield threads()
+        return
     with _lock:
         cold = not marker.exists()
         if cold:
             log.warning(
                 "compiling the rasteriser's %s kernels (about %d s, once per machine)", stage, seconds
             )
-        before = numba.get_num_threads()
-        count = max(1, min(threads(), config.NUMBA_NUM_THREADS))
-        numba.set_num_threads(count)
-        try:
-            yield count
-        finally:
-            numba.set_num_threads(before)
+        yield threads()
         if cold:
             marker.touch()
+        _ready.add(marker)

@@ -6,24 +6,20 @@ import math
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.rasterize.jit import Number, kernel
+from progdf.rasterize.lanes import WIDTH, Lanes, choose, times_power, whole
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
 
-LANES = np.uint64(8)
-"""Pixels are worked on in groups of this many, from the first that a splat touches; the surplus is masked."""
-
-PLANE = np.uint64(TILE_W * TILE_H + 8)
-"""A tile's state is planes of this many float32 in one buffer: so LLVM can tell that they do not overlap. A
-group of pixels that begins in a plane's last columns ends in its padding."""
+PLANE = np.uint64(TILE_W * TILE_H + WIDTH)
+"""A tile's state is planes of this many float32 in one buffer. Pixels are worked on in groups of eight, from
+the first of a row that a splat touches; the surplus is masked, and in a tile's last row it is the padding of
+the plane."""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
@@ -35,37 +31,18 @@ _E4, _E5, _E6 = (
     np.float32(0.0012747482964304813),
     np.float32(0.00010902322854050052),
 )
-_ONE = np.float32(1.0)
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def _as_float(typingctx: Any, bits: Any) -> Any:
-    """Bits of an int32 as a float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def _as_int(typingctx: Any, number: Any) -> Any:
-    """Bits of a float32 as an int32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.IntType(32))
-
-    return types.int32(types.float32), generate
+_ONE: Number = np.float32(1.0)
+_LOWEST: Number = np.float32(-126.0)
 
 
 @kernel(fast=True, inline=True)
-def exp2(x: Number) -> Number:
-    """2^x for x ≤ 0, below -126 as at -126; branch-free, so that loops around it vectorise. float32"""
-    x = max(x, np.float32(-126.0))
-    whole = np.int32(x)
-    f = x - np.float32(whole)
+def exp2(x: Lanes) -> Lanes:
+    """2^x for x ≤ 0, below -126 as at -126."""
+    x = choose(x < _LOWEST, _LOWEST, x)
+    n = whole(x)
+    f = x - n
     p = _ONE + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
-    return _as_float(_as_int(p) + (whole << np.int32(23)))
+    return times_power(p, n)
 
 
 BATCH = 16

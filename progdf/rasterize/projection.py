@@ -12,13 +12,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from progdf.rasterize.conventions import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
 from progdf.rasterize.geometry import dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.shading import fill_basis, view_direction
+from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
 
@@ -65,10 +65,10 @@ def _cull_range(
         )
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def cull(
     means: Array, scales: Array, opacities: Array, viewmat: Array, intrinsics: Array, size: Array,
-    window: Array, near: float, centres: Array, depths: Array, candidates: Array,
+    window: Array, near: float, centres: Array, depths: Array, candidates: Array, claims: Array,
 ) -> None:  # fmt: skip
     """Mark the Gaussians that may touch the window, by a bound that needs no covariance.
 
@@ -82,13 +82,16 @@ def cull(
         centres: out, [N,2] float32
         depths: out, [N] float32
         candidates: out, [N] bool
+        claims: as `shares.claim` wants it
     """
     n = means.shape[0]
-    for part in prange((n + _CHUNK - 1) // _CHUNK):
+    part = claim(claims)
+    while part * _CHUNK < n:
         _cull_range(
             part * _CHUNK, min(n, (part + 1) * _CHUNK), means, scales, opacities, viewmat, intrinsics, size,
             window, near, centres, depths, candidates,
         )  # fmt: skip
+        part = claim(claims)
 
 
 @kernel(contract=True)
@@ -148,11 +151,11 @@ def _project_range(
         rgb[s, 0], rgb[s, 1], rgb[s, 2], rgb[s, 3] = red, green, blue, opacity
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def project(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, window: Array, antialiased: bool,
-    splats: Array, rgb: Array, visible: Array,
+    splats: Array, rgb: Array, visible: Array, claims: Array,
 ) -> None:  # fmt: skip
     """Project and shade the candidates; read in the order of the scene, written in the order of depth.
 
@@ -165,10 +168,13 @@ def project(
         splats: out, the columns named above; R2 is -1 where the splat is not shown. [V,8] float64
         rgb: out, [V,4] opacity last, antialias included. float32
         visible: out, set to True for what is shown. [N] bool
+        claims: as `shares.claim` wants it
     """
     count = ids.size
-    for part in prange((count + _CHUNK - 1) // _CHUNK):
+    part = claim(claims)
+    while part * _CHUNK < count:
         _project_range(
             part * _CHUNK, min(count, (part + 1) * _CHUNK), ids, ranks, means, quats, scales, opacities,
             colors, degree, viewmat, intrinsics, size, window, antialiased, splats, rgb, visible,
         )  # fmt: skip
+        part = claim(claims)

@@ -12,7 +12,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from progdf.rasterize.blend_backward import SUMS
@@ -33,6 +32,7 @@ from progdf.rasterize.geometry import (
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection import R2, UNIT
 from progdf.rasterize.shading import shade_backward
+from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
 
@@ -178,13 +178,13 @@ def _project_backward_range(
             grad_means[i, k] = by_mean[k]
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def project_backward(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
     splats: Array, per_splat: Array, sums: Array, wanted: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
-    grad_camera: Array,
+    grad_camera: Array, claims: Array,
 ) -> None:  # fmt: skip
     """Gradients of `projection.project`, which has the same first arguments.
 
@@ -196,11 +196,14 @@ def project_backward(
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes
             of inputs
         grad_camera: out, zero on entry. [PARTS, CAMERA] float64
+        claims: as `shares.claim` wants it
     """
     step = (ids.size + PARTS - 1) // PARTS
-    for part in prange(PARTS):
+    part = claim(claims)
+    while part < PARTS:
         _project_backward_range(
             part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities,
             colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums, wanted,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera[part],
         )  # fmt: skip
+        part = claim(claims)

@@ -5,18 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import Number, kernel
+from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total
 from progdf.rasterize.pixels import (
     BATCH,
     CARD,
     END,
     FIRST,
     PEAK,
+    PLANE,
     START,
     STEP,
     STOP,
@@ -26,6 +27,7 @@ from progdf.rasterize.pixels import (
     make_cards,
     tile_bounds,
 )  # fmt: skip
+from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
 
@@ -38,33 +40,47 @@ _ZERO: Number = np.float32(0.0)
 _ONE: Number = np.float32(1.0)
 
 
-@kernel()
-def add_weights(state: Array, cards: Array, card: Number, mask: Array, out: Array) -> None:
-    """Blend one splat's transmittance into a tile and add its weights to `out`; mask begins at the tile."""
+@kernel(fast=True, inline=True)
+def add_weights(state: Array, cards: Array, card: Number, out: Array) -> None:
+    """Blend one splat's transmittance into a tile and add its weights to `out`.
+
+    Args:
+        state: transmittance (negative: the pixel is done) and mask. [2·PLANE] float32
+        cards, card: see `pixels`
+        out: [4] float64
+    """
+    inside = within = weights = pixels = spread(_ZERO)
+    step = cards[card + STEP]
     for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-        peak, u_peak, top = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + TOP + row]
-        for j in range(np.uint64(cards[card + START + row]), np.uint64(cards[card + STOP + row])):
-            p = row * np.uint64(TILE_W) + j
-            u = u_peak + cards[card + STEP] * (np.float32(np.int32(j)) - peak)
-            alpha = min(_ALPHA_MAX, exp2(top - u * u))
-            before = state[p]
+        start, stop, top = cards[card + START + row], cards[card + STOP + row], cards[card + TOP + row]
+        peak, u_peak = cards[card + PEAK + row], cards[card + U_PEAK + row]
+        for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
+            p = row * np.uint64(TILE_W) + np.uint64(j)
+            column = np.float32(j) + count()
+            u = u_peak + step * (column - peak)
+            alpha = exp2(top - u * u)
+            alpha = choose(alpha < _ALPHA_MAX, alpha, _ALPHA_MAX)
+            before, mask = load(state, p), load(state, p + PLANE)
             after = before * (_ONE - alpha)
-            if after > _T_MIN:
-                weight = alpha * before
-                m = mask[row, j]
-                state[p] = after
-                out[0] += weight * m
-                out[1] += m
-                out[2] += weight
-                out[3] += 1.0
-            else:
-                state[p] = -abs(before)
+            reached = column < stop
+            taken = reached & (after > _T_MIN)
+            weight = choose(taken, alpha * before, _ZERO)
+            done = choose(before < _ZERO, before, _ZERO - before)
+            store(state, p, choose(reached, choose(taken, after, done), before))
+            inside += weight * mask
+            within += choose(taken, mask, _ZERO)
+            weights += weight
+            pixels += choose(taken, _ONE, _ZERO)
+    out[0] += total(inside)
+    out[1] += total(within)
+    out[2] += total(weights)
+    out[3] += total(pixels)
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def weigh(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
-    mask: Array, workers: int, sums: Array,
+    mask: Array, sums: Array, claims: Array,
 ) -> None:  # fmt: skip
     """Add up the weights of every (splat, tile) intersection; the first arguments as in `blend.blend`.
 
@@ -72,27 +88,32 @@ def weigh(
         slots: row of `sums` that belongs to each entry of `members`. [I] int64
         mask: of the full image. [H,W] float32
         sums: out, zero on entry. [I,4] float64
+        claims: as `shares.claim` wants it
     """
     tiles = tile_starts.size - 1
-    for worker in prange(workers):
-        state = np.empty(TILE_H * TILE_W, np.float32)
-        cards, bounds = np.empty(BATCH * np.int64(CARD), np.float32), np.empty(4, np.int64)
-        for tile in range(worker, tiles, workers):
-            x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
-            state[:] = _ONE
-            tile_bounds(x, y, window, bounds)
-            for begin in range(tile_starts[tile], tile_starts[tile + 1], BATCH):
-                end = min(begin + BATCH, tile_starts[tile + 1])
-                make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
-                for place in range(begin, end):
-                    card = np.uint64(place - begin) * CARD
-                    add_weights(state, cards, card, mask[y:, x:], sums[slots[place]])
+    state = np.empty(2 * np.int64(PLANE), np.float32)
+    cards, bounds = np.empty(BATCH * np.int64(CARD), np.float32), np.empty(4, np.int64)
+    tile = claim(claims)
+    while tile < tiles:
+        x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
+        state[:] = _ONE
+        tile_bounds(x, y, window, bounds)
+        for row in range(bounds[1], bounds[3]):
+            for column in range(bounds[0], bounds[2]):
+                state[np.int64(PLANE) + row * TILE_W + column] = mask[y + row, x + column]
+        for begin in range(tile_starts[tile], tile_starts[tile + 1], BATCH):
+            end = min(begin + BATCH, tile_starts[tile + 1])
+            make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
+            for place in range(begin, end):
+                card = np.uint64(place - begin) * CARD
+                add_weights(state, cards, card, sums[slots[place]])
+        tile = claim(claims)
 
 
-@kernel(parallel=True, cache=True)
+@kernel(cache=True)
 def gather(ids: Array, ranks: Array, per_splat: Array, sums: Array, totals: Array) -> None:
     """Add up each splat's intersections in their fixed order. totals: out, [N,4] float64, zero on entry"""
-    for n in prange(ids.size):
+    for n in range(ids.size):
         for slot in range(per_splat[ranks[n]], per_splat[ranks[n] + 1]):
             for k in range(SUMS):
                 totals[ids[n], k] += sums[slot, k]
