@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 from PIL import Image
 
 from progdf import bench, bench_field, bench_network
@@ -13,7 +12,6 @@ from progdf.bench_forms import Form
 from progdf.bench_plot import PAPER, draw_forms
 from progdf.errors import ProgdfError
 from progdf.field import NeuralSettings
-from progdf.field.joint import fit_joint
 
 
 def _form(edit: str, kind: str, bytes_per_member: float, worst: float | None, ms: float) -> Form:
@@ -78,18 +76,6 @@ def test_a_separable_point_lies_higher_where_its_error_is_smaller() -> None:
         return sum(i // 340 for i in blue) / len(blue)
 
     assert height(50.0) < height(30.0)
-
-
-def test_joint_factors_of_every_rank_are_a_recording_again() -> None:
-    offsets = torch.randn(6, 20, 14, generator=torch.Generator().manual_seed(1)).cumsum(dim=0)
-    offsets -= offsets[:1].clone()
-    strengths = torch.linspace(0, 1, 6)
-    few, full = (fit_joint(strengths, offsets, rank) for rank in (1, 4))
-    errors = [max(float((f.offsets(i / 5) - offsets[i]).abs().max()) for i in range(6)) for f in (few, full)]
-    assert errors[1] < 0.05 < errors[0]
-    assert torch.equal(few.offsets(1.0), offsets[-1])
-    shared = [bases.coefficients[:, 1:] for bases in few.attributes.values()]
-    assert all(torch.equal(shared[0], other) for other in shared)
 
 
 def test_runs_and_a_plot_are_refused_where_no_fields_are_measured(tmp_path: Path) -> None:

@@ -53,6 +53,26 @@ def test_a_curve_through_a_straight_way_is_straight() -> None:
     assert torch.allclose(at_snapshots(field, strengths), straight, atol=1e-5)
 
 
+def test_a_curve_through_keyframes_of_a_parabola_is_the_parabola() -> None:
+    strengths = torch.linspace(0, 1, 17)
+    offsets = strengths[:, None, None] ** 2 * torch.randn(5, 14, generator=torch.Generator().manual_seed(2))
+    field = fit_keyframes(strengths, offsets, 4, kept=torch.tensor([0, 3, 10, 16]), between="cubic")
+    assert torch.allclose(at_snapshots(field, strengths), offsets, atol=1e-5)
+
+
+def test_int8_keyframes_spend_their_levels_on_the_bend() -> None:
+    strengths, bend = curved_trajectory(30)
+    straight = 1000 * strengths[:, None, None]
+    field = fit_keyframes(strengths, straight + bend, 9, rest_type=torch.int8)
+    error = (at_snapshots(field, strengths) - straight - bend).abs().max()
+    assert float(error) < 2 * float(bend.abs().max()) / 127
+
+
+def test_the_slider_gets_the_ticks_that_it_is_told() -> None:
+    assert fit_keyframes(*curved_trajectory(3), 3, recorded=(0.0, 0.4, 1.0)).recorded == (0.0, 0.4, 1.0)
+    assert fit_keyframes(*curved_trajectory(3, snapshots=3), 2).recorded == (0.0, 0.5, 1.0)
+
+
 def test_keyframes_lie_where_the_way_bends() -> None:
     strengths = torch.linspace(0, 1, 21)
     way = torch.where(strengths < 0.15, strengths / 0.15, torch.ones(21))[:, None]  # a corner at 0.15

@@ -61,11 +61,11 @@ def test_a_step_that_makes_pictures_worse_is_not_taken() -> None:
     shown = linear_pictures(60, 14)
 
     def saturated(moved: torch.Tensor) -> torch.Tensor:
-        return (8 * shown(moved)).sin()  # far from linear
+        return (3000 * shown(moved)).atan()  # far from linear: slopes lead beyond the mark
 
     field = fit_separable(strengths, offsets, {})
     after = errors(refined(field, offsets, saturated), offsets, saturated)
-    assert bool((after <= errors(field, offsets, saturated) + 1e-9).all())
+    assert bool((after <= errors(field, offsets, saturated) * (1 + 1e-6)).all())
 
 
 def test_a_field_that_moves_nothing_stays_one() -> None:
