@@ -169,6 +169,19 @@ def test_beside_the_edit_pass_the_cpu_composes_means_only(ctx: moderngl.Context,
 
 
 @pytest.mark.gl
+def test_the_error_is_measured_once_for_every_stack(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    measured = Count(monkeypatch, engine._editing, "error")
+    for strength, calls in ((0.4, 1), (0.4, 1), (0.5, 2)):
+        engine.image(view_of(stack, strength), SIZE)
+        engine.edits()
+        assert measured.calls == calls
+    engine.release()
+
+
+@pytest.mark.gl
 def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,7 +121,8 @@ class Comparer:
             if self._other is not None:
                 self._other.release()
             self._against = self.against(view)  # reading a recording may have shown that it is none
-            self._other = Engine(self._ctx, self.engine.scene, gdfs, self.engine.draws_with)
+            ways = self.engine.draws_with, self.engine.edits_with
+            self._other = Engine(self._ctx, self.engine.scene, gdfs, *ways)
         return self._other
 
     def _recorded(self) -> tuple[Gdf, ...]:

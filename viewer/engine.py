@@ -36,6 +36,8 @@ from .turntable import bounds_of, to_camera
 
 DRAWS = ("auto", "gl", "cpu")
 EDIT_PASSES = ("auto", "gpu", "cpu")
+"""What works out the attributes; "auto" leaves the edit pass to graphics cards: llvmpipe takes 0.6 µs of the
+processor's time a member (places, shapes and colours, three bases), where composing and sending take 0.06."""
 
 
 @dataclass(frozen=True)

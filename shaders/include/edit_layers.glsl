@@ -30,7 +30,8 @@ struct Part {
 };
 
 ivec2 texel_at(int index) {
-    return ivec2(index % TEXELS_PER_ROW, index / TEXELS_PER_ROW);
+    uint at = uint(index);   // unsigned: a power of two is then a mask and a shift
+    return ivec2(at % uint(TEXELS_PER_ROW), at / uint(TEXELS_PER_ROW));
 }
 
 Part part_of(int layer, int slot) {
