@@ -14,11 +14,12 @@ from ui_rig import bear
 
 from progdf.__main__ import main
 from progdf.gaussians import ATTRIBUTES, normalize_quats
+from progdf.layers import Gains
 from progdf.ply import load_ply
 from viewer import document, film, session, timeline
 from viewer.engine import Engine
 from viewer.session import Session
-from viewer.state import Comparison, Timeline, ViewState
+from viewer.state import Comparison, LayerState, Timeline, ViewState
 
 SMALL = ("--size", "64x48", "--engine", "cpu")
 
@@ -44,11 +45,15 @@ def run(*argv: str) -> int:
 def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) -> None:
     """Strengths, gains, paint, which layers show, their order and how they blend."""
     view = replace(full_view(), blend=blend)
-    both = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
-    for shown in (view, both):
-        saved(here, shown)
+    again = LayerState(2, "ears once more", 0.6, gains=Gains(1.0, 1.0, 0.3))
+    three = tuple(replace(layer, solo=False, enabled=True) for layer in (*view.layers, again))
+    scene, scarf, ears = bear().save(here)
+    opened = document.load(scene, [scarf, ears, ears])
+    for layers in (view.layers, three, three[::-1]):
+        shown = replace(view, layers=layers)
+        session.save(here / "work.session.json", Session(opened, shown))
         assert run("export", "--session", "work.session.json", "-o", "edited.ply") == 0
-        expected, found = Engine(None, bear().scene, bear().gdfs).gaussians(shown), load_ply("edited.ply")
+        expected, found = Engine(None, opened.scene, opened.gdfs).gaussians(shown), load_ply("edited.ply")
         for name in ATTRIBUTES:
             was, now = getattr(expected, name), getattr(found, name)
             was = normalize_quats(was) if name == "quats" else was
