@@ -39,7 +39,7 @@ class Trajectory:
         end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
         steps: optimiser steps done at each recording. [S] int64
         stage_ends: recording at which each stage ends, ascending, the last S − 1
-        strengths: the slider value that each stage's end is pinned to
+        strengths: what the editor was asked for, of each stage; `s[stage_ends]` is where that is
     """
 
     s: Tensor
@@ -51,6 +51,11 @@ class Trajectory:
 
     def __len__(self) -> int:
         return int(self.s.shape[0])
+
+    @property
+    def asked(self) -> tuple[tuple[float, float], ...]:
+        """Slider value of each stage's end, and the strength that the editor was asked for there."""
+        return tuple((float(self.s[e]), s) for e, s in zip(self.stage_ends, self.strengths, strict=True))
 
     def at(self, s: float) -> Tensor:
         """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""

@@ -20,7 +20,7 @@ from trainer.losses import GradientL1
 from trainer.measures import courses
 from trainer.memory import PeakMemory
 from trainer.plots import LINES, Plot, draw_plot, ticks
-from trainer.report import best_view, editor_strip, strip, thumbnail
+from trainer.report import best_view, columns_of, editor_strip, strip, thumbnail
 
 
 def _judged(bear: Small) -> Judge:
@@ -81,7 +81,8 @@ def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> Non
 def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_was_not_asked() -> None:
     bear = small(count=3)
     judge = _judged(bear)
-    ours, own = strip(judge, _darker(bear), 64), editor_strip(judge, 64)
+    columns = columns_of([(1.0, 1.0)])
+    ours, own = strip(judge, _darker(bear), columns, 64), editor_strip(judge, columns, 64)
     assert len(ours) == len(own) == 5
     assert {picture.shape for picture in (*ours, *own)} == {ours[0].shape}
     assert torch.equal(ours[0], own[0])

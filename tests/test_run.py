@@ -24,6 +24,7 @@ from tests.trained import quick_options, write_bear
 from trainer import cli
 from trainer.options import FitOptions, settled
 from trainer.run import RunResult, refit, train
+from trainer.trajectory import before_fit
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +49,38 @@ def test_training_lowers_the_loss_and_reaches_held_out_views(done: RunResult) ->
 
 
 def test_the_slider_is_nearer_to_the_editor_than_two_keyframes(done: RunResult) -> None:
-    for strength in ("0.25", "0.5", "0.75"):
-        between = done.report["between"][strength]
-        assert between["psnr"] > between["keyframes2"] + 4.0, strength
+    assert len(done.report["between"]) == 3
+    for s, between in done.report["between"].items():
+        assert between["psnr"] > between["keyframes2"] + 4.0, s
+
+
+def test_equal_steps_of_the_slider_look_equally_large(done: RunResult) -> None:
+    assert done.report["slider"]["uniformity"] > 0.7  # .9 when written; .5 with the editor's strengths pinned
+
+
+def test_the_report_says_at_which_strength_the_editor_was_asked(done: RunResult) -> None:
+    report = done.report
+    asked = [between["strength"] for between in report["between"].values()]
+    assert asked == report["trajectory"]["stages"][:-1] == list(done.trajectory.strengths[:-1])
+    assert [float(s) for s in report["between"]] == report["trajectory"]["stages_at"][:-1]
+    for s, quarter in zip(report["trajectory"]["stages_at"], (0.25, 0.5, 0.75, 1.0), strict=True):
+        assert s == pytest.approx(quarter, abs=0.06)
+    assert asked != [0.25, 0.5, 0.75], "this editor's strengths are not evenly visible"
+
+
+def test_the_recording_lies_where_the_field_shows_it(folder: Path, done: RunResult) -> None:
+    gdf = load_gdf(done.gdf, load_ply(folder / "scene.ply"))
+    trajectory, extra, _ = load_trajectory(done.folder.trajectory)
+    assert torch.equal(trajectory.s, done.trajectory.s)
+    assert gdf.field.recorded == pytest.approx(trajectory.s.tolist(), abs=1e-6)
+    assert not torch.equal(before_fit(trajectory, extra).s, trajectory.s), "where the next field begins"
+
+
+def test_with_stages_the_slider_is_the_editors_own_strength(folder: Path) -> None:
+    result = train(quick_options(folder, "pinned", slider="stages", steps=24), quiet=True)
+    assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}
+    assert all(float(s) == found["strength"] for s, found in result.report["between"].items())
+    assert result.report["trajectory"]["stages_at"] == [0.25, 0.5, 0.75, 1.0]
 
 
 def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_exactly_the_recorded_end(
@@ -87,7 +117,7 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
         "field": {"kind", "bytes_per_gaussian", "parameters", "psnr_mean", "psnr_worst", "endpoint_error"},
         "baselines": {"keyframes2", "keyframes4"},
         "slider": {"monotone", "uniformity", "largest_jump", "t50", "t90"},
-        "between": {"0.25", "0.5", "0.75"},
+        "between": {f"{s:g}" for s in done.report["trajectory"]["stages_at"][:-1]},
         "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
         "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
         "time": {"views", "edit", "optimise", "fit", "total"},
@@ -105,7 +135,8 @@ def test_every_view_is_kept_before_and_after(done: RunResult) -> None:
     views = done.folder.root / "views"
     names = {path.name for path in (views / "original").glob("*.png")}
     assert len(names) == 10
-    for kind in ("edited", "edited/0.25", "edited/0.5", "edited/0.75", "mask", "final"):
+    edited = [f"edited/{s:g}" for s in done.trajectory.strengths[:-1]]
+    for kind in ("edited", *edited, "mask", "final"):
         assert {path.name for path in (views / kind).glob("*.png")} == names, kind
     with Image.open(done.folder.picture) as picture:
         assert picture.width > 600
@@ -119,7 +150,8 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
     )
     result = train(options, quiet=True)
     assert result.report["edit"]["psnr_to_views"] > 32.0
-    assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}
+    given = {f"{s:g}" for s in done.trajectory.strengths[:-1]}
+    assert set(result.report["between"]) == given, "pinned where they were given"
 
 
 def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
@@ -180,14 +212,17 @@ def test_members_that_no_view_shows_are_left_out_only_when_asked(
 
 def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
     result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
-    before = result.folder.trajectory.read_bytes()
+    before, extra, _ = load_trajectory(result.folder.trajectory)
     again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
     assert again.report["field"]["kind"] == "keyframes"
     assert load_gdf(again.gdf).field.kind == "keyframes"
     tried = again.report["choice"]["tried"]
     assert again.report["choice"]["chosen"] in [field["field"] for field in tried]
     assert "the smallest of" in again.report["choice"]["why"]
-    assert result.folder.trajectory.read_bytes() == before
+    after, kept, _ = load_trajectory(result.folder.trajectory)
+    assert torch.equal(after.offsets, before.offsets)
+    assert torch.equal(after.end, before.end)
+    assert torch.equal(before_fit(after, kept).s, before_fit(before, extra).s), "each fit begins alike"
     assert again.report["edit"] == result.report["edit"]
     for stage in ("optimise", "total"):
         assert again.report["time"][stage] == result.report["time"][stage]

@@ -20,6 +20,7 @@ from progdf.bench import machine
 from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
+from progdf.field.dial import same
 from progdf.files import written_whole
 from progdf.pictures import write_image
 from progdf.slider_statistics import slider_statistics
@@ -28,18 +29,18 @@ from trainer.ablation_ground import Ground, digest_of, make_ground, plain, run_o
 from trainer.ablation_table import Outcome, sheet_of, table_of, told
 from trainer.artefacts import RunFolder, locked, write_json
 from trainer.editors.base import EditKind
+from trainer.evenness import evened
 from trainer.fit import fit_field, without_idle_attributes
 from trainer.interrupts import stopping
-from trainer.judge import Judge
 from trainer.losses import Perceptual, perceptual_loss
-from trainer.measures import courses
+from trainer.measures import against_editor
 from trainer.options import AblateOptions, TrainOptions
 from trainer.pictures import read_picture
 from trainer.progress import RunLog
 from trainer.reopen import reopened
 from trainer.report import SHOWN, best_view, editor_strip, strip
 from trainer.run import use_threads
-from trainer.settings import loss_weights
+from trainer.settings import loss_weights, slider_meant
 from trainer.state import StateFolder
 from trainer.training import retimed, trained
 from trainer.variants import Variant, chosen, sensible
@@ -129,13 +130,13 @@ def _do(root: Path, variant: Variant, ground: Ground, quiet: bool) -> None:
         return
     finally:
         log.close()
-    field = _fitted(variant, trajectory, ground)
-    outcome = _judged(replace(outcome, seconds=seconds), field, ground.judge, measure)
+    field, asked = _fitted(variant, trajectory, ground, options)
+    outcome = _judged(replace(outcome, seconds=seconds), field, ground, asked, measure)
     region, scene = ground.run.region, ground.run.scene
     told = {"name": variant.name, **plain(options)}
     gdf = Gdf(variant.name, region, field, fingerprint(scene), options.editor, told)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
-    _keep(folder, outcome, strip(ground.judge, field, _WIDTH), variant, ground)
+    _keep(folder, outcome, strip(ground.judge, field, ground.columns, _WIDTH), variant, ground)
 
 
 def _recorded(
@@ -160,26 +161,35 @@ def _recorded(
     return retimed(trajectory, ground.stand, options)
 
 
-def _fitted(variant: Variant, trajectory: Trajectory, ground: Ground) -> BakedField:
+def _fitted(
+    variant: Variant, trajectory: Trajectory, ground: Ground, options: TrainOptions
+) -> tuple[BakedField, Mapping[float, float]]:
+    """The variant's field, and where on its slider it was shown which of the editor's strengths."""
     if variant.linear:
         offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-        return fit_keyframes(trajectory.s, offsets, 2)
+        return fit_keyframes(trajectory.s, offsets, 2), {}
     target = ground.options.target_psnr
     fitted = fit_field(trajectory, ground.seen, ground.judge, ground.weights, "auto", target)
-    return fitted.chosen.field
+    field, dial = fitted.chosen.field, same()
+    if slider_meant(options.slider, options.editor, trajectory.strengths) == "even":
+        field, dial = evened(field, ground.stand)
+    return field, {strength: dial.at(s) for s, strength in trajectory.asked}
 
 
-def _judged(outcome: Outcome, field: BakedField, judge: Judge, measure: Perceptual) -> Outcome:
-    """With the figures that the field deserves."""
-    asked = tuple(sorted(judge.edited))
-    course = courses(judge, {"slider": field}, asked, lambda s: judge.edited[s], measure)["slider"]
+def _judged(
+    outcome: Outcome, field: BakedField, ground: Ground, asked: Mapping[float, float], measure: Perceptual
+) -> Outcome:
+    """With the figures that the field deserves; where it was shown no picture, on the run's own slider."""
+    judge = ground.judge
+    shown = [(s, asked.get(e, at), e) for s, (at, e) in zip(SHOWN[1:], ground.columns[1:], strict=True) if e]
+    course = against_editor(judge, {"slider": field}, [(at, e) for _, at, e in shown], measure)["slider"]
     slider = slider_statistics(lambda s: judge.pictures(field.offsets(s)), masks=judge.pixels)
     return replace(
         outcome,
         psnr=round(course.psnr[-1], 2),
         ssim=round(course.ssim[-1], 4),
         lpips=round(course.lpips[-1], 4),
-        between={f"{s:g}": round(p, 2) for s, p in zip(course.s, course.psnr, strict=True) if s < 1.0},
+        between={f"{s:g}": round(p, 2) for (s, *_), p in zip(shown[:-1], course.psnr, strict=False)},
         uniformity=round(slider.uniformity, 3),
         t50=round(slider.t50, 3),
         t90=round(slider.t90, 3),
@@ -226,9 +236,9 @@ def _publish(root: Path, variants: Sequence[Variant], ground: Ground) -> Ablatio
     for outcome in outcomes:
         if not outcome.failed:
             strips[outcome.name] = read_picture(root / outcome.name / "strip.png").chunk(len(SHOWN), dim=1)
-    editor = [(image * 255).round() / 255 for image in editor_strip(judge, _WIDTH)]
+    editor = [(image * 255).round() / 255 for image in editor_strip(judge, ground.columns, _WIDTH)]
     caption = f"held-out view {judge.names[best_view(judge)]}; PSNR to the editor's own pictures"
-    write_image(root / "ablation.png", sheet_of(editor, outcomes, strips, title, caption))
+    write_image(root / "ablation.png", sheet_of(editor, outcomes, strips, ground.columns, title, caption))
     with written_whole(root / "ablation.md") as beside:
         beside.write_text(table.markdown() + "\n", encoding="utf-8")
     rows: list[Mapping[str, Any]] = [asdict(outcome) for outcome in outcomes]

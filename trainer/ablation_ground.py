@@ -19,7 +19,7 @@ from trainer.judge import Judge, make_judge
 from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, TrainOptions
 from trainer.preparation import Pictures, Stand, widened
 from trainer.reopen import FinishedRun, its_views
-from trainer.report import SHOWN
+from trainer.report import Columns, columns_of
 from trainer.variants import Variant
 from trainer.views import View
 
@@ -38,7 +38,8 @@ class Ground:
         kind: what the edit moves
         stand: scene, region, views whose boxes hold the edit
         edited: strength → the edited training views, whole
-        judge: held-out views with the editor's pictures at the shown strengths
+        judge: held-out views with the editor's pictures of the shown columns
+        columns: where on the run's slider the variants are shown, and what the editor was asked there
         seen: a few training views, on which the field's ranks are chosen
         weights: how visible each member is. [M]
         digest: of all of this but the options
@@ -50,6 +51,7 @@ class Ground:
     stand: Stand
     edited: Pictures
     judge: Judge
+    columns: Columns
     seen: Judge
     weights: Tensor
     digest: str
@@ -84,7 +86,8 @@ def make_ground(run: FinishedRun, options: TrainOptions, kind: EditKind, quick: 
         options = replace(options, steps=min(options.steps, QUICK_STEPS), stages=len(strengths))
     edited = {s: _edited(run, stand.train, s) for s in strengths}
     stand = widened(stand, edited)
-    shown = [s for s in run.trajectory.strengths if s in SHOWN]
+    columns = columns_of(run.trajectory.asked)
+    shown = [strength for _, strength in columns[1:] if strength is not None]
     few = _thinned(stand.train, 4)
     channels = BASE_CHANNELS + 3 * run.scene.shN.shape[1]
 
@@ -105,6 +108,7 @@ def make_ground(run: FinishedRun, options: TrainOptions, kind: EditKind, quick: 
         stand,
         edited,
         judge(stand.held_out, drawn),
+        columns,
         judge(few, {1.0: _edited(run, few, 1.0)}),
         visibility(run.scene, run.region.members, stand.train),
         digest.hexdigest(),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from progdf.bench import Table, machine
 from progdf.pictures import contact_sheet
-from trainer.report import SHOWN
+from trainer.report import SHOWN, Columns, headed
 
 BETWEEN = SHOWN[1:-1]
 
@@ -23,7 +23,8 @@ class Outcome:
     Args:
         name, what: of the variant
         psnr, ssim, lpips: of the finished edit to the edited views
-        between: strength → PSNR to the editor's own picture, dB, where it was asked
+        between: a quarter, half or three quarters of the slider → PSNR to the editor's own picture from
+            there or near by, dB, where it was asked
         uniformity: least over largest visible change of twenty equal steps, 0..1
         t50, t90: slider value at which half and nine tenths of the change are reached
         bytes_per_member: of the field
@@ -53,7 +54,7 @@ def table_of(outcomes: Sequence[Outcome], title: str, perceptual: str, note: str
     columns += ("uniform", "t50", "t90", "bytes", "train, s")
     notes = [
         "On held-out views, over the pixels that show the region: the finished edit against the edited "
-        "views, the slider at a strength against the editor's own picture of it (–: it was not asked); "
+        "views, the slider near these strengths against the editor's own picture (–: it was not asked); "
         "least over largest visible change of 20 equal steps; slider value at 50 and 90 % of the change; "
         "bytes per member.",
         note,
@@ -94,6 +95,7 @@ def sheet_of(
     editor: Sequence[Tensor],
     outcomes: Sequence[Outcome],
     strips: Mapping[str, Sequence[Tensor]],
+    columns: Columns,
     title: str,
     caption: str,
 ) -> Tensor:
@@ -103,13 +105,14 @@ def sheet_of(
         editor: what the editor made of the pictured view, at five strengths. [h,w,3] each
         outcomes: variants in order
         strips: their pictures, by name, of the same size
+        columns: where on the run's slider
         title, caption: a line above and below
     """
     shown = [outcome for outcome in outcomes if outcome.name in strips]
     return contact_sheet(
         [editor, *(strips[outcome.name] for outcome in shown)],
         ["the editor", *(f"{outcome.name}\n{told(outcome)}" for outcome in shown)],
-        [f"s = {s:g}" for s in SHOWN],
+        [headed(*column) for column in columns],
         title,
         caption,
     )

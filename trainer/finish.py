@@ -13,11 +13,13 @@ from torch import Tensor
 
 from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.compose import Layer, compose
+from progdf.field.dial import same
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.pictures import write_image
 from progdf.trajectory import Trajectory
 from trainer.active import Dropped, dropped_of
 from trainer.artefacts import RunFolder, read_views, write_json
+from trainer.evenness import evened
 from trainer.fit import fit_field, judged_field, visibility
 from trainer.judge import Judge, make_judge
 from trainer.losses import Perceptual
@@ -27,7 +29,9 @@ from trainer.options import CLIP_MODEL, FieldKind
 from trainer.preparation import Stand
 from trainer.progress import RunLog
 from trainer.report import report_picture
+from trainer.settings import slider_meant
 from trainer.state import Saved
+from trainer.trajectory import lay_over
 from trainer.views import View
 
 _RANK_VIEWS = 4
@@ -83,7 +87,12 @@ def finished(
                 dropped = dropped_of(stand, trajectory, judge, fitted)
                 fitted = dropped.fitted
                 log.say(dropped.line())
-    field = fitted.chosen.field
+    with log.stage("even"):
+        slider = slider_meant(options.get("slider", "stages"), options["editor"], trajectory.strengths)
+        field, dial = fitted.chosen.field, same()
+        if slider == "even":
+            field, dial = evened(field, stand)
+        laid = lay_over(folder.trajectory, dial)
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
@@ -98,7 +107,7 @@ def finished(
         clip = clip_course(judge, stand.held_out, field, texts(options))
         if clip.reason and (options.get("text_before") or options.get("text_after")):
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
-        measured = measure(judge, trajectory, fitted, perceptual, clip)
+        measured = measure(judge, trajectory, fitted, field, dial, perceptual, clip)
         end = end_rows(stand, trajectory)
         if dropped is not None:
             region, field, end = dropped.region(region), dropped.field(field), end[dropped.kept]
@@ -115,8 +124,10 @@ def finished(
         **measures,
         "trajectory": {
             "recordings": len(trajectory),
-            "s": [round(float(s), 4) for s in trajectory.s],
+            "slider": slider,
+            "s": [round(float(s), 4) for s in laid.s],
             "stages": list(trajectory.strengths),
+            "stages_at": [round(s, 4) for s, _ in laid.asked],
             "attribute_worth_db": about["attribute_worth_db"],
         },
         "objective": about["objective"],
@@ -140,11 +151,12 @@ def finished(
     log.say(
         f"held-out views: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
         + "".join(
-            f"; s={s} {e['psnr']} dB (2 keyframes {e['keyframes2']})" for s, e in report["between"].items()
+            f"; s={float(s):.3g} {e['psnr']} dB (2 keyframes {e['keyframes2']})"
+            for s, e in report["between"].items()
         )
     )
     log.say(f"wrote {folder.gdf(options['name'])}")
-    return RunResult(folder, folder.gdf(options["name"]), report, trajectory)
+    return RunResult(folder, folder.gdf(options["name"]), report, laid)
 
 
 def kept_judge(

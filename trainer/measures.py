@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,11 +11,12 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
+from progdf.field.dial import Dial
 from progdf.field.judge import sample_strengths
 from progdf.slider_statistics import SliderStatistics, slider_statistics
 from progdf.trajectory import Trajectory
 from trainer.clip import Clip, direction, load_clip
-from trainer.fit import Fitted, choice_figures, field_figures
+from trainer.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.judge import Judge
 from trainer.losses import Perceptual
 from trainer.views import View
@@ -76,7 +77,10 @@ class Measured:
     """Everything about the fitted field that the report tells, measured on held-out views.
 
     Args:
-        fitted: the field and its baselines
+        fitted: the field and its baselines, on the trajectory's slider
+        shown: the field as it is shipped, on a slider of its own
+        dial: from the trajectory's slider to that
+        asked: slider value of what the editor was asked for, and the strength that it was asked at
         slider: how the slider feels
         at_recordings: worst PSNR of the field at the recordings themselves, dB
         trajectory: "slider" and the compared baseline against the recorded trajectory
@@ -86,6 +90,9 @@ class Measured:
     """
 
     fitted: Fitted
+    shown: BakedField
+    dial: Dial
+    asked: Sequence[tuple[float, float]]
     slider: SliderStatistics
     at_recordings: float
     trajectory: Mapping[str, Course]
@@ -95,7 +102,13 @@ class Measured:
 
 
 def measure(
-    judge: Judge, trajectory: Trajectory, fitted: Fitted, perceptual: Perceptual, clip: Direction
+    judge: Judge,
+    trajectory: Trajectory,
+    fitted: Fitted,
+    shown: BakedField,
+    dial: Dial,
+    perceptual: Perceptual,
+    clip: Direction,
 ) -> Measured:
     """Measure the chosen field beside the compared baseline.
 
@@ -103,22 +116,25 @@ def measure(
         judge: held-out views
         trajectory: what was recorded
         fitted: the field and its baselines
+        shown: the field as it is shipped
+        dial: from the trajectory's slider to the shipped field's
         perceptual: LPIPS, or its stand-in
         clip: measured already, or the reason why not
     """
     field = fitted.chosen.field
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
-    slider = slider_statistics(lambda s: judge.pictures(field.offsets(s)), masks=judge.pixels)
+    slider = slider_statistics(lambda s: judge.pictures(shown.offsets(s)), masks=judge.pixels)
     samples = sample_strengths()[::_EVERY]
     recorded = courses(judge, fields, samples, lambda s: judge.pictures(trajectory.at(s)), perceptual)
-    asked = tuple(sorted(judge.edited))
-    drawn = courses(judge, fields, asked, lambda s: judge.edited[s], perceptual)
+    recorded = {n: replace(c, s=tuple(dial.at(s) for s in c.s)) for n, c in recorded.items()}
+    asked = tuple((dial.at(s), strength) for s, strength in trajectory.asked)
+    drawn = against_editor(judge, {**fields, "slider": shown}, asked, perceptual)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
         (judge.psnr(judge.pictures(field.offsets(s)), judge.pictures(trajectory.at(s))) for s in nodes),
         default=fitted.chosen.worst,
     )
-    return Measured(fitted, slider, worst, recorded, drawn, perceptual.name, clip)
+    return Measured(fitted, shown, dial, asked, slider, worst, recorded, drawn, perceptual.name, clip)
 
 
 def clip_course(judge: Judge, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
@@ -160,6 +176,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
     return {
         "field": {
             **field_figures(fitted.chosen),
+            "parameters": stored_numbers(measured.shown),
             "psnr_at_recordings": round(measured.at_recordings, 2),
             "ssim_mean": _four(sum(course.ssim) / len(course.ssim)),
             "ssim_worst": _four(min(course.ssim)),
@@ -179,8 +196,8 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             "t90": round(slider.t90, 3),
         },
         "between": {
-            f"{s:g}": {"psnr": round(ours, 2), COMPARED: round(plain, 2)}
-            for s, ours, plain in zip(drawn.s, drawn.psnr, linear.psnr, strict=True)
+            f"{round(s, 4):g}": {"psnr": round(ours, 2), COMPARED: round(plain, 2), "strength": strength}
+            for (s, strength), ours, plain in zip(measured.asked, drawn.psnr, linear.psnr, strict=True)
             if s < 1.0
         },
         "edit": {
@@ -235,6 +252,24 @@ def courses(
         name: Course(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
         for name, found in rows.items()
     }
+
+
+def against_editor(
+    judge: Judge,
+    fields: Mapping[str, BakedField],
+    asked: Sequence[tuple[float, float]],
+    perceptual: Perceptual,
+) -> dict[str, Course]:
+    """Each field's errors against the editor's own pictures.
+
+    Args:
+        judge: held-out views with these pictures
+        fields: by name
+        asked: slider value and the strength that the editor was asked at, ascending
+        perceptual: LPIPS, or its stand-in
+    """
+    strength = dict(asked)
+    return courses(judge, fields, tuple(strength), lambda s: judge.edited[strength[s]], perceptual)
 
 
 def _seen(clip: Clip, judge: Judge, views: Sequence[View], offsets: Tensor) -> Tensor:

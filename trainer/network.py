@@ -34,6 +34,7 @@ from trainer.pgs import Stage
 from trainer.preparation import Stand, probes
 from trainer.progress import RunLog
 from trainer.resume import plain_options
+from trainer.settings import slider_meant
 from trainer.state import Saved, StateFolder
 
 PART = "network"
@@ -109,6 +110,8 @@ def begin_alongside(
         )
 
     strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
+    if slider_meant(options.slider, options.editor, strengths) == "even":
+        strengths = [(i + 1) / len(stages) for i in range(len(stages))]
     return Alongside(
         NeuralFit(rows, channels, attributes, settings, seen), channels, strengths, steps, render
     )

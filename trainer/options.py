@@ -139,8 +139,10 @@ class TrainOptions:
     recording: Literal["smooth", "raw"] = "smooth"
     """Record a running mean of the parameters whenever the pictures have moved, and drop jitter; or the bare
     iterates at even steps (paper), between which the slider's steps differ far more."""
-    slider: Slider = "stages"
-    """Slider values: even visible change between the stages' strengths, even overall, or optimiser time."""
+    slider: Slider = "auto"
+    """Slider values. even: equal steps look equally large, and an editor with a dial is asked for pictures
+    that do; stages: s is the editor's own strength, even in between; time: the optimiser's. auto: even, but
+    stages where folder: has pictures of several strengths."""
     field: FieldKind = "auto"
     """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
     keeps every recording."""

@@ -17,6 +17,7 @@ from progdf.region import Region
 from progdf.trajectory import Trajectory, load_trajectory
 from trainer.artefacts import RunFolder
 from trainer.preparation import Stand
+from trainer.trajectory import before_fit
 from trainer.views import make_view, near_enough
 
 
@@ -28,7 +29,7 @@ class FinishedRun:
         folder: its folder
         scene: the original
         region: what was edited
-        trajectory: what was recorded
+        trajectory: what was recorded, on its own slider
         about: what the trajectory's file tells of the run: options, losses, …
     """
 
@@ -64,7 +65,7 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
             "give that one with --scene"
         )
     region = Region(about["options"]["name"], extra["members"], score)
-    return FinishedRun(folder, gaussians, region, trajectory, about)
+    return FinishedRun(folder, gaussians, region, before_fit(trajectory, extra), about)
 
 
 def its_views(run: FinishedRun) -> Stand:

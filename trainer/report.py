@@ -19,6 +19,10 @@ from trainer.plots import PAPER, Plot, Points, draw_plot
 
 SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
 
+Columns = Sequence[tuple[float, float | None]]
+"""Slider value of each picture, and the strength at which the editor was asked there; None: it was not."""
+
+_CLOSE = 1 / 16  # a picture is shown where the editor was asked if that is so near
 _SPAN = (0.0, 1.0)
 _THUMBNAIL, _PLOT_HEIGHT = 240, 270
 _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
@@ -33,15 +37,16 @@ def report_picture(judge: Judge, measured: Measured, losses: Losses, title: str)
         losses: mean of every loss term per recording
         title: one line
     """
-    chosen, linear = measured.fitted.chosen.field, measured.fitted.baselines[COMPARED].field
+    chosen, linear = measured.shown, measured.fitted.baselines[COMPARED].field
+    columns = columns_of(measured.asked)
     sheet = to_picture(
         contact_sheet(
-            [strip(judge, chosen), editor_strip(judge), strip(judge, linear)],
+            [strip(judge, chosen, columns), editor_strip(judge, columns), strip(judge, linear, columns)],
             ["slider", "the editor", "2 keyframes"],
-            [f"s = {s:g}" for s in SHOWN],
+            [headed(*column) for column in columns],
             title,
             f"held-out view {judge.names[best_view(judge)]}"
-            + ("" if set(SHOWN[1:]) <= set(judge.edited) else "; grey: the editor was not asked"),
+            + ("; grey: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
     rows = [_against_trajectory(measured)]
@@ -56,18 +61,31 @@ def best_view(judge: Judge) -> int:
     return max(range(len(judge.pixels)), key=lambda i: int(judge.pixels[i].sum()))
 
 
-def strip(judge: Judge, field: BakedField, width: int = _THUMBNAIL) -> list[Tensor]:
+def columns_of(asked: Sequence[tuple[float, float]]) -> Columns:
+    """Five slider values to show: `SHOWN`, or close by where the editor was asked.
+
+    Args:
+        asked: slider value and the strength that the editor was asked at, ascending, the last (1, 1)
+    """
+    columns: list[tuple[float, float | None]] = [(0.0, 0.0)]
+    for s in SHOWN[1:]:
+        at, strength = min(asked, key=lambda pair: abs(pair[0] - s))
+        columns.append((at, strength) if abs(at - s) <= _CLOSE else (s, None))
+    return columns
+
+
+def strip(judge: Judge, field: BakedField, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
     """The best view at five strengths, as thumbnails of one size."""
     best = best_view(judge)
-    return [thumbnail(judge.pictures(field.offsets(s))[best], width) for s in SHOWN]
+    return [thumbnail(judge.pictures(field.offsets(s))[best], width) for s, _ in columns]
 
 
-def editor_strip(judge: Judge, width: int = _THUMBNAIL) -> list[Tensor]:
+def editor_strip(judge: Judge, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
     """What the editor makes of the best view; grey where it was not asked."""
     best = best_view(judge)
     blank = torch.full((*judge.crops[best].size, 3), 0.94)
     original = judge.crops[best].original().clamp(0, 1)
-    own = [original if s == 0 else judge.edited[s][best] if s in judge.edited else blank for s in SHOWN]
+    own = [original, *(blank if at is None else judge.edited[at][best] for _, at in columns[1:])]
     return [thumbnail(image, width) for image in own]
 
 
@@ -82,7 +100,8 @@ def thumbnail(image: Tensor, width: int) -> Tensor:
 
 
 def _against_trajectory(measured: Measured) -> list[Plot]:
-    fitted, s = measured.fitted, sample_strengths()
+    fitted = measured.fitted
+    s = [measured.dial.at(s) for s in sample_strengths()]
     fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
     curves: dict[str, Points] = {
         f"{_words(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
@@ -170,6 +189,12 @@ def _lines(courses: Mapping[str, Course], value: Callable[[Course], Sequence[flo
 
 def _distance(measured: Measured) -> str:
     return "LPIPS" if measured.perceptual.startswith("lpips") else measured.perceptual
+
+
+def headed(s: float, asked: float | None) -> str:
+    """What stands above a column; the editor's strength where it is another number."""
+    own = "" if asked is None or abs(asked - s) < 5e-3 else f", editor {asked:.2g}"
+    return f"s = {round(s, 2):g}{own}"
 
 
 def _words(name: str) -> str:

@@ -21,6 +21,7 @@ from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
 from trainer.editors import VIEW_BY_VIEW, check_editor, make_editor
 from trainer.editors.base import EditKind
+from trainer.evenness import even_strengths
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
 from trainer.followers import followers_of
@@ -45,8 +46,9 @@ from trainer.reedit import reedit
 from trainer.regions import region_kinds, region_settings
 from trainer.reopen import its_views, reopened
 from trainer.resume import kept_region, one_line, open_session, plain_options, still_there
-from trainer.settings import loss_weights, stages_to_ask
+from trainer.settings import loss_weights, slider_meant, stages_to_ask
 from trainer.training import retimed, trained
+from trainer.trajectory import before_fit
 from trainer.views import pictured
 
 __all__ = ["RunResult", "refit", "train", "use_threads"]
@@ -131,7 +133,8 @@ def _trained(
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
-    trajectory, _, about = load_trajectory(folder.trajectory)
+    trajectory, extra, about = load_trajectory(folder.trajectory)
+    trajectory = before_fit(trajectory, extra)
     measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
     begun = folder.state.load(NETWORK)
     return finished(folder, stand, trajectory, about, measure, log, options.field, begun)
@@ -166,6 +169,8 @@ def _edited(
     editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
     kind: EditKind = editor.kind if options.kind == "auto" else options.kind
     strengths = strengths_to_ask(editor, stages_to_ask(options, kind))
+    if slider_meant(options.slider, options.editor, strengths) == "even":
+        strengths = even_strengths(editor, options.editor, views, strengths)
     confined = to_confine(editor, options, kind)
     with log.steps("edit", len(views) * len(strengths)) as advance:
         edited = edited_views(editor, views, strengths, folder, confined, advance)

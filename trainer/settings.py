@@ -35,13 +35,16 @@ whose views disagreed, 800 steps: 8 stages 25.0 20.5 18.1, even .00; one target 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from progdf.gaussians import BASE_CHANNELS
+from trainer.editors import GIVEN
 from trainer.editors.base import EditKind
 from trainer.groups import GROWTH
 from trainer.objective import LossWeights, Sharpness
 from trainer.options import MOST_STAGES, QUICK_STAGES, STAGE_STEPS, TrainOptions
 from trainer.pgs import PgsSettings, learning_rates
+from trainer.trajectory import Slider
 
 PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"colour": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: dict[EditKind, Sharpness] = {"colour": "off", "style": "hinge", "geometry": "off"}
@@ -54,6 +57,19 @@ def stages_to_ask(options: TrainOptions, kind: EditKind) -> int:
     most = STAGES[kind]
     hurried = options.quick or options.steps < STAGE_STEPS * most
     return options.stages or min(most, QUICK_STAGES if hurried else most)
+
+
+def slider_meant(slider: Slider, editor: str, strengths: Sequence[float]) -> Slider:
+    """What "auto" means: even, but pinned where somebody gave pictures of several strengths.
+
+    Args:
+        slider: the option
+        editor: `KIND:WHAT`
+        strengths: of the stages
+    """
+    if slider != "auto":
+        return slider
+    return "stages" if len(strengths) > 1 and editor.partition(":")[0] in GIVEN else "even"
 
 
 def loss_weights(options: TrainOptions, kind: EditKind) -> LossWeights:

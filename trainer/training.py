@@ -26,7 +26,7 @@ from trainer.options import TrainOptions
 from trainer.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
-from trainer.settings import loss_weights, pgs_settings
+from trainer.settings import loss_weights, pgs_settings, slider_meant
 from trainer.sheen import NEEDED, view_dependence
 from trainer.state import Autosave, Resumable, Saved, StateFolder
 from trainer.trajectory import record, retime, straightened
@@ -248,7 +248,8 @@ def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Traj
 
     if options.recording == "smooth":
         trajectory = straightened(trajectory, seen)
-    return retime(trajectory, seen, options.slider)
+    slider = slider_meant(options.slider, options.editor, trajectory.strengths)
+    return retime(trajectory, seen, slider)
 
 
 def _shared(steps: int, stages: int) -> list[int]:

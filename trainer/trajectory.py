@@ -1,23 +1,27 @@
 """Recording a trajectory: which snapshots stay, and at which slider value each of them lies.
 
-The slider is visible change, not time (method.md 3, recording): between two stages, whose strengths are
-pinned, equal steps of the slider change the pictures equally.
+The slider is visible change, not time (method.md 3, recording): equal steps of it change the pictures
+equally, over the whole slider or between two stages that are pinned.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from progdf.trajectory import Trajectory
+from progdf.field.dial import Dial, interpolated
+from progdf.trajectory import Trajectory, load_trajectory, save_trajectory
 
-Slider = Literal["stages", "even", "time"]
+Slider = Literal["auto", "even", "stages", "time"]
+"""How a slider is laid over what was recorded; auto becomes one of the others (`settings.slider_meant`)."""
 
+_BEFORE = "s_before_fit"
 _LEAST_GAP = 1e-4  # slider values of neighbouring recordings stay apart by this
 
 
@@ -29,7 +33,7 @@ def record(
     Args:
         snapshots: (step, stage, ends_stage, offsets [M,C] float16) in order; the original is added before
         them end: the last offsets in full precision. [M,C] float32
-        strengths: slider value of each stage's end
+        strengths: what the editor was asked for, of each stage
     """
     offsets = torch.stack([torch.zeros_like(snapshots[0][3]), *(offset for *_, offset in snapshots)])
     steps = torch.tensor([0, *(step for step, *_ in snapshots)])
@@ -61,6 +65,8 @@ def retime(
         passes: how often to repeat
         samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
+    if slider == "auto":
+        raise ValueError("'auto' says no slider; see settings.slider_meant")
     if slider == "time":
         return replace(trajectory, s=_placed(0.0, 1.0, trajectory.steps.double()).float())
     if slider == "stages":
@@ -81,7 +87,7 @@ def retime(
             count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
             progress = _cumulative(_chords([render(trajectory.at(float(x))) for x in even]))
-            s[nodes] = _placed(low, high, _interpolate(s[nodes], even, progress))
+            s[nodes] = _placed(low, high, interpolated(s[nodes], even, progress))
     return replace(trajectory, s=s.float())
 
 
@@ -130,6 +136,23 @@ def straightened(
     )
 
 
+def before_fit(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajectory:
+    """A trajectory read from its file, as it was before a field's slider was laid over it (`lay_over`)."""
+    return replace(trajectory, s=extra.get(_BEFORE, trajectory.s))
+
+
+def lay_over(path: Path, dial: Dial) -> Trajectory:
+    """Move the recordings in a trajectory's file to where the fitted field shows them, so that one can be
+    held against the other; and keep where they were, from which the next field is fitted.
+    """
+    trajectory, extra, about = load_trajectory(path)
+    before = before_fit(trajectory, extra)
+    moved = replace(before, s=dial(before.s).float())
+    if not torch.equal(moved.s, trajectory.s):
+        save_trajectory(path, moved, {**extra, _BEFORE: before.s}, about)
+    return moved
+
+
 def _chords(pictures: Sequence[Tensor]) -> Tensor:
     """Mean absolute difference of neighbours. [n-1] float64"""
     pairs = pairwise(pictures)
@@ -141,13 +164,6 @@ def _cumulative(lengths: Tensor) -> Tensor:
     total = float(lengths.sum())
     lengths = lengths if total > 0 else torch.ones_like(lengths)
     return torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / lengths.sum()])
-
-
-def _interpolate(x: Tensor, nodes: Tensor, values: Tensor) -> Tensor:
-    """Piecewise linear through (nodes, values). [n], [k], [k] -> [n]"""
-    right = torch.searchsorted(nodes, x).clamp(1, len(nodes) - 1)
-    share = (x - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
-    return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
 
 
 def _placed(low: float, high: float, progress: Tensor) -> Tensor:

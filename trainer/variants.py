@@ -10,7 +10,7 @@ from progdf.errors import ProgdfError
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.presets import PRESETS
-from trainer.settings import PERCEPTUAL_WEIGHT, SHARPNESS
+from trainer.settings import PERCEPTUAL_WEIGHT, SHARPNESS, slider_meant
 
 BASE, LINEAR = "base", "2-keyframes"
 
@@ -53,7 +53,7 @@ VARIANTS = (
     Variant("no-lpips", "L1 alone", {"perceptual_weight": 0.0}),
     Variant("no-sh", "view-dependent colour left as it is", {"sh": "off"}),
     Variant("no-groups", "parts are not moved as wholes first", {"group_steps": 0}),
-    Variant("slider-stages", "even between the stages' strengths", {"slider": "stages"}),
+    Variant("slider-stages", "the editor's own strengths, even in between", {"slider": "stages"}),
     Variant("slider-even", "even over the whole slider", {"slider": "even"}),
     Variant("slider-time", "the optimiser's time", {"slider": "time"}),
     Variant("paper", "all as the paper prints it", _AS_PRINTED),
@@ -74,12 +74,12 @@ def sensible(options: TrainOptions, kind: EditKind, stages: int, sh_degree: int)
         *(() if sh_degree > 0 else ("no-sh",)),
         *(() if kind == "geometry" else ("no-groups",)),
     }
-    own = _resolved(options, kind)
+    own = _resolved(options, kind, stages)
     return [
         variant
         for variant in VARIANTS
         if variant.name not in idle
-        and (not variant.changes or _resolved(replace(options, **variant.changes), kind) != own)
+        and (not variant.changes or _resolved(replace(options, **variant.changes), kind, stages) != own)
     ]
 
 
@@ -97,8 +97,9 @@ def chosen(variants: Sequence[Variant], only: str) -> list[Variant]:
     return [variant for variant in variants if not names or variant.name in names]
 
 
-def _resolved(options: TrainOptions, kind: EditKind) -> TrainOptions:
+def _resolved(options: TrainOptions, kind: EditKind, stages: int) -> TrainOptions:
     """With the kind's own values in place of "auto" and None."""
     weight = PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight
     sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness
-    return replace(options, perceptual_weight=weight, sharpness=sharpness)
+    slider = slider_meant(options.slider, options.editor, (1.0,) * stages)
+    return replace(options, perceptual_weight=weight, sharpness=sharpness, slider=slider)

@@ -33,6 +33,12 @@ and the settings of learned editors."""
 VIEW_BY_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
 
+GIVEN = ("folder", "photographs")
+"""Kinds whose pictures were made elsewhere, at the strengths that they were made at."""
+
+COSTLY_DIAL = ("instruct",)
+"""Kinds that paint every strength anew: what a model takes its time for is not done to look around."""
+
 EXAMPLES = (
     "recolor:#3060d0",
     "tint:#d4af37",
@@ -66,7 +72,9 @@ def make_editor(
 
 
 __all__ = [
+    "COSTLY_DIAL",
     "EDITORS",
+    "GIVEN",
     "VIEW_BY_VIEW",
     "EditorSettings",
     "ImageEditor",
