@@ -9,7 +9,7 @@ from networks import FORMS, MEMBERS, baked, network, rows
 from torch import Tensor
 
 from progdf.field import baked_neural
-from progdf.field.bake import NeuralForm, bake_nodes
+from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
 from progdf.field.judge import FieldJudge
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -71,3 +71,23 @@ def test_a_form_refuses_other_numbers_of_members() -> None:
     assert isinstance(form, NeuralForm)
     with pytest.raises(ValueError, match="expected 40"):
         form.baked(rows()[:39])
+
+
+def test_a_looser_bake_has_fewer_bases() -> None:
+    tight, loose = (baked_neural(network(), rows(), tolerance=given).origin for given in (1e-3, 0.3))
+    assert tight is not None
+    assert loose is not None
+    assert sum(loose.plan.ranks.values()) < sum(tight.plan.ranks.values())
+
+
+def test_the_error_of_a_bake_is_not_that_of_the_network_at_the_end() -> None:
+    form = baked("position").origin  # which misses the end by much, as all members see is their place
+    assert form is not None
+    assert form.error is not None
+    assert form.error["rms"] < 0.02
+
+
+@pytest.mark.parametrize("count", [1, 258])
+def test_a_plan_of_too_few_or_too_many_nodes_is_refused(count: int) -> None:
+    with pytest.raises(ValueError, match="expected 2 to 257"):
+        BakePlan(torch.linspace(0, 1, count), {}, {})
