@@ -32,3 +32,30 @@ def test_the_floor_in_pictures_is_that_of_the_neighbours() -> None:
 def test_a_lone_member_has_no_neighbours() -> None:
     strengths, offsets = curved_trajectory(1)
     assert position_floor(strengths, offsets, torch.zeros(1, 3)).unpredictable["means"] == 1.0
+
+
+def test_movement_that_does_not_show_is_not_counted() -> None:
+    places = torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
+    strengths, offsets = smooth_trajectory(places)
+    hidden = places[:, 0] > 0
+    noise = torch.randn(400, 3, generator=torch.Generator().manual_seed(1))
+    offsets[1:, hidden, 11:14] += noise[hidden]
+    evenly = position_floor(strengths, offsets, places).unpredictable["sh0"]
+    shown = position_floor(strengths, offsets, places, (~hidden).float()).unpredictable["sh0"]
+    assert shown < 0.5 * evenly
+
+
+def test_as_many_neighbours_are_asked_as_tell_most() -> None:
+    pairs = torch.arange(20.0).repeat_interleave(2)
+    places = torch.stack([pairs * 10 + torch.tensor([0.0, 0.1]).repeat(20)] * 3, dim=1)
+    moved = torch.randn(20, 14, generator=torch.Generator().manual_seed(3)).repeat_interleave(2, dim=0)
+    found = position_floor(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros(40, 14), moved]), places)
+    assert found.neighbours == 1
+    assert max(found.unpredictable.values()) < 1e-6
+
+
+def test_members_that_move_together_are_foretold_between_snapshots_too() -> None:
+    strengths = torch.tensor([0.0, 1.0])
+    offsets = strengths[:, None, None].expand(2, 9, 14).clone()
+    judge = FieldJudge(strengths, offsets, lambda moved: moved[:, 11:14])
+    assert position_floor(strengths, offsets, torch.rand(9, 3), judge=judge).psnr_worst == 99.0
