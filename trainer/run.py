@@ -261,6 +261,10 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
     try:
         with log.stage("views"):
             stand = its_views(run)
+            names = [view.camera.name for view in stand.train]
+            edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
+            # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
+            stand = widened(stand, edited)
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
