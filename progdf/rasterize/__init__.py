@@ -125,6 +125,7 @@ def render(
         camera.width,
         camera.height,
         background,
+        camera.near,
         sh_degree=degree,
         antialiased=antialiased,
         engine=engine,
