@@ -68,11 +68,11 @@ def draw(
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
         _anchor(label, mouse, value)
     elif held or let_go():  # a slow frame may hold the last move and the release
-        fine = imgui.get_io().key_shift
-        if storage.get_bool(_slot(label, "fine")) != fine:
-            _anchor(label, mouse, value)
-        moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if fine else 1.0)
+        was_fine = storage.get_bool(_slot(label, "fine"))
+        moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if was_fine else 1.0)
         value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
+        if was_fine != imgui.get_io().key_shift:
+            _anchor(label, mouse, value)  # after the move: a slow frame holds both
     colour = fill if active else PALETTE.faint
     _paint(start, top, span, radius, value, ticks, scale, colour, hovered or held, most)
     return value
