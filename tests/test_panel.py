@@ -171,11 +171,11 @@ def test_a_move_in_the_same_frame_as_shift_still_counts_in_full(hand: Hand) -> N
     hand.button(True)
     imgui.get_io().add_mouse_pos_event(at(0.7) * hand.ui.scale, TRACKS[0] * hand.ui.scale)
     hand.hold(imgui.Key.mod_shift, True)
-    assert hand.strengths[0] == pytest.approx(0.7, abs=1e-3)
+    assert hand.strengths[0] == pytest.approx(0.7, abs=4e-3)
     hand.move(at(0.8), TRACKS[0])
     hand.button(False)
     hand.hold(imgui.Key.mod_shift, False)
-    assert hand.strengths[0] == pytest.approx(0.71, abs=1e-3)
+    assert hand.strengths[0] == pytest.approx(0.71, abs=4e-3)
 
 
 def test_a_slider_can_be_set_to_within_half_a_per_cent_by_the_mouse_alone() -> None:
