@@ -6,12 +6,12 @@ from dataclasses import replace
 from functools import cache
 
 import torch
-from edits import curved_trajectory, some_rows
-from scenes import random_gaussians
 from torch import Tensor
 
 from progdf.field import BakedField, NeuralField, NeuralSettings, baked_neural, fit_neural
 from progdf.gaussians import Gaussians, pack
+from tests.edits import curved_trajectory, some_rows
+from tests.scenes import random_gaussians
 
 MEMBERS = 40
 SHORT = NeuralSettings(steps=40, batch=64, code=3)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ui_rig import bear, first_view
 
 from progdf.layers import Gains
+from tests.ui_rig import bear, first_view
 from viewer import document, paint, session, snapshots
 from viewer.session import Session
 from viewer.state import Comparison, Keyframe, Timeline, ViewState

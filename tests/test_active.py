@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from edits import curved_field, curved_trajectory, linear_pictures
-from scenes import random_gaussians
 
 from progdf.camera import orbit_rig
 from progdf.field import BakedField, Candidate, FieldJudge, NeuralSettings, baked_neural, fit_neural
@@ -17,6 +15,8 @@ from progdf.field.rendered import Render
 from progdf.gaussians import pack
 from progdf.rasterize import render
 from progdf.region import Region
+from tests.edits import curved_field, curved_trajectory, linear_pictures
+from tests.scenes import random_gaussians
 from trainer.active import drop_invisible
 from trainer.fit import Fitted
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from edits import curved_trajectory
 from torch import Tensor
 
 from progdf.checkpoint import load_gdf
@@ -17,6 +16,7 @@ from progdf.field import neural_fit
 from progdf.field.neural_fit import NeuralFit, NeuralSettings
 from progdf.ply import load_ply
 from progdf.trajectory import load_trajectory
+from tests.edits import curved_trajectory
 from tests.trained import quick_options, write_bear
 from trainer.bank import Alongside, MemoryBank
 from trainer.options import FitOptions, check_network_options, settled

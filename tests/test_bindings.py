@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 from imgui_bundle import imgui
-from ui_rig import Rig, rig
 
+from tests.ui_rig import Rig, rig
 from viewer import bindings, controls
 from viewer.ui_context import SMALL_PX
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
-from ui_rig import Rig, bear, first_view, rig
 
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer.state import Brush, Keyframe, Timeline
 from viewer.timeline_bar import HEIGHT_PX
 

@@ -11,11 +11,11 @@ import moderngl
 import numpy as np
 import pytest
 import torch
-from ui_rig import rig
 
 from progdf.gaussians import Gaussians
 from progdf.metrics import psnr
 from progdf.scenes import bear
+from tests.ui_rig import rig
 from viewer import controls, turntable, workspace
 from viewer.engine import Engine
 from viewer.headless import headless_context

@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from edits import curved_field, edit_of, some_rows
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenes import random_gaussians
 
 from progdf.checkpoint import (
     FORMAT,
@@ -28,6 +26,8 @@ from progdf.checkpoint import (
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
+from tests.edits import curved_field, edit_of, some_rows
+from tests.scenes import random_gaussians
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import torch
-from edits import curved_field, curved_trajectory, linear_pictures
 from torch import Tensor
 
 from progdf.field import Candidate, FieldJudge, choose_field, fit_separable
 from progdf.field.choose import _chosen, separable_within
 from progdf.field.rendered import rendered_courses
+from tests.edits import curved_field, curved_trajectory, linear_pictures
 
 
 def test_the_best_field_is_the_one_whose_worst_picture_is_best() -> None:

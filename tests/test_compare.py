@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from ui_rig import Rig, bear, first_view, rig
 
 from progdf.__main__ import main
 from progdf.metrics import psnr
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import compare
 from viewer.state import Comparison, ViewState
 

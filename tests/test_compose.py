@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from edits import bits, curved_field, edit_of, some_rows
-from scenes import random_gaussians
 
 from progdf.checkpoint import Gdf
 from progdf.compose import BLENDS, Gains, Layer, compose
@@ -16,6 +14,8 @@ from progdf.composer import Composer
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
 from progdf.rasterize import set_threads
+from tests.edits import bits, curved_field, edit_of, some_rows
+from tests.scenes import random_gaussians
 
 COLOUR = ("sh0", "shN")
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scenes import random_gaussians
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.scenes import bear
+from tests.scenes import random_gaussians
 from viewer import controls, turntable, workspace
 from viewer.layer_rows import LayerRow
 from viewer.state import LayerState, Vec3, ViewCamera, ViewState

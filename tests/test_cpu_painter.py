@@ -12,7 +12,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from stacks import Stack, bear_stack
 
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf, fingerprint
@@ -21,6 +20,7 @@ from progdf.gaussians import Gaussians
 from progdf.pixel_cells import CELL, mark_cells, no_cells
 from progdf.rasterize import render
 from progdf.region import Region
+from tests.stacks import Stack, bear_stack
 from viewer import cpu_painter
 from viewer.engine import Engine
 from viewer.gl.screen import read_rgb

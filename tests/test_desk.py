@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from null_app import null_app, press
-from sessions import bear_files, full_view, opened_document, saved_session, spoilt
-from ui_rig import bear, first_view
 
 from progdf.camera_files import save_cameras
 from progdf.ply import save_ply
+from tests.null_app import null_app, press
+from tests.sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from tests.ui_rig import bear, first_view
 from viewer import app as application
 from viewer import desk, recent, session
 from viewer.turntable import to_camera

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ui_rig import Rig, bear, first_view, rig
 
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import draft
 from viewer.draft import COARSE, REST_S, SLOW_MS, Draft
 from viewer.engine import FrameTimings

@@ -10,17 +10,17 @@ import moderngl
 import numpy as np
 import pytest
 import torch
-from edits import curved_field, curved_trajectory, edit_of, some_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scenes import random_gaussians
 
 from progdf.checkpoint import Gdf
 from progdf.compose import BLENDS, Gains, Layer, compose
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import ATTRIBUTES, Gaussians
+from tests.edits import curved_field, curved_trajectory, edit_of, some_rows
+from tests.scenes import random_gaussians
 from viewer.edit_sample import EditSample, difference
 from viewer.gl import edit_pass as edit_pass_module
 from viewer.gl.edit_pass import EditPass, EditPassError

@@ -12,12 +12,12 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from stacks import Stack, bear_stack
 
 from progdf.compose import BLENDS, Gains, Layer, compose
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import render
+from tests.stacks import Stack, bear_stack
 from viewer import engine as engine_module
 from viewer.editing import GpuEditing
 from viewer.engine import Engine, FrameTimings

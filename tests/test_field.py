@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -16,6 +15,7 @@ from progdf.field.choose import separable_within
 from progdf.field.rendered import rendered_courses
 from progdf.field.separable import channel_weights, stored_bases
 from progdf.gaussians import ATTRIBUTES, attribute_slices
+from tests.edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
 
 EVERYTHING = dict.fromkeys(ATTRIBUTES, 2)
 REST_TYPES = [torch.int8, torch.float16, torch.float32]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from edits import curved_trajectory
-from networks import smooth_trajectory
 
 from progdf.field import position_floor
 from progdf.field.judge import FieldJudge
+from tests.edits import curved_trajectory
+from tests.networks import smooth_trajectory
 
 
 def test_a_smooth_edit_is_told_by_the_neighbours_and_a_random_one_is_not() -> None:

@@ -12,13 +12,13 @@ import moderngl
 import numpy as np
 import pytest
 import torch
-from scenes import front_camera, hard_cases, one_gaussian, orbit_camera, random_gaussians
 
 from progdf.camera import Camera, orbit_rig
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.ply import load_ply
 from progdf.rasterize import render
 from progdf.scenes import bear
+from tests.scenes import front_camera, hard_cases, one_gaussian, orbit_camera, random_gaussians
 from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.scene_textures import row_runs
 from viewer.gl.splats import SplatRenderer

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from edits import at_snapshots, curved_trajectory
 
 from progdf.field.joint import fit_joint
 from progdf.gaussians import attribute_slices
+from tests.edits import at_snapshots, curved_trajectory
 
 
 def test_joint_factors_of_every_rank_are_a_recording_again() -> None:

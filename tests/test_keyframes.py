@@ -8,11 +8,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from edits import at_snapshots, curved_trajectory
 
 from progdf.field import fit_keyframes, fit_lossless
 from progdf.field.baked import REST_TYPES
 from progdf.field.keyframes import bending_snapshots, even_snapshots
+from tests.edits import at_snapshots, curved_trajectory
 
 
 def test_all_snapshots_kept_are_met_exactly() -> None:

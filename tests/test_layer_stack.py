@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 from imgui_bundle import imgui
-from stacks import Stack, bear_stack
-from ui_rig import Rig, bear, first_view, rig
 
 from progdf.__main__ import main
 from progdf.compose import Gains, Layer, compose
@@ -18,6 +16,8 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES
 from progdf.layers import BLENDS
 from progdf.ply import load_ply
+from tests.stacks import Stack, bear_stack
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import change_curve, layer_fold, panel, stack
 from viewer.layer_arguments import stack_of
 from viewer.layer_rows import layer_rows

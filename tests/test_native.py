@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from null_app import null_app, press
-from ui_rig import bear, first_view, rig
 
+from tests.null_app import null_app, press
+from tests.ui_rig import bear, first_view, rig
 from viewer import document, native, session
 from viewer.app import App
 from viewer.workspace import Dialog

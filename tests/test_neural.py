@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from edits import curved_trajectory
-from networks import FORMS, MEMBERS, network, rows
 
 from progdf.field.neural import NeuralShape, course
 from progdf.gaussians import attribute_slices
+from tests.edits import curved_trajectory
+from tests.networks import FORMS, MEMBERS, network, rows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

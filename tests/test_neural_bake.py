@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from edits import curved_trajectory
-from networks import FORMS, MEMBERS, baked, network, rows
 from torch import Tensor
 
 from progdf.field import baked_neural
 from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
 from progdf.field.judge import FieldJudge
+from tests.edits import curved_trajectory
+from tests.networks import FORMS, MEMBERS, baked, network, rows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

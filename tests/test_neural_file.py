@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from edits import edit_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from networks import FORMS, MEMBERS, baked, members, rows, scene
 from torch import Tensor
 
 from progdf.checkpoint import Gdf, _checksum, load_gdf, open_gdf, save_gdf
@@ -20,6 +18,8 @@ from progdf.compose import compose
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.layers import Layer
+from tests.edits import edit_of
+from tests.networks import FORMS, MEMBERS, baked, members, rows, scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

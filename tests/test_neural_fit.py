@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from edits import curved_trajectory
-from networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
 from torch import Tensor
 
 from progdf.field import NeuralSettings, baked_neural, fit_neural
 from progdf.field.neural_fit import NeuralFit, rendered_importance, trained
+from tests.edits import curved_trajectory
+from tests.networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

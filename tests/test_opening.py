@@ -10,12 +10,12 @@ import pytest
 import torch
 from PIL import Image
 from test_session import full_view
-from ui_rig import bear
 
 from progdf.__main__ import main
 from progdf.gaussians import ATTRIBUTES, normalize_quats
 from progdf.layers import Gains
 from progdf.ply import load_ply
+from tests.ui_rig import bear
 from viewer import document, film, session, timeline
 from viewer.engine import Engine
 from viewer.session import Session

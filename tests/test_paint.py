@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from imgui_bundle import imgui
-from ui_rig import Rig, bear, first_view, rig
 
 from progdf.camera import Camera
 from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import paint
 from viewer.layer_arguments import stack_of
 from viewer.paint import Stroke

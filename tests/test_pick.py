@@ -8,11 +8,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import front_camera, orbit_camera, random_gaussians
-from ui_rig import bear
 
 from progdf.gaussians import Gaussians
 from progdf.rasterize import rasterize
+from tests.scenes import front_camera, orbit_camera, random_gaussians
+from tests.ui_rig import bear
 from viewer.pick import surface_point
 from viewer.turntable import first_camera, to_camera
 

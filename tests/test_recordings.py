@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from stacks import recording_of
 from test_compare import BANNER, SIZE, beside_line
-from ui_rig import Rig, bear, first_view, rig
 
 from progdf.__main__ import main
 from progdf.checkpoint import save_gdf
@@ -23,6 +21,8 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import pack
 from progdf.metrics import psnr
 from progdf.trajectory import FILE_NAME, save_trajectory
+from tests.stacks import recording_of
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import compare, compare_labels, recordings
 from viewer.engine import Engine
 from viewer.recordings import Recording

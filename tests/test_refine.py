@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from edits import curved_trajectory, linear_pictures
 
 from progdf.field import BakedField, FieldJudge, choose_field, fit_separable
 from progdf.field.refine import refined
 from progdf.field.rendered import Render
 from progdf.gaussians import ATTRIBUTES
+from tests.edits import curved_trajectory, linear_pictures
 
 ONE = dict.fromkeys(ATTRIBUTES, 1)
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from stacks import Stack, bear_stack
 
 from progdf.__main__ import main
 from progdf.camera import Camera
@@ -21,6 +20,7 @@ from progdf.compose import Layer, compose
 from progdf.gaussians import ATTRIBUTES
 from progdf.ply import load_ply
 from progdf.rasterize import render
+from tests.stacks import Stack, bear_stack
 from viewer import film
 from viewer.arguments import fitted, layers_of, load_edits, parse_orbit, read_camera
 from viewer.state import ViewCamera

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from sessions import bear_files, full_view, opened_document, saved_session, spoilt
-from ui_rig import bear, first_view
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.info import kind_of
 from progdf.ply import save_ply
 from progdf.session_file import read_session, sha256
+from tests.sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from tests.ui_rig import bear, first_view
 from viewer import app as application
 from viewer import plain, session
 from viewer.session import Session

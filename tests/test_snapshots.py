@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ui_rig import bear, first_view, rig
 
+from tests.ui_rig import bear, first_view, rig
 from viewer import app as application
 from viewer import snapshots, workspace
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 from PIL import Image
-from ui_rig import Rig, bear, rig
 
+from tests.ui_rig import Rig, bear, rig
 from viewer.gl import edit_pass
 
 pytestmark = pytest.mark.gl

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from imgui_bundle import imgui
-from ui_rig import Rig, bear, first_view, rig
 
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer.inputs import Keys, Press
 from viewer.state import LayerState
 from viewer.turntable import axes, eye, frame

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from ui_rig import bear
 
 from progdf.checkpoint import Gdf, load_gdf
 from progdf.gaussians import Gaussians
+from tests.ui_rig import bear
 from viewer import arguments, render, threads
 
 

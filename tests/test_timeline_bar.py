@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from ui_rig import STEP_S, Rig, bear, first_view, rig
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from tests.ui_rig import STEP_S, Rig, bear, first_view, rig
 from viewer import film, panel, timeline, timeline_bar, timeline_file
 from viewer.headless import headless_context, is_software
 from viewer.state import Keyframe, Timeline, ViewState

@@ -9,11 +9,11 @@ import moderngl
 import numpy as np
 import pytest
 import torch
-from stacks import Stack
-from ui_rig import bear, first_view, rig
 
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
+from tests.stacks import Stack
+from tests.ui_rig import bear, first_view, rig
 from viewer import paint, tint
 from viewer.engine import Engine
 from viewer.headless import headless_context

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imgui_bundle import imgui
-from ui_rig import Rig, bear, first_view, rig
 
 from progdf.errors import ProgdfError
+from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import panel
 from viewer.engine import FrameTimings
 from viewer.headless import headless_context, is_software

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from ui_rig import bear, first_view
 
 from progdf.checkpoint import save_gdf
 from progdf.ply import save_ply
+from tests.ui_rig import bear, first_view
 from viewer import app as application
 from viewer import controls, panel, timeline_file
 from viewer.session import open_session

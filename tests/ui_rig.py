@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from imgui_bundle import imgui
 from numpy.typing import NDArray
-from stacks import Stack, bear_stack
 
+from tests.stacks import Stack, bear_stack
 from viewer import panel
 from viewer.document import Document
 from viewer.engine import Engine
