@@ -67,6 +67,18 @@ def type_name(hand: Rig, text: str, end: imgui.Key = imgui.Key.enter) -> None:
     hand.frame(2)
 
 
+def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> None:
+    top, left = round(HEADS) - 12, POINTS[0] - 80
+    hand.move(*hand.slider(0, 0.5))
+    hand.press()
+    before = hand.image()[top : top + 24, left:]
+    hand.move(*hand.slider(0, 0.8))
+    shown = hand.image()[top : top + 24, left:]
+    hand.frame(3)
+    assert (shown != before).any()
+    np.testing.assert_array_equal(hand.image()[top : top + 24, left:], shown)
+
+
 def test_what_is_alone_shows_though_its_eye_is_closed_and_nothing_else_does() -> None:
     view = stack.soloed(THREE, 1)
     view = stack.changed(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))

@@ -179,7 +179,7 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
         imgui.WindowFlags_.no_nav.value,
     )
     card = _head(_Card(state), index, row, cards.renaming == index, active, ui)
-    layer = card.state.layers[index]
+    number_at, layer = imgui.get_item_rect_min(), card.state.layers[index]
     imgui.begin_disabled(layer.locked)
     strength = strength_slider.draw(
         "##strength",
@@ -193,6 +193,7 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
     )
     touched = imgui.is_item_active()
     imgui.end_disabled()
+    _number(number_at, strength, active)
     card = replace(card, state=stack.changed(card.state, index, lambda old: replace(old, strength=strength)))
     card = _foot(card, index, row, ui)
     if layer.gdf in card.state.unfolded:
@@ -220,8 +221,8 @@ def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], scale: float) -> None:
 
 
 def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, ui: UiContext) -> _Card:
-    scale, p = ui.scale, PALETTE
-    state, layer = card.state, card.state.layers[index]
+    """Eye, swatch, name, and last the place of the number, which is drawn when the slider has its value."""
+    scale, state, layer = ui.scale, card.state, card.state.layers[index]
     right = right_edge()
     if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
         if imgui.get_io().key_alt:
@@ -232,18 +233,22 @@ def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, 
     imgui.same_line()
     _swatch(row.swatch, active, ui)
     imgui.same_line()
-    number = f"{layer.strength:.3f}"
-    number_width = imgui.calc_text_size(number).x
+    number_width = imgui.calc_text_size(f"{layer.strength:.3f}").x
     room = right - number_width - 10 * scale - imgui.get_cursor_pos_x()
     card = _name(replace(card, state=state), index, room, renaming, active, ui)
     imgui.same_line(right - number_width)
-    imgui.align_text_to_frame_padding()
-    beyond = p.warning if layer.strength > 1.0 else p.text
-    imgui.text_colored(imgui.ImVec4(*(beyond if active else p.dim)), number)
+    imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
         strength_slider.start_typing("##strength")
     tip("Locked (L)" if layer.locked else "Click, or Ctrl+click the slider, to type a value")
     return card
+
+
+def _number(corner: imgui.ImVec2, strength: float, active: bool) -> None:
+    """The strength in the card's upper right corner; every digit is equally wide."""
+    beyond = PALETTE.warning if strength > 1.0 else PALETTE.text
+    at = imgui.ImVec2(corner.x, corner.y + imgui.get_style().frame_padding.y)
+    imgui.get_window_draw_list().add_text(at, u32(beyond if active else PALETTE.dim), f"{strength:.3f}")
 
 
 def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui: UiContext) -> _Card:
