@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,17 +20,17 @@ from ui_rig import Rig, rig
 
 from progdf.checkpoint import Gdf
 from progdf.ply import load_ply
+from viewer import panel
 from viewer.arguments import load_edits
 from viewer.state import LayerState, ViewState
 from viewer.turntable import first_camera
-from viewer.workspace import Dialog
 
 SIZE = (1280, 800)
+COLOURS, PANEL_COLOURS = 144, 96  # so that a file stays below 250 kB
 
 
 def layers(hand: Rig) -> None:
     """Two edits, gains and curve of the first unfolded, its colour held back."""
-    hand.wheel(490.0, 400.0, 1.0)
     hand.key("G")
     hand.key("Tab")
     for _ in range(2):
@@ -39,8 +39,7 @@ def layers(hand: Rig) -> None:
 
 def compare(hand: Rig) -> None:
     """The original beside the edited scene, the divider in the hand."""
-    _whole(hand)
-    _wheel_in(hand)
+    _at(hand, (1.0,) * len(hand.strengths))
     hand.key("Y")
     hand.move(490.0, 300.0)
     hand.frame(3)
@@ -48,32 +47,28 @@ def compare(hand: Rig) -> None:
 
 def difference(hand: Rig) -> None:
     """What differs, four times as bright, with the PSNR."""
-    _whole(hand)
-    _wheel_in(hand)
+    _at(hand, (1.0,) * len(hand.strengths))
     hand.key("Shift+Y")
 
 
 def recorded(hand: Rig) -> None:
     """The field beside what training recorded at the same strengths, with the PSNR."""
-    hand.key("F")
-    hand.wheel(200.0, 200.0, -1.5)
     hand.key("Alt+Y")
 
 
 def session(hand: Rig) -> None:
-    """Snapshots in the panel, and the question before changes are lost."""
-    _wheel_in(hand)
-    for chord in ("1", *["Shift+Right"] * 2, "F3", *["Shift+Left"] * 5, "F3", "2", *["Shift+Left"] * 9, "F3"):
-        hand.key(chord)
+    """Snapshots of five mixtures in the panel, back at one of them."""
+    for strengths in ((1.0, 0.0), (0.3, 0.0), (0.3, 1.0), (0.6, 1.0), (1.0, 1.0)):
+        _at(hand, strengths)
+        hand.key("F3")
     hand.frame(8)
     hand.wheel(1130.0, 600.0, -100.0)
-    hand.stage.ask(Dialog("leave", "playbot.session.json", "quit"))
+    hand.click(1130.0, 672.0)
     hand.settle()
 
 
 def timeline(hand: Rig) -> None:
     """A film of three keys: the edits come while the camera goes around; the playhead on the way."""
-    _wheel_in(hand)
     start = hand.stage.work.view
     bare = tuple(replace(layer, strength=0.0) for layer in start.layers)
     hand.stage.change(replace(start, layers=bare))
@@ -94,23 +89,16 @@ def timeline(hand: Rig) -> None:
     hand.frame(3)
 
 
-def _whole(hand: Rig) -> None:
-    """All edits at full strength."""
+def _at(hand: Rig, strengths: Sequence[float]) -> None:
+    """The edits at these strengths, as far as there are some."""
     view = hand.stage.work.view
-    full = tuple(replace(layer, strength=1.0) for layer in view.layers)
-    hand.stage.change(replace(view, layers=full))
+    layers = (replace(layer, strength=s) for layer, s in zip(view.layers, strengths, strict=False))
+    hand.stage.change(replace(view, layers=tuple(layers)))
     hand.settle()
-
-
-def _wheel_in(hand: Rig) -> None:
-    """Nearer to the focused layer."""
-    hand.key("F")
-    hand.wheel(490.0, 400.0, -6.5)
 
 
 def timings(hand: Rig) -> None:
     """A slider in the hand: only its part of the picture is drawn, and the figures say so."""
-    _wheel_in(hand)
     hand.key("F10")
     first = hand.strengths[0]
     hand.move(*hand.slider(0, first))
@@ -120,10 +108,15 @@ def timings(hand: Rig) -> None:
 
 
 def painted(hand: Rig) -> None:
-    """The first edit rubbed away in a band, the brush still there."""
-    hand.wheel(490.0, 400.0, 1.0)
+    """The first edit painted on one side, the brush still there."""
     hand.key("B")
-    hand.drag((470.0, 210.0), (500.0, 330.0))
+    hand.key("Backspace")
+    hand.key("X")
+    hand.key("X")
+    for _ in range(3):
+        hand.key("]")
+    for x, top, bottom in ((340.0, 160.0, 400.0), (420.0, 120.0, 420.0), (500.0, 120.0, 230.0)):
+        hand.drag((x, top), (x, bottom))
 
 
 SHOTS: dict[str, Callable[[Rig], None]] = {
@@ -140,9 +133,9 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
 
 
 def first_state(gdfs: tuple[Gdf, ...], strengths: tuple[float, ...] = (0.8, 0.6, 0.5, 0.4)) -> ViewState:
-    """Every edit part of the way."""
+    """Every edit part of the way; never coarse."""
     stack = tuple(LayerState(i, gdf.name, strengths[i % 4]) for i, gdf in enumerate(gdfs))
-    return ViewState(layers=stack, background=(0.75, 0.82, 0.88))
+    return ViewState(layers=stack, background=(0.75, 0.82, 0.88), draft="off")
 
 
 def main() -> None:
@@ -154,14 +147,28 @@ def main() -> None:
     asked = parser.parse_args()
     scene = load_ply(asked.scene)
     gdfs = load_edits(asked.gdfs, scene, asked.scene)
-    view = replace(first_state(gdfs), camera=first_camera(scene, aspect=980 / 800))
+    view = replace(first_state(gdfs), camera=first_camera(scene, aspect=(SIZE[0] - panel.WIDTH_PX) / SIZE[1]))
     with rig(view, SIZE, stack=_Opened(scene, gdfs), gdf_paths=asked.gdfs) as hand:
         hand.stage.facts = replace(hand.stage.facts, title=asked.scene.name)
         SHOTS[asked.name](hand)
         hand.frame(3)
         picture = Image.fromarray(hand.image())
-    # no dithering: it would grain the interface's flat colours
-    picture.quantize(256, kmeans=3, dither=Image.Dither.NONE).save(asked.out, optimize=True)
+    _in_few_colours(picture, SIZE[0] - round(panel.WIDTH_PX)).save(asked.out, optimize=True)
+
+
+def _in_few_colours(window: Image.Image, panel_at: int) -> Image.Image:
+    """A palette for the picture, dithered, and one for the panel, whose flat colours that would grain."""
+    picture = window.crop((0, 0, panel_at, window.height))
+    few = picture.quantize(COLOURS, kmeans=3, dither=Image.Dither.NONE)
+    picture = picture.quantize(palette=few, dither=Image.Dither.FLOYDSTEINBERG)
+    right = window.crop((panel_at, 0, *window.size)).quantize(
+        PANEL_COLOURS, kmeans=3, dither=Image.Dither.NONE
+    )
+    both = Image.new("P", window.size)
+    both.putpalette((few.getpalette() or [])[: 3 * COLOURS] + (right.getpalette() or [])[: 3 * PANEL_COLOURS])
+    both.paste(picture, (0, 0))
+    both.paste(right.point([(i + COLOURS) % 256 for i in range(256)]), (panel_at, 0))
+    return both
 
 
 class _Opened:
