@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from progdf.command_line import parsed
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
 
@@ -87,7 +88,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the named benchmarks. Raises ProgdfError for a name that does not exist."""
     from progdf.__main__ import BENCHES, RECORDED  # the front door is the one file that knows all floors
 
-    options = tyro.cli(Options, args=list(argv), prog="progdf bench")
+    options = parsed(Options, argv, "progdf bench")
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(f"there is no benchmark '{name}'; try one of {', '.join(BENCHES)}")

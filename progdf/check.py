@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from progdf.command_line import parsed
 from progdf.ply import load_ply_with_report
 from progdf.survey import survey
 
@@ -26,7 +27,7 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
-    options = tyro.cli(Options, args=list(argv), prog="progdf check")
+    options = parsed(Options, argv, "progdf check")
     scene, report = load_ply_with_report(options.scene)
     for line in report.lines() + survey(scene).lines():
         print(line)

@@ -19,7 +19,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
             beside.write_bytes(…)
 
     Raises:
-        ProgdfError: the folder does not exist, or `path` is a folder.
+        ProgdfError: the folder does not exist or cannot be written to, or `path` is a folder.
     """
     target = Path(path)
     if target.is_dir():
@@ -27,7 +27,12 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     if not target.parent.is_dir():
         raise ProgdfError(f"the folder {target.parent} does not exist; make it first")
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
+    try:
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
+    except OSError as error:
+        raise ProgdfError(
+            f"{target} cannot be written ({error.strerror or error}); give a place that can be written to"
+        ) from None
     os.close(handle)
     beside = Path(name)
     try:

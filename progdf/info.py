@@ -14,6 +14,7 @@ import tyro
 from progdf import session_file
 from progdf.camera_files import load_cameras
 from progdf.checkpoint import open_gdf
+from progdf.command_line import parsed
 from progdf.errors import ProgdfError
 from progdf.files import open_failure
 from progdf.gdf_head import GdfHead
@@ -38,7 +39,7 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
-    path = tyro.cli(Options, args=list(argv), prog="progdf info").file
+    path = parsed(Options, argv, "progdf info").file
     for line in _DESCRIBE[kind_of(path)](path):
         print(line)
     return 0

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from progdf.__main__ import COMMANDS, main
+from progdf.ply import save_ply
+from tests.scenes import random_gaussians
 
 
 def stderr_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -48,3 +50,38 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
         raise SystemExit(main([command, "--help"]))
     assert stop.value.code in (0, None)
     assert "usage" in capsys.readouterr().out.lower()
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_an_option_that_does_not_exist_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = stderr_of(capsys, command, "--no-such-option")
+    assert f"see progdf {command} --help" in said
+
+
+@pytest.mark.parametrize("command", ["fit", "ablate"])
+@pytest.mark.parametrize("threads", ["-1", "99999"])
+def test_a_number_of_threads_that_cannot_be_is_told(
+    command: str, threads: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert "--threads is" in stderr_of(capsys, command, str(tmp_path), "--threads", threads)
+
+
+@pytest.mark.parametrize("psnr", ["nan", "inf"])
+def test_a_refit_to_no_number_of_decibels_is_refused(
+    psnr: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert "--target-psnr is" in stderr_of(capsys, "fit", str(tmp_path), "--target-psnr", psnr)
+
+
+@pytest.mark.parametrize(
+    "editor", ["recolor:#30", "tint:", "stripes:red", "darken:nan", "style:99", "folder:nope"]
+)
+def test_an_editor_that_cannot_be_is_told_before_a_folder_is_made(
+    editor: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    save_ply(tmp_path / "scene.ply", random_gaussians(20))
+    stderr_of(
+        capsys, "train", str(tmp_path / "scene.ply"), "--out", str(run), "--region", "all", "--editor", editor
+    )
+    assert not run.exists()

@@ -70,3 +70,16 @@ def test_a_missing_folder_and_a_folder_in_place_of_a_file_are_one_line(tmp_path:
         pass
     with pytest.raises(ProgdfError, match="is a folder"), written_whole(tmp_path):
         pass
+
+
+def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(**_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(tmp_path / ".out.x1y2.txt"))
+
+    monkeypatch.setattr("progdf.files.tempfile.mkstemp", refused)
+    path = tmp_path / "out.txt"
+    with pytest.raises(ProgdfError) as told, written_whole(path):
+        pass
+    assert str(told.value).startswith(f"{path} cannot be written (Permission denied); ")

@@ -15,6 +15,7 @@ from PIL import Image
 
 import trainer.training
 from progdf.checkpoint import load_gdf
+from progdf.command_line import parsed
 from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, pack
@@ -301,7 +302,7 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
-    options = settled(cli.parsed(trainer.options.TrainOptions, words, "progdf train"))
+    options = settled(parsed(trainer.options.TrainOptions, words, "progdf train"))
     assert (options.seed, options.slider, options.name) == (7, "even", "r")
     assert (options.steps, options.views) == (240, 12)
 

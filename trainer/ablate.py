@@ -74,6 +74,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
         ProgdfError: the folder is no finished run, its scene or a view is gone, a variant does not exist.
         KeyboardInterrupt: interrupted; the message says what is kept.
     """
+    use_threads(options.threads)
     run = reopened(options.run, options.scene)
     own = run_options(run)
     if run.about.get("kind") is None:
@@ -81,7 +82,6 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
     kind: EditKind = run.about["kind"]
     variants = sensible(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
     wanted = chosen(variants, options.only)
-    use_threads(options.threads)
     root = run.folder.root / "ablation"
     root.mkdir(exist_ok=True)
     with stopping(), locked(RunFolder(root)):

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from progdf.camera_files import save_cameras
 from progdf.checkpoint import Gdf, load_gdf
+from progdf.command_line import parsed
 from progdf.compose import Layer, compose
 from progdf.files import written_whole
 from progdf.pictures import contact_sheet, write_image
@@ -132,7 +133,7 @@ class DemoOptions:
 
 def main(argv: Sequence[str]) -> int:
     """Run the demo. Raises ProgdfError for options that cannot be met."""
-    options = tyro.cli(DemoOptions, args=list(argv), prog="progdf demo")
+    options = parsed(DemoOptions, argv, "progdf demo")
     begun = time.perf_counter()
     show = SHOWS[options.scene]
     scene = show.make(show.size if options.size is None else options.size, options.seed)

@@ -35,6 +35,9 @@ NETWORK_OPTIONS: Mapping[str, Any] = {
 
 MOST_STAGES = 8
 """Strengths that an editor with a dial is asked for if nobody says how many, at most."""
+
+MOST_THREADS = 1024
+"""More than any machine has: what --threads says at most."""
 STAGE_STEPS = 40
 """A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
 one is met. `QUICK_STAGES` are asked for then. Room's walls, 200 steps, PSNR on held-out views at .25, .5, .75
@@ -271,7 +274,7 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--image-size", options.image_size, 32, 2048),
         ("--stages", options.stages, 0, 16),
         ("--group-steps", options.group_steps, 0, 10_000),
-        ("--threads", options.threads, 0, 1024),
+        ("--threads", options.threads, 0, MOST_THREADS),
         ("--perceptual-every", options.perceptual_every, 1, 1000),
         ("--guidance", options.guidance, 1, 100),
         ("--image-guidance", options.image_guidance, 1, 100),
@@ -295,10 +298,6 @@ def settled(options: TrainOptions) -> TrainOptions:
     ):
         if weight is not None and not 0 <= weight < math.inf:
             raise ProgdfError(f"{what} is {weight}; 0 or more would be right")
-    if not math.isfinite(options.target_psnr):
-        raise ProgdfError(
-            f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"
-        )
     if not 0 <= options.save_every < math.inf:
         raise ProgdfError(f"--save-every is {options.save_every}; 0 or more seconds would be right")
     _check_editor_options(options)
@@ -325,6 +324,10 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
     Raises:
         ProgdfError: one does not.
     """
+    if not math.isfinite(options.target_psnr):
+        raise ProgdfError(
+            f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"
+        )
     for name, default in NETWORK_OPTIONS.items():
         option = "--" + name.replace("_", "-")
         if options.field != "neural" and getattr(options, name, default) != default:

@@ -19,7 +19,7 @@ from progdf.region_spec import parse_region
 from progdf.trajectory import load_trajectory, save_trajectory
 from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
-from trainer.editors import VIEW_BY_VIEW, check_editor, make_editor
+from trainer.editors import VIEW_BY_VIEW, check_editor, check_new_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.evenness import even_strengths
 from trainer.finish import RunResult, end_rows, finished, kept_judge
@@ -28,7 +28,14 @@ from trainer.followers import followers_of
 from trainer.interrupts import stopping
 from trainer.losses import Perceptual, perceptual_loss
 from trainer.network import PART as NETWORK
-from trainer.options import NETWORK_OPTIONS, FitOptions, TrainOptions, check_network_options, settled
+from trainer.options import (
+    MOST_THREADS,
+    NETWORK_OPTIONS,
+    FitOptions,
+    TrainOptions,
+    check_network_options,
+    settled,
+)
 from trainer.preparation import (
     BACKGROUND,
     Pictures,
@@ -67,6 +74,8 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
     """
     options = settled(options)
     check_editor(options.editor)
+    if not options.out.is_dir() or not any(options.out.iterdir()):
+        check_new_editor(options.editor)
     use_threads(options.threads)
     scene = load_ply(options.scene)
     edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
@@ -288,6 +297,12 @@ def use_threads(wanted: int) -> None:
 
 
 def wanted_threads(wanted: int) -> int:
-    """How many threads `wanted` means."""
+    """How many threads `wanted` means.
+
+    Raises:
+        ProgdfError: fewer than none, or more than any machine has.
+    """
+    if not 0 <= wanted <= MOST_THREADS:
+        raise ProgdfError(f"--threads is {wanted}; 0 to {MOST_THREADS} would be right")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return wanted or max(1, cores - 1)

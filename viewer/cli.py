@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from plyfile import PlyData
 
+from progdf.command_line import parsed
 from progdf.compose import compose
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
@@ -29,7 +29,7 @@ from .turntable import first_camera
 @one_thread()
 def view(argv: Sequence[str]) -> int:
     """`progdf view`: open the window and stay until it is closed."""
-    options = tyro.cli(ViewOptions, args=arguments.joined(opening.without_name(argv)), prog="progdf view")
+    options = parsed(ViewOptions, arguments.joined(opening.without_name(argv)), "progdf view")
     found = opening.opened(options)
     from .app import run  # imgui and glfw, which render and export do without
 
@@ -48,7 +48,7 @@ def view(argv: Sequence[str]) -> int:
 
 def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
-    options = tyro.cli(ExportOptions, args=arguments.joined(opening.without_name(argv)), prog="progdf export")
+    options = parsed(ExportOptions, arguments.joined(opening.without_name(argv)), "progdf export")
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
     found = opening.opened(options)

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-import tyro
 from PIL import Image
 
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
+from progdf.command_line import parsed
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.gaussians import Gaussians
@@ -33,7 +33,7 @@ ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 @one_thread()
 def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
-    options = tyro.cli(RenderOptions, args=arguments.joined(opening.without_name(argv)), prog="progdf render")
+    options = parsed(RenderOptions, arguments.joined(opening.without_name(argv)), "progdf render")
     _check_output(options)
     size = None if options.size is None else arguments.parse_size(options.size)
     found = opening.opened(options)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
+from progdf.colour import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.editors.base import EditorSettings, ImageEditor, Painter
-from trainer.editors.folder import folder, photographs
+from trainer.editors.folder import folder, folder_of, photographs
 from trainer.editors.instruct import instruct
-from trainer.editors.procedural import darken, night, recolor, stripes, tint
-from trainer.editors.style import style
+from trainer.editors.procedural import darken, night, recolor, stops_of, stripes, tint
+from trainer.editors.style import style, style_number
 from trainer.views import View
 
 Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorSettings], ImageEditor]
@@ -51,12 +53,32 @@ EXAMPLES = (
 )
 
 
+CHECKS: dict[str, Callable[[str], object]] = {
+    "recolor": parse_color,
+    "tint": parse_color,
+    "stripes": parse_color,
+    "darken": partial(stops_of, editor="darken"),
+    "night": partial(stops_of, editor="night"),
+    "folder": folder_of,
+    "photographs": folder_of,
+    "style": style_number,
+}
+"""Kind of editor → what tells, by itself, whether what stands behind the colon can be."""
+
+
 def check_editor(spec: str) -> tuple[str, str]:
     """Split `KIND:WHAT`; ProgdfError if there is no such kind. Cheap: nothing is read or rendered."""
     kind, _, what = spec.partition(":")
     if kind not in EDITORS:
         raise ProgdfError(f"there is no editor '{kind}'; use one of {', '.join(EXAMPLES)}")
     return kind, what
+
+
+def check_new_editor(spec: str) -> None:
+    """ProgdfError if no run can begin with `spec`; one that has begun keeps its views, its folder may go."""
+    kind, what = check_editor(spec)
+    if kind in CHECKS:
+        CHECKS[kind](what)
 
 
 def make_editor(
@@ -80,5 +102,6 @@ __all__ = [
     "ImageEditor",
     "Painter",
     "check_editor",
+    "check_new_editor",
     "make_editor",
 ]

