@@ -99,6 +99,11 @@ def main(argv: Sequence[str]) -> int:
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; say progdf bench {drawing[0]}")
     if options.seconds is not None and options.what and "window" not in options.what:
         raise ProgdfError("--seconds is how long the window is dragged; say progdf bench window")
+    for output in (options.json, options.plot):  # told now, not when an hour has been measured
+        if output is not None and not output.parent.is_dir():
+            raise ProgdfError(f"the folder {output.parent} does not exist; make it first")
+    if options.readme is not None and not options.readme.is_file():
+        raise ProgdfError(f"{options.readme} does not exist; check the name and the folder")
     given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
     if options.runs:
         given["field"]["recorded"] = [_named(RECORDED)(run) for run in options.runs]

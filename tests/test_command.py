@@ -85,3 +85,11 @@ def test_an_editor_that_cannot_be_is_told_before_a_folder_is_made(
         capsys, "train", str(tmp_path / "scene.ply"), "--out", str(run), "--region", "all", "--editor", editor
     )
     assert not run.exists()
+
+
+@pytest.mark.parametrize("option", ["--json", "--plot", "--readme"])
+def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
+    option: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("progdf.__main__.BENCHES", {"field": "nowhere:begun"})
+    assert "does not exist; " in stderr_of(capsys, "bench", "field", option, str(tmp_path / "no" / "f.x"))
