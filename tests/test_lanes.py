@@ -1,17 +1,20 @@
-"""Eight float32 at once inside kernels do what numpy does to arrays of eight."""
+"""Eight numbers at once inside kernels do what numpy does to arrays of eight."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from progdf.rasterize.gathers import first, gather, rows_at, rows_from, scatter
 from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import (
     WIDTH,
     Lanes,
+    any_of,
     choose,
     count,
     load,
@@ -21,6 +24,7 @@ from progdf.rasterize.lanes import (
     total,
     totals,
     whole,
+    widen,
 )
 from progdf.rasterize.pixels import exp2
 
@@ -143,3 +147,93 @@ def test_lanes_of_another_type_are_refused_when_the_kernel_is_compiled() -> None
 
     with pytest.raises(TypingError):
         _arithmetic(numbers(0)[0], numbers(1)[0], "one", np.zeros(40, np.float32))
+
+
+@kernel(contract=True)
+def _in_double(a: Array, b: Array, out: Array) -> None:
+    x, y = load(a, np.uint64(0)), load(b, np.uint64(0))
+    lanes = (
+        x / y, -x, abs(x), math.sqrt(abs(x)), math.log2(abs(x)), np.floor(x), np.ceil(x), min(x, y),
+        max(0.5, x), choose(x == y, 1.0, x), choose(x >= y, x, 0.0),
+    )  # fmt: skip
+    for k in range(len(lanes)):
+        store(out, np.uint64(k * 8), lanes[k])
+    out[88] = total(x)
+
+
+def test_float64_lanes_are_as_exact_as_numbers_one_by_one() -> None:
+    a, b = numbers(5)[0].astype(np.float64) / 3, numbers(6)[0].astype(np.float64)
+    b[:2] = a[:2]
+    out = np.zeros(89)
+    _in_double(a, b, out)
+    size = np.abs(a)
+    expected = [
+        a / b, -a, size, np.sqrt(size), np.log2(size), np.floor(a), np.ceil(a), np.minimum(a, b),
+        np.maximum(0.5, a), np.where(a == b, 1.0, a), np.where(a >= b, a, 0.0),
+    ]  # fmt: skip
+    np.testing.assert_allclose(out[:88].reshape(11, 8), expected, rtol=3e-16)
+    assert out[88] == pytest.approx(a.sum(), rel=1e-15)
+
+
+@kernel()
+def _nans(a: Array, out: Array) -> None:
+    x = load(a, np.uint64(0))
+    store(out, np.uint64(0), min(max(x, -1.0), 1.0))
+    out[8] = any_of(x > 2.0)
+    out[9] = any_of(x > 1e3)
+
+
+def test_what_is_not_a_number_stays_in_its_lane() -> None:
+    a, out = np.array([np.nan, 3.0, -3.0, 0.5, np.inf, -np.inf, np.nan, 0.0]), np.zeros(10)
+    _nans(a[:8], out)
+    np.testing.assert_array_equal(out[:8], [np.nan, 1.0, -1.0, 0.5, 1.0, -1.0, np.nan, 0.0])
+    assert out[8:].tolist() == [1.0, 1.0]
+    _nans(np.full(8, np.nan), out)
+    assert out[8:].tolist() == [0.0, 0.0]
+
+
+@kernel()
+def _one_or_eight(x: Number, y: Number) -> Number:
+    return choose(x < y, math.sqrt(y - x), max(x, 2.0))
+
+
+@kernel()
+def _both_ways(a: Array, b: Array, out: Array) -> None:
+    store(out, np.uint64(0), _one_or_eight(load(a, np.uint64(0)), load(b, np.uint64(0))))
+    for k in range(8):
+        out[8 + k] = _one_or_eight(a[k], b[k])
+
+
+def test_one_function_serves_one_number_and_eight() -> None:
+    a, b, out = numbers(7)[0].astype(np.float64), numbers(8)[0].astype(np.float64), np.zeros(16)
+    _both_ways(a, b, out)
+    np.testing.assert_array_equal(out[:8], out[8:])
+
+
+@kernel()
+def _moved(source: Array, ids: Array, begin: int, out: Array, marks: Array) -> None:
+    i, k = rows_at(ids, begin, ids.size), rows_from(begin, ids.size)
+    scatter(out, k, 1, gather(source, i, 2))
+    scatter(marks, i, 0, first(ids.size - begin))
+
+
+def test_rows_are_gathered_and_scattered_and_past_the_end_the_last_is_repeated() -> None:
+    source = numbers(9, rows=6)[:, :3].copy()
+    ids = np.array([4, 0, 3, 5, 1])
+    out, marks = np.full((7, 2), -9.0), np.zeros(6, np.bool_)
+    _moved(source, ids, 2, out, marks)
+    np.testing.assert_array_equal(out[2:5, 1], source[[3, 5, 1], 2].astype(np.float64))
+    assert (out[[0, 1, 5, 6]] == -9.0).all()
+    assert (out[:, 0] == -9.0).all()
+    assert marks.tolist() == [False, False, False, True, False, True]  # row 1: overwritten by a surplus lane
+
+
+@kernel()
+def _wide(a: Array, out: Array) -> None:
+    store(out, np.uint64(0), widen(load(a, np.uint64(0))))
+
+
+def test_widening_is_exact() -> None:
+    a, out = numbers(10)[0], np.zeros(8)
+    _wide(a, out)
+    np.testing.assert_array_equal(out, a.astype(np.float64))

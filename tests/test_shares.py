@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import depth_order
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.shares import at_once, claim, share
+from progdf.rasterize.order import depth_order
+from progdf.rasterize.shares import at_once, claim, finish, finished, share
 
 Array = NDArray[Any]
 
@@ -31,6 +31,29 @@ def test_every_piece_of_work_is_done_once(workers: int) -> None:
     times = np.zeros(100_000, np.int64)
     share(workers, _tick, times)
     assert (times == 1).all()
+
+
+@kernel()
+def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
+    piece = claim(claims)
+    while piece < times.size:
+        times[piece] = piece
+        finish(claims)
+        piece = claim(claims)
+    while finished(claims) < times.size:
+        pass
+    piece = claim(claims[2:])
+    while piece < sums.size:
+        sums[piece] = times.sum()
+        piece = claim(claims[2:])
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_a_second_step_sees_all_of_the_first(workers: int) -> None:
+    for _ in range(20):
+        times, sums = np.zeros(5000, np.int64), np.zeros(20, np.int64)
+        share(workers, _tick_and_add, times, sums)
+        assert (sums == 5000 * 4999 // 2).all()
 
 
 def test_two_python_threads_may_share_out_work_at_the_same_time() -> None:

@@ -36,7 +36,7 @@ from progdf.rasterize.pixels import (
     make_cards,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim
+from progdf.rasterize.shares import claim, finish
 
 Array = NDArray[Any]
 
@@ -138,7 +138,7 @@ def unblend_tile(
                 pass_splat(state, cards, card, np.float32(place))
 
 
-@kernel(cache=True)
+@kernel()
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     background: Array, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
@@ -151,7 +151,7 @@ def unblend(
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
         sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
         wanted: splats whose gradients are wanted. [V] bool
-        claims: as `shares.claim` wants it
+        claims: as `shares.claim` and `shares.finish` want it
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
@@ -181,4 +181,5 @@ def unblend(
                 state[p + _BEHIND + k] = state[p + k] * seen
         listed = slice(tile_starts[tile], tile_starts[tile + 1])
         unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted)
+        finish(claims)
         tile = claim(claims)

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.rasterize import binning, few, projection, weights
+from progdf.rasterize import binning, few, order, projection, weights
+from progdf.rasterize.backward import backpropagate
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.blend import blend
-from progdf.rasterize.blend_backward import SUMS, unblend
+from progdf.rasterize.blend_backward import SUMS
 from progdf.rasterize.conventions import RasterInfo
 from progdf.rasterize.jit import running
-from progdf.rasterize.projection_backward import CAMERA, PARTS, project_backward
+from progdf.rasterize.projection_backward import CAMERA, PARTS
 from progdf.rasterize.shares import at_once, share
 
 Array = NDArray[Any]
@@ -168,7 +169,7 @@ def _list_splats(
         means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
         centres, depths, candidates,
     )  # fmt: skip
-    ids, ranks = binning.depth_order(depths, candidates, workers)
+    ids, ranks = order.depth_order(depths, candidates, workers)
     splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
     share(
         workers, projection.project,
@@ -207,7 +208,7 @@ class _Rasterize(torch.autograd.Function):
         *gaussians, background = arrays
         if view.degree < 0:
             gaussians[4] = gaussians[4].reshape(-1, 1, 3)
-        x0, y0, x1, y1 = view.window
+        x0, y0, x1, y1 = view.window.tolist()
         image = np.empty((y1 - y0, x1 - x0, 3), np.float32)
         transmittance, last = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
         with running("forward", 12) as workers:
@@ -242,16 +243,12 @@ class _Rasterize(torch.autograd.Function):
         wanted = _wanted_splats(lists, len(means), ctx.grad_rows)
         with running("backward", 5) as workers:
             share(
-                workers, unblend,
+                workers, backpropagate,
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
                 lists.slots, background, transmittance, ctx.last, grad_image, grad_transmittance,
                 sums, wanted,
-            )  # fmt: skip
-            share(
-                workers, project_backward,
                 lists.ids, lists.ranks, means, quats, scales, opacities, colors, view.degree,
-                view.viewmat, view.intrinsics, view.size,
-                view.antialiased, lists.splats, lists.per_splat, sums, wanted,
+                view.viewmat, view.intrinsics, view.size, view.antialiased, lists.per_splat,
                 by_means, by_quats, by_scales, by_opacities, by_colors, grad_camera,
             )  # fmt: skip
         results: list[Tensor | None] = [

@@ -1,7 +1,7 @@
 """Kernels: cull, sort, project and bin a small scene in one call on one thread.
 
-The steps are those of `projection` and `binning`, compiled from the same functions without threads: for a few
-thousand Gaussians, nine launches take longer than the work between them. The result is the same bits.
+The steps are those of `projection`, `order` and `binning`, compiled from the same functions without threads:
+for a few thousand Gaussians, nine launches take longer than the work. The result is the same bits.
 """
 
 from __future__ import annotations
@@ -11,19 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import (
+from progdf.rasterize.binning import fill_tiles, find_tiles, place_tiles
+from progdf.rasterize.jit import kernel
+from progdf.rasterize.order import (
     BUCKETS,
     DIGITS,
     count_digits,
-    fill_tiles,
-    find_tiles,
     gather_keys,
     move_digits,
     place_digits,
-    place_tiles,
     rank_items,
 )
-from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection import cull, project
 
 Array = NDArray[Any]

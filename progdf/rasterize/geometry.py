@@ -1,4 +1,7 @@
-"""Kernels: one Gaussian seen by one camera, in float64; what projection and its gradient have in common."""
+"""Kernels: Gaussians seen by one camera, in float64; what projection and its gradient have in common.
+
+A `Real` is one float64 or eight (`lanes`): the same lines project one Gaussian or eight.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,15 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.conventions import DILATION, FRUSTUM_MARGIN
 from progdf.rasterize.jit import kernel
+from progdf.rasterize.lanes import choose
 
 Array = NDArray[Any]
-Vec = tuple[float, float, float]
+Real = Any
+Vec = tuple[Real, Real, Real]
 
 
 @kernel(contract=True, inline=True)
-def dot(a: Vec, b: Vec) -> float:
+def dot(a: Vec, b: Vec) -> Real:
     """a·b"""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -28,7 +33,7 @@ def cross(a: Vec, b: Vec) -> Vec:
 
 
 @kernel(contract=True, inline=True)
-def blend2(s: float, a: Vec, t: float, b: Vec) -> Vec:
+def blend2(s: Real, a: Vec, t: Real, b: Vec) -> Vec:
     """s·a + t·b"""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
@@ -98,7 +103,7 @@ def make_lens(viewmat: Array, intrinsics: Array, size: Array) -> Lens:
 
 
 class Footprint(NamedTuple):
-    """A Gaussian seen by a camera.
+    """A Gaussian seen by a camera, or eight.
 
     Args:
         x, y: camera coordinates
@@ -116,15 +121,15 @@ class Footprint(NamedTuple):
         det0, det: determinant before and after the dilation
     """
 
-    x: float
-    y: float
-    inv_z: float
-    tan_x: float
-    tan_y: float
-    free_x: bool
-    free_y: bool
-    quat: tuple[float, float, float, float]
-    inv_length: float
+    x: Real
+    y: Real
+    inv_z: Real
+    tan_x: Real
+    tan_y: Real
+    free_x: Real
+    free_y: Real
+    quat: tuple[Real, Real, Real, Real]
+    inv_length: Real
     rotation: tuple[Vec, Vec, Vec]
     a0: Vec
     a1: Vec
@@ -132,38 +137,38 @@ class Footprint(NamedTuple):
     turned1: Vec
     p0: Vec
     p1: Vec
-    a: float
-    b: float
-    c: float
+    a: Real
+    b: Real
+    c: Real
     normal: Vec
-    det0: float
-    det: float
+    det0: Real
+    det: Real
 
 
 @kernel(contract=True, inline=True)
-def unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
+def unit_quat(w: Real, x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real, Real]:
     """Unit quaternion and 1/length; the identity and 0 where it is zero or not finite."""
-    largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
     total = abs(w) + abs(x) + abs(y) + abs(z)
-    if not (largest > 0.0 and total < np.inf):
-        return 1.0, 0.0, 0.0, 0.0, 0.0
+    usable = (total > 0.0) & (total < np.inf)
+    w, x = choose(usable, w, 1.0), choose(usable, x, 0.0)
+    y, z = choose(usable, y, 0.0), choose(usable, z, 0.0)
     inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+    return w * inverse, x * inverse, y * inverse, z * inverse, choose(usable, inverse, 0.0)
 
 
 @kernel(contract=True, inline=True)
-def rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec]:
+def rotation_rows(w: Real, x: Real, y: Real, z: Real) -> tuple[Vec, Vec, Vec]:
     """Rows of the rotation by a unit quaternion."""
     return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
 
 
 @kernel(contract=True, inline=True)
-def footprint(lens: Lens, mean: Vec, q0: float, q1: float, q2: float, q3: float, scale: Vec) -> Footprint:
-    """Project a Gaussian in front of the camera; quaternion wxyz of any length."""
+def footprint(lens: Lens, mean: Vec, q0: Real, q1: Real, q2: Real, q3: Real, scale: Vec) -> Footprint:
+    """Project a Gaussian (or eight) in front of the camera; quaternion wxyz of any length."""
     x, y = dot(lens.rows[0], mean) + lens.shift[0], dot(lens.rows[1], mean) + lens.shift[1]
     inv_z = 1.0 / (dot(lens.rows[2], mean) + lens.shift[2])
     ratio_x, ratio_y = x * inv_z, y * inv_z

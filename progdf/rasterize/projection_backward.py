@@ -9,13 +9,14 @@ product.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.blend_backward import SUMS
 from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION
+from progdf.rasterize.gathers import first, gather, gather_vec, rows_at, scatter, scatter_vec
 from progdf.rasterize.geometry import (
     Footprint,
     Lens,
@@ -30,11 +31,14 @@ from progdf.rasterize.geometry import (
     vec,
 )  # fmt: skip
 from progdf.rasterize.jit import kernel
+from progdf.rasterize.lanes import WIDTH, Lanes, Mask, choose, load, spread, store, total, widen
 from progdf.rasterize.projection import R2, UNIT
 from progdf.rasterize.shading import shade_backward
 from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
+
+_PER_UNIT, _PER_UNIT2 = 1.0 / UNIT, 1.0 / (UNIT * UNIT)
 
 PARTS = 64
 """The camera's gradients are added up in this many parts, for any number of threads: so bits are the same."""
@@ -44,11 +48,11 @@ CAMERA = 16
 
 
 @kernel(contract=True, inline=True)
-def _axes_gradient(seen: Footprint, total: Array, antialiased: bool) -> tuple[float, float, Vec, Vec]:
-    """Gradients to the centre in pixels (2) and to the 2D axes p0, p1, from a splat's sums [9]."""
-    # the sums are of g = −dL/dσ, in units of u and v
-    e0, e1 = -total[4] / UNIT, -total[5] / UNIT
-    h00, h01, h11 = -total[6] / (UNIT * UNIT), -total[7] / (UNIT * UNIT), -total[8] / (UNIT * UNIT)
+def _axes_gradient(seen: Footprint, g: tuple[Lanes, ...], antialiased: bool) -> tuple[Lanes, Lanes, Vec, Vec]:
+    """Gradients to the centre in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
+    # g = −dL/dσ; u and v are in units of their own
+    e0, e1 = -g[1] * _PER_UNIT, -g[2] * _PER_UNIT
+    h00, h01, h11 = -g[3] * _PER_UNIT2, -g[4] * _PER_UNIT2, -g[5] * _PER_UNIT2
     sigma_y = math.sqrt(seen.c + DILATION)
     inv_root = 1.0 / (math.sqrt(seen.det) * sigma_y)
     l11, l21, l22 = sigma_y * sigma_y * inv_root, -seen.b * inv_root, 1.0 / sigma_y
@@ -56,10 +60,11 @@ def _axes_gradient(seen: Footprint, total: Array, antialiased: bool) -> tuple[fl
     along = blend2(inv_root, cross(seen.p1, seen.normal), DILATION * inv_root, seen.p0)
     d0 = blend2(-l11 * h00, along, -l11 * h01 * l22, seen.p1)
     d1 = blend2(-(l21 * h00 + l22 * h01), along, -(l21 * h01 + l22 * h11) * l22, seen.p1)
-    if antialiased and seen.det0 >= ANTIALIAS_FLOOR * seen.det:
+    if antialiased:
         # opacity · sqrt(det0 / det): d log = (ddet0 / det0 − ddet / det) / 2, det = det0 + ε (a + c) + ε²
-        by_det0 = total[3] * (1.0 / seen.det0 - 1.0 / seen.det)
-        by_trace = -total[3] * DILATION / seen.det
+        free = seen.det0 >= ANTIALIAS_FLOOR * seen.det
+        by_det0 = choose(free, g[0] * (1.0 / seen.det0 - 1.0 / seen.det), 0.0)
+        by_trace = choose(free, -g[0] * DILATION / seen.det, 0.0)
         d0 = blend2(1.0, d0, by_det0, cross(seen.p1, seen.normal))
         d0 = blend2(1.0, d0, by_trace, seen.p0)
         d1 = blend2(1.0, d1, by_det0, cross(seen.normal, seen.p0))
@@ -68,7 +73,7 @@ def _axes_gradient(seen: Footprint, total: Array, antialiased: bool) -> tuple[fl
 
 
 @kernel(contract=True, inline=True)
-def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, float, float]:
+def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """Gradient to the quaternion as given; d0, d1: gradients to the rows a0ᵀR, a1ᵀR."""
     q0, q1, q2, q3 = seen.quat
     v0, v1, v2 = (
@@ -89,35 +94,69 @@ def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, flo
 
 @kernel(contract=True, inline=True)
 def _point_gradient(
-    lens: Lens, seen: Footprint, grad_px: float, grad_py: float, ga: Vec, gb: Vec, camera: Array
-) -> Vec:
-    """Gradient to the point in camera axes; adds the intrinsics' to `camera`. ga, gb: gradients to a0, a1.
+    lens: Lens, seen: Footprint, grad_px: Lanes, grad_py: Lanes, ga: Vec, gb: Vec
+) -> tuple[Vec, tuple[Lanes, Lanes], tuple[Lanes, Lanes]]:
+    """Gradients to the points in camera axes, to fx and fy, and to cx and cy. ga, gb: gradients to a0, a1.
 
     px = fx x/z + cx; a0 = fx/z (W0 − tan_x W2), where tan_x is x/z or a limit ((width − cx) + half)/fx,
     −(cx + half)/fx; the same for y.
     """
     inv_z = seen.inv_z
-    jx, jy = lens.fx * inv_z, lens.fy * inv_z
     down_a, down_b = dot(ga, lens.rows[2]), dot(gb, lens.rows[2])
     grad_jx = dot(ga, lens.rows[0]) - seen.tan_x * down_a
     grad_jy = dot(gb, lens.rows[1]) - seen.tan_y * down_b
-    slope_x, slope_y = lens.fx * grad_px, lens.fy * grad_py
-    camera[12] += grad_px * seen.x * inv_z + grad_jx * inv_z
-    camera[13] += grad_py * seen.y * inv_z + grad_jy * inv_z
-    camera[14] += grad_px
-    camera[15] += grad_py
-    if seen.free_x:
-        slope_x -= jx * down_a
-    else:
-        camera[12] += jx * down_a * seen.tan_x / lens.fx
-        camera[14] += jx * down_a / lens.fx
-    if seen.free_y:
-        slope_y -= jy * down_b
-    else:
-        camera[13] += jy * down_b * seen.tan_y / lens.fy
-        camera[15] += jy * down_b / lens.fy
+    by_tan_x, by_tan_y = inv_z * down_a, inv_z * down_b  # over −fx, −fy
+    slope_x = lens.fx * (grad_px - choose(seen.free_x, by_tan_x, 0.0))
+    slope_y = lens.fy * (grad_py - choose(seen.free_y, by_tan_y, 0.0))
+    by_limit_x, by_limit_y = choose(seen.free_x, 0.0, by_tan_x), choose(seen.free_y, 0.0, by_tan_y)
     towards = slope_x * seen.x + slope_y * seen.y + grad_jx * lens.fx + grad_jy * lens.fy
-    return slope_x * inv_z, slope_y * inv_z, -towards * inv_z * inv_z
+    by_focal = (
+        (grad_px * seen.x + grad_jx) * inv_z + by_limit_x * seen.tan_x,
+        (grad_py * seen.y + grad_jy) * inv_z + by_limit_y * seen.tan_y,
+    )
+    by_centre = (grad_px + by_limit_x, grad_py + by_limit_y)
+    return (slope_x * inv_z, slope_y * inv_z, -towards * inv_z * inv_z), by_focal, by_centre
+
+
+class _Scratch(NamedTuple):
+    """What a thread works in.
+
+    Args:
+        rows, places: in the scene and in the order of depth, of the Gaussians that get gradients. [≥ a part]
+        sums: of eight Gaussians, each followed by the gradient to the ray from the eye. [8,SUMS+3] float64
+        order: 0..7. int64
+        basis, slopes: see `shading.shade_backward`
+        camera: the gradients to the camera, lane by lane. [CAMERA·8] float64
+    """
+
+    rows: Array
+    places: Array
+    sums: Array
+    order: Array
+    basis: Array
+    slopes: Array
+    camera: Array
+
+
+@kernel(contract=True, inline=True)
+def _add_up(begin: int, end: int, sums: Array, out: Array, row: int) -> None:
+    """The sum of some intersections, as a row of `out`."""
+    eight, ninth = spread(0.0), 0.0
+    for slot in range(begin, end):
+        eight += widen(load(sums, np.uint64(slot * SUMS)))
+        ninth += sums[slot, WIDTH]
+    store(out, np.uint64(row * out.shape[1]), eight)
+    out[row, WIDTH] = ninth
+
+
+@kernel(contract=True, inline=True)
+def _add_four(camera: Array, row: int, a: Vec, b: Lanes, used: Mask) -> None:
+    """Add to four numbers of the camera's gradients."""
+    at = np.uint64(4 * row * WIDTH)
+    for k in range(3):
+        store(camera, at, load(camera, at) + choose(used, a[k], 0.0))
+        at += np.uint64(WIDTH)
+    store(camera, at, load(camera, at) + choose(used, b, 0.0))
 
 
 @kernel(contract=True)
@@ -126,59 +165,76 @@ def _project_backward_range(
     opacities: Array, colors: Array, degree: int, viewmat: Array, intrinsics: Array, size: Array,
     antialiased: bool, splats: Array, per_splat: Array, sums: Array, wanted: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
-    camera: Array,
+    scratch: _Scratch, camera: Array,
 ) -> None:  # fmt: skip
     lens = make_lens(viewmat, intrinsics, size)
-    total, basis, slopes = np.empty(SUMS), np.empty(16), np.zeros((16, 3))
+    scratch.camera[:] = 0.0
+    count = 0
     for n in range(begin, end):
-        i, s = ids[n], ranks[n]
-        if not wanted[s] or splats[s, R2] < 0.0 or per_splat[s] == per_splat[s + 1]:
-            continue
-        for k in range(SUMS):
-            total[k] = 0.0
-        for slot in range(per_splat[s], per_splat[s + 1]):
-            for k in range(SUMS):
-                total[k] += sums[slot, k]
-        mean, scale = vec(means, i), vec(scales, i)
-        seen = footprint(
-            lens, mean, np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]),
-            np.float64(quats[i, 3]), scale,
+        s = ranks[n]
+        if wanted[s] and splats[s, R2] >= 0.0 and per_splat[s] < per_splat[s + 1]:
+            scratch.rows[count], scratch.places[count] = ids[n], s
+            count += 1
+    for k in range(0, count, WIDTH):
+        for lane in range(WIDTH):
+            at = min(k + lane, count - 1)
+            n, s = scratch.rows[at], scratch.places[at]
+            _add_up(per_splat[s], per_splat[s + 1], sums, scratch.sums, lane)
+            by_rgb = vec(scratch.sums, lane)
+            if degree < 0:
+                grad_colors[n, 0, 0], grad_colors[n, 0, 1], grad_colors[n, 0, 2] = by_rgb
+            else:
+                by_ray = shade_backward(
+                    n, colors, degree, vec(means, n), lens.eye, by_rgb, scratch.basis, scratch.slopes,
+                    grad_colors,
+                )  # fmt: skip
+                for axis in range(3):
+                    scratch.sums[lane, SUMS + axis] = by_ray[axis]
+        i, used = rows_at(scratch.rows, k, count), first(count - k)
+        e = rows_at(scratch.order, 0, WIDTH)
+        g = (
+            gather(scratch.sums, e, 3), gather(scratch.sums, e, 4), gather(scratch.sums, e, 5),
+            gather(scratch.sums, e, 6), gather(scratch.sums, e, 7), gather(scratch.sums, e, 8),
         )  # fmt: skip
-        grad_opacities[i] = total[3] / np.float64(opacities[i])
-        grad_px, grad_py, d0, d1 = _axes_gradient(seen, total, antialiased)
-        by_scale0, by_scale1 = times(d0, seen.turned0), times(d1, seen.turned1)
-        for k in range(3):
-            grad_scales[i, k] = by_scale0[k] + by_scale1[k]
+        by_rays = (
+            gather(scratch.sums, e, SUMS),
+            gather(scratch.sums, e, SUMS + 1),
+            gather(scratch.sums, e, SUMS + 2),
+        )
+        mean, scale = gather_vec(means, i), gather_vec(scales, i)
+        seen = footprint(
+            lens, mean, gather(quats, i, 0), gather(quats, i, 1), gather(quats, i, 2), gather(quats, i, 3),
+            scale,
+        )  # fmt: skip
+        scatter(grad_opacities, i, 0, g[0] / gather(opacities, i, 0))
+        grad_px, grad_py, d0, d1 = _axes_gradient(seen, g, antialiased)
+        scatter_vec(grad_scales, i, blend2(1.0, times(d0, seen.turned0), 1.0, times(d1, seen.turned1)))
         d0, d1 = times(d0, scale), times(d1, scale)
         by_quat = _quat_gradient(seen, d0, d1)
-        for k in range(4):
-            grad_quats[i, k] = by_quat[k]
+        scatter(grad_quats, i, 0, by_quat[0])
+        scatter(grad_quats, i, 1, by_quat[1])
+        scatter(grad_quats, i, 2, by_quat[2])
+        scatter(grad_quats, i, 3, by_quat[3])
         r0, r1, r2 = seen.rotation
         ga, gb = (dot(r0, d0), dot(r1, d0), dot(r2, d0)), (dot(r0, d1), dot(r1, d1), dot(r2, d1))
-        point = _point_gradient(lens, seen, grad_px, grad_py, ga, gb, camera)
-        by_mean = row_times(point, lens.rows)
+        point, by_focal, by_centre = _point_gradient(lens, seen, grad_px, grad_py, ga, gb)
+        scatter_vec(grad_means, i, blend2(1.0, row_times(point, lens.rows), 1.0, by_rays))
         jx, jy = lens.fx * seen.inv_z, lens.fy * seen.inv_z
-        for k in range(3):
-            camera[k] += point[0] * mean[k] + jx * ga[k]
-            camera[4 + k] += point[1] * mean[k] + jy * gb[k]
-            camera[8 + k] += point[2] * mean[k] - jx * seen.tan_x * ga[k] - jy * seen.tan_y * gb[k]
-            camera[4 * k + 3] += point[k]
-        if degree < 0:
-            for k in range(3):
-                grad_colors[i, 0, k] = total[k]
-        else:
-            by_rgb = (total[0], total[1], total[2])
-            by_ray = shade_backward(i, colors, degree, mean, lens.eye, by_rgb, basis, slopes, grad_colors)
-            by_mean = blend2(1.0, by_mean, 1.0, by_ray)
-            for row in range(3):  # the eye is −RᵀT
-                camera[4 * row + 3] += dot(by_ray, lens.rows[row])
-                for k in range(3):
-                    camera[4 * row + k] += by_ray[k] * lens.shift[row]
-        for k in range(3):
-            grad_means[i, k] = by_mean[k]
+        row0, row1 = blend2(point[0], mean, jx, ga), blend2(point[1], mean, jy, gb)
+        row2 = blend2(point[2], mean, -1.0, blend2(jx * seen.tan_x, ga, jy * seen.tan_y, gb))
+        # and the colours' by the eye, −RᵀT
+        row0 = blend2(1.0, row0, lens.shift[0], by_rays)
+        row1 = blend2(1.0, row1, lens.shift[1], by_rays)
+        row2 = blend2(1.0, row2, lens.shift[2], by_rays)
+        _add_four(scratch.camera, 0, row0, point[0] + dot(by_rays, lens.rows[0]), used)
+        _add_four(scratch.camera, 1, row1, point[1] + dot(by_rays, lens.rows[1]), used)
+        _add_four(scratch.camera, 2, row2, point[2] + dot(by_rays, lens.rows[2]), used)
+        _add_four(scratch.camera, 3, (by_focal[0], by_focal[1], by_centre[0]), by_centre[1], used)
+    for k in range(CAMERA):
+        camera[k] = total(load(scratch.camera, np.uint64(k * WIDTH)))
 
 
-@kernel(cache=True)
+@kernel()
 def project_backward(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
@@ -199,11 +255,16 @@ def project_backward(
         claims: as `shares.claim` wants it
     """
     step = (ids.size + PARTS - 1) // PARTS
+    scratch = _Scratch(
+        np.empty(step, np.int64), np.empty(step, np.int64), np.zeros((WIDTH, SUMS + 3)), np.arange(WIDTH),
+        np.empty(16), np.zeros((16, 3)), np.empty(CAMERA * WIDTH),
+    )  # fmt: skip
     part = claim(claims)
     while part < PARTS:
         _project_backward_range(
             part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities,
             colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums, wanted,
-            grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_camera[part],
+            grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, scratch,
+            grad_camera[part],
         )  # fmt: skip
         part = claim(claims)

@@ -41,9 +41,9 @@ def share(workers: int, kernel: Callable[..., None], *arguments: Any) -> None:
 
     Args:
         workers: how many threads, ≥ 1
-        kernel: takes its work by `claim`
+        kernel: takes its work by `claim`; claims are [3], so that two steps fit in one launch
     """
-    call = partial(kernel, *arguments, np.zeros(1, np.int64))
+    call = partial(kernel, *arguments, np.zeros(3, np.int64))
     at_once([call] * workers)
 
 
@@ -73,3 +73,30 @@ def claim(typingctx: Any, claims: Any) -> Any:
         return builder.atomic_rmw("add", counter, context.get_constant(types.int64, 1), "monotonic")
 
     return types.int64(claims), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def finish(typingctx: Any, claims: Any) -> Any:
+    """Inside a kernel: count a claimed piece of work as done."""
+
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        one = context.get_constant(types.int64, 1)
+        builder.atomic_rmw("add", _done(context, builder, sig, args), one, "release")
+        return context.get_dummy_value()
+
+    return types.void(claims), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def finished(typingctx: Any, claims: Any) -> Any:
+    """Inside a kernel: how many pieces of work are done; what they wrote may be read. int64"""
+
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return builder.load_atomic(_done(context, builder, sig, args), "acquire", 8)
+
+    return types.int64(claims), generate
+
+
+def _done(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+    counter = context.make_array(sig.args[0])(context, builder, args[0]).data
+    return builder.gep(counter, [context.get_constant(types.int64, 1)])
