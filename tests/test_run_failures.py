@@ -96,7 +96,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
         raise OSError(30, os.strerror(30), "run/.log.txt")
 
     monkeypatch.setattr(tempfile, "mkstemp", mkstemp)
-    with pytest.raises(ProgdfError, match=r"run cannot be written \(Read-only file system\); "):
+    with pytest.raises(ProgdfError, match=r"run.log\.txt cannot be written \(Read-only file system\); "):
         train(small_run(bear_folder), quiet=True)
     with pytest.raises(ProgdfError, match="cannot be made"):
         train(replace(small_run(bear_folder), out=Path("/proc/run")), quiet=True)
