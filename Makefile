@@ -42,7 +42,7 @@ test: setup extras window
 	$(BIN)/python -m pytest
 
 test-all: setup extras window
-	$(BIN)/python -m pytest -m ''
+	$(BIN)/python -m pytest -m '' --hypothesis-profile=search
 
 # With the extras, so that types are checked against the same packages everywhere.
 lint: setup extras

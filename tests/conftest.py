@@ -9,9 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 from PIL import Image
 
 pytest.register_assert_rewrite("tests.ply_files", "tests.refused", "tests.stopped_runs")
+
+# `make test` tries the same examples everywhere; `make test-all` looks for new ones
+settings.register_profile("same", derandomize=True)
+settings.register_profile("search", derandomize=False, print_blob=True)
+settings.load_profile("same")
 
 SCREENSHOTS = Path(__file__).parent / "screenshots"
 LEVELS = 2  # of 255: the last bits of a software GPU differ between processors

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
 from progdf.gaussians import Gaussians
-from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN, DILATION
+from progdf.rasterize import reference
+from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN
 
 from .stack import shown
 from .state import Vec3, ViewState
@@ -101,15 +102,11 @@ def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 
         near_ray = np.flatnonzero(sized & (depth > near) & (dx * dx + dy * dy < reach * reach))
     if not len(near_ray):
         return None
-    alphas = _alphas(
-        scene[torch.from_numpy(near_ray)], local[near_ray], rotation, fx, fy, dx[near_ray], dy[near_ray]
-    )
-    order = np.argsort(depth[near_ray], kind="stable")
-    through = np.cumprod(1.0 - alphas[order])
-    if 1.0 - through[-1] < FAINT:
+    rows, alphas = _alphas(scene, near_ray, camera, x, y, near)
+    through = np.cumprod(1.0 - alphas)
+    if not len(rows) or 1.0 - through[-1] < FAINT:
         return None
-    shares = alphas[order] * np.concatenate([[1.0], through[:-1]])
-    rows = near_ray[order]
+    shares = alphas * np.concatenate([[1.0], through[:-1]])
     return Seen(rows, shares, depth[rows].astype(np.float64))
 
 
@@ -120,37 +117,17 @@ def _lens(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _alphas(
-    seen: Gaussians,
-    local: np.ndarray,
-    rotation: np.ndarray,
-    fx: float,
-    fy: float,
-    dx: np.ndarray,
-    dy: np.ndarray,
-) -> np.ndarray:
-    """Alpha of each Gaussian at the pixel (EWA projection, as the renderer's). [M]"""
-    axes = _rotations(seen.unit_quats.double().numpy()) * seen.scales.double().numpy()[:, None, :]
-    axes = rotation.astype(np.float64) @ axes  # principal axes in the camera, columns
-    x, y, z = local.astype(np.float64).T
-    jacobian = np.zeros((len(local), 2, 3))
-    jacobian[:, 0, 0], jacobian[:, 0, 2] = fx / z, -fx * x / (z * z)
-    jacobian[:, 1, 1], jacobian[:, 1, 2] = fy / z, -fy * y / (z * z)
-    flat = jacobian @ axes
-    cov = flat @ flat.transpose(0, 2, 1)
-    a, b, c = cov[:, 0, 0] + DILATION, cov[:, 0, 1], cov[:, 1, 1] + DILATION
-    power = 0.5 * (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / np.maximum(a * c - b * b, 1e-12)
-    alphas = seen.opacities.double().numpy() * np.exp(-np.clip(power, 0.0, 80.0))
-    alphas[alphas < ALPHA_MIN] = 0.0
-    clamped: np.ndarray = np.minimum(alphas, ALPHA_MAX)
-    return clamped
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices of unit quaternions wxyz. [M,4] -> [M,3,3]"""
-    w, x, y, z = quats.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    scene: Gaussians, rows: NDArray[np.int64], camera: Camera, x: float, y: float, near: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Which of some Gaussians the rasteriser draws at a position, nearest first, and their alphas there."""
+    some = scene[torch.from_numpy(rows)]
+    pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
+    splats, _ = reference.project(
+        some.means.double(), some.quats, some.scales, some.opacities, torch.zeros(len(rows), 3),
+        camera.viewmat, camera.K, camera.width, camera.height, near, None, False, pixel,
+    )  # fmt: skip
+    l11, l21, l22 = splats.whitening.unbind(1)
+    dx, dy = (torch.tensor([x, y], dtype=torch.float64) - splats.means2d).unbind(1)
+    alphas = splats.opacities * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))
+    alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp_max(ALPHA_MAX), 0.0)
+    return rows[splats.rows.numpy()], alphas.numpy()
