@@ -13,28 +13,31 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.order import depth_order
-from progdf.rasterize.shares import at_once, claim, finish, finished, share
+from progdf.rasterize.shares import Team, at_once, claim, enter, finish, finished, leave
 
 Array = NDArray[Any]
 
 
 @kernel()
 def _tick(times: Array, claims: Array) -> None:
+    enter(claims)
     piece = claim(claims)
     while piece < times.size:
         times[piece] += 1
         piece = claim(claims)
+    leave(claims)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_every_piece_of_work_is_done_once(workers: int) -> None:
     times = np.zeros(100_000, np.int64)
-    share(workers, _tick, times)
+    Team(workers).share(_tick, times)
     assert (times == 1).all()
 
 
 @kernel()
 def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
+    enter(claims)
     piece = claim(claims)
     while piece < times.size:
         times[piece] = piece
@@ -46,19 +49,20 @@ def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
     while piece < sums.size:
         sums[piece] = times.sum()
         piece = claim(claims[2:])
+    leave(claims)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_a_second_step_sees_all_of_the_first(workers: int) -> None:
     for _ in range(20):
         times, sums = np.zeros(5000, np.int64), np.zeros(20, np.int64)
-        share(workers, _tick_and_add, times, sums)
+        Team(workers).share(_tick_and_add, times, sums)
         assert (sums == 5000 * 4999 // 2).all()
 
 
 def test_two_python_threads_may_share_out_work_at_the_same_time() -> None:
     done = [np.zeros(200_000, np.int64) for _ in range(4)]
-    callers = [threading.Thread(target=share, args=(2, _tick, times)) for times in done]
+    callers = [threading.Thread(target=Team(2).share, args=(_tick, times)) for times in done]
     for caller in callers:
         caller.start()
     for caller in callers:
@@ -85,10 +89,10 @@ def test_an_error_in_another_thread_arrives() -> None:
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_forked_process_gets_threads_of_its_own() -> None:
     times = np.zeros(1000, np.int64)
-    share(2, _tick, times)
+    Team(2).share(_tick, times)
     child = os.fork()
     if child == 0:
-        share(2, _tick, times)
+        Team(2).share(_tick, times)
         os._exit(0 if (times == 2).all() else 1)
     _, status = os.waitpid(child, 0)
     assert status == 0
@@ -99,6 +103,6 @@ def test_depth_order_is_numpys_stable_sort_for_every_number_of_threads(workers: 
     rng = np.random.default_rng(0)
     depths = rng.choice(np.linspace(0.02, 90.0, 5000).astype(np.float32), 200_000)
     candidates = rng.random(len(depths)) < 0.9
-    ids, ranks = depth_order(depths, candidates, workers)
+    ids, ranks = depth_order(depths, candidates, Team(workers))
     np.testing.assert_array_equal(ids, np.flatnonzero(candidates))
     np.testing.assert_array_equal(np.argsort(ranks), np.argsort(depths[ids], kind="stable"))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from progdf.rasterize.blend_backward import unblend
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection_backward import project_backward
-from progdf.rasterize.shares import finished
+from progdf.rasterize.shares import enter, finished, leave
 
 Array = NDArray[Any]
 
@@ -24,7 +24,8 @@ def backpropagate(
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
     grad_camera: Array, claims: Array,
 ) -> None:  # fmt: skip
-    """`unblend`, then `project_backward`, whose arguments these are; claims: [3], as from `shares.share`."""
+    """`unblend`, then `project_backward`, whose arguments these are; claims: as `shares.Team` gives them."""
+    enter(claims)
     unblend(
         splats, rgb, window, grid, tile_starts, members, slots, background, transmittance, last, grad_image,
         grad_transmittance, sums, wanted, claims,
@@ -37,3 +38,4 @@ def backpropagate(
         splats, per_splat, sums, wanted, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors,
         grad_camera, claims[2:],
     )  # fmt: skip
+    leave(claims)

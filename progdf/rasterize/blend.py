@@ -13,12 +13,16 @@ from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import WIDTH, choose, count, load, store
 from progdf.rasterize.pixels import (
     BATCH,
+    BEGIN,
     BLUE,
     CARD,
+    EIGHT,
     END,
     FIRST,
     GREEN,
-    PEAK,
+    LEAST,
+    MOST,
+    ONE,
     PLANE,
     RED,
     START,
@@ -28,9 +32,10 @@ from progdf.rasterize.pixels import (
     U_PEAK,
     exp2,
     make_cards,
+    new_cards,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim
+from progdf.rasterize.shares import claim, enter, leave
 
 Array = NDArray[Any]
 
@@ -47,25 +52,29 @@ _G, _B, _LAST = PLANE * np.uint64(2), PLANE * np.uint64(3), PLANE * np.uint64(4)
 def blend_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> None:
     """Blend one row of a splat into a tile's state; `card` is where its card begins, see `pixels`."""
     start, stop = cards[card + START + row], cards[card + STOP + row]
-    peak, u_peak, step = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + STEP]
-    top = cards[card + TOP + row]
+    if start >= stop:
+        return
+    u_peak, top, step = cards[card + U_PEAK + row], cards[card + TOP + row], cards[card + STEP]
     red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
-        p = row * np.uint64(TILE_W) + np.uint64(j)
-        column = np.float32(j) + count()
-        u = u_peak + step * (column - peak)
-        alpha = exp2(top - u * u)
-        alpha = choose(alpha < _ALPHA_MAX, alpha, _ALPHA_MAX)
-        alpha = choose(column < stop, alpha, _ZERO)
+    p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+    offset = start + count()
+    while start < stop:
+        u = u_peak + step * offset
+        alpha = exp2(top - u * u, cards)
+        alpha = choose(alpha < cards[MOST], alpha, cards[MOST])
+        alpha = choose(offset < stop, alpha, _ZERO)
         before = load(state, p)
-        after = before * (_ONE - alpha)
-        taken = after > _T_MIN
+        after = before * (cards[ONE] - alpha)
+        taken = after > cards[LEAST]
         weight = choose(taken, alpha * before, _ZERO)
         store(state, p, choose(taken, after, choose(before < _ZERO, before, _ZERO - before)))
         store(state, p + PLANE, load(state, p + PLANE) + weight * red)
         store(state, p + _G, load(state, p + _G) + weight * green)
         store(state, p + _B, load(state, p + _B) + weight * blue)
         store(state, p + _LAST, choose(weight > _ZERO, place, load(state, p + _LAST)))
+        p += np.uint64(WIDTH)
+        offset += cards[EIGHT]
+        start += cards[EIGHT]
 
 
 @kernel(fast=True, inline=True)
@@ -100,8 +109,8 @@ def blend_tile(
         make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
         for place in range(begin, end):
             card = np.uint64(place - begin) * CARD
-            for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-                blend_row(state, cards, card, row, np.float32(place))
+            for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
+                blend_row(state, cards, card, np.uint64(line), np.float32(place))
         if not _shrink(state, bounds):
             break
 
@@ -122,12 +131,13 @@ def blend(
         image: out, [h,w,3] float32
         transmittance: out, [h,w] float32
         last: out, place in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
-        claims: as `shares.claim` wants it
+        claims: as `shares.Team` gives them
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
-    state, cards = np.empty(5 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
+    state, cards = np.empty(5 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
+    enter(claims)
     tile = claim(claims)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
@@ -149,3 +159,4 @@ def blend(
                 image[i, left + k, 1] = state[p + _G + k] + through * background[1]
                 image[i, left + k, 2] = state[p + _B + k] + through * background[2]
         tile = claim(claims)
+    leave(claims)

@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.conventions import ALPHA_MAX
 from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total, totals
 from progdf.rasterize.pixels import (
     BATCH,
+    BEGIN,
     BLUE,
     CARD,
+    EIGHT,
     END,
     FIRST,
     GREEN,
-    PEAK,
+    MOST,
+    ONE,
     PLANE,
     RED,
     START,
@@ -34,6 +36,7 @@ from progdf.rasterize.pixels import (
     V,
     exp2,
     make_cards,
+    new_cards,
     tile_bounds,
 )  # fmt: skip
 from progdf.rasterize.shares import claim, finish
@@ -43,7 +46,6 @@ Array = NDArray[Any]
 SUMS = 9
 """Numbers of one intersection's row."""
 
-_ALPHA_MAX: Number = np.float32(ALPHA_MAX)
 _ZERO: Number = np.float32(0.0)
 _ONE: Number = np.float32(1.0)
 # planes of the state: transmittance after the splat at hand; what lies behind it, times the gradient; the
@@ -57,24 +59,27 @@ def unblend_splat(state: Array, cards: Array, card: Number, place: Number, sums:
     """Take one splat off a tile's state and write its row of `sums`; the rest as in `blend_row`."""
     red, green, blue, step = cards[card + RED], cards[card + GREEN], cards[card + BLUE], cards[card + STEP]
     s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = spread(_ZERO)
-    for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-        start, stop, top = cards[card + START + row], cards[card + STOP + row], cards[card + TOP + row]
-        peak, u_peak, v = cards[card + PEAK + row], cards[card + U_PEAK + row], cards[card + V + row]
-        for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
-            p = row * np.uint64(TILE_W) + np.uint64(j)
-            column = np.float32(j) + count()
-            u = u_peak + step * (column - peak)
-            raw = exp2(top - u * u)
-            alpha = choose(raw < _ALPHA_MAX, raw, _ALPHA_MAX)
-            alpha = choose((column < stop) & (place <= load(state, p + _LAST)), alpha, _ZERO)
-            inverse = _ONE / (_ONE - alpha)
+    for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
+        row = np.uint64(line)
+        start, stop = cards[card + START + row], cards[card + STOP + row]
+        if start >= stop:
+            continue
+        u_peak, v, top = cards[card + U_PEAK + row], cards[card + V + row], cards[card + TOP + row]
+        p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+        offset = start + count()
+        while start < stop:
+            u = u_peak + step * offset
+            reached = (offset < stop) & (place <= load(state, p + _LAST))
+            raw = choose(reached, exp2(top - u * u, cards), _ZERO)
+            alpha = choose(raw < cards[MOST], raw, cards[MOST])
+            inverse = cards[ONE] / (cards[ONE] - alpha)
             before = load(state, p) * inverse
             g0, g1, g2 = load(state, p + _G0), load(state, p + _G1), load(state, p + _G2)
             shown = red * g0 + green * g1 + blue * g2
             behind = load(state, p + _BEHIND)
             weight = alpha * before
             g = alpha * (before * shown - behind * inverse)
-            g = choose(raw <= _ALPHA_MAX, g, _ZERO)
+            g = choose(raw <= cards[MOST], g, _ZERO)
             store(state, p, before)
             store(state, p + _BEHIND, behind + weight * shown)
             s_r += weight * g0
@@ -87,6 +92,9 @@ def unblend_splat(state: Array, cards: Array, card: Number, place: Number, sums:
             s_uu += g_u * u
             s_uv += g_u * v
             s_vv += g_v * v
+            p += np.uint64(WIDTH)
+            offset += cards[EIGHT]
+            start += cards[EIGHT]
     at = np.uint64(slot) * np.uint64(SUMS)
     store(sums, at, totals(s_r, s_g, s_b, s_0, s_u, s_v, s_uu, s_uv))
     sums[slot, 8] = total(s_vv)
@@ -96,20 +104,26 @@ def unblend_splat(state: Array, cards: Array, card: Number, place: Number, sums:
 def pass_splat(state: Array, cards: Array, card: Number, place: Number) -> None:
     """As `unblend_splat` for a splat whose own gradient nobody wants."""
     red, green, blue, step = cards[card + RED], cards[card + GREEN], cards[card + BLUE], cards[card + STEP]
-    for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-        start, stop, top = cards[card + START + row], cards[card + STOP + row], cards[card + TOP + row]
-        peak, u_peak = cards[card + PEAK + row], cards[card + U_PEAK + row]
-        for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
-            p = row * np.uint64(TILE_W) + np.uint64(j)
-            column = np.float32(j) + count()
-            u = u_peak + step * (column - peak)
-            alpha = exp2(top - u * u)
-            alpha = choose(alpha < _ALPHA_MAX, alpha, _ALPHA_MAX)
-            alpha = choose((column < stop) & (place <= load(state, p + _LAST)), alpha, _ZERO)
-            before = load(state, p) / (_ONE - alpha)
+    for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
+        row = np.uint64(line)
+        start, stop = cards[card + START + row], cards[card + STOP + row]
+        if start >= stop:
+            continue
+        u_peak, top = cards[card + U_PEAK + row], cards[card + TOP + row]
+        p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+        offset = start + count()
+        while start < stop:
+            u = u_peak + step * offset
+            reached = (offset < stop) & (place <= load(state, p + _LAST))
+            alpha = choose(reached, exp2(top - u * u, cards), _ZERO)
+            alpha = choose(alpha < cards[MOST], alpha, cards[MOST])
+            before = load(state, p) / (cards[ONE] - alpha)
             shown = red * load(state, p + _G0) + green * load(state, p + _G1) + blue * load(state, p + _G2)
             store(state, p, before)
             store(state, p + _BEHIND, load(state, p + _BEHIND) + alpha * before * shown)
+            p += np.uint64(WIDTH)
+            offset += cards[EIGHT]
+            start += cards[EIGHT]
 
 
 @kernel(fast=True)
@@ -155,7 +169,7 @@ def unblend(
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
-    state, cards = np.empty(6 * plane, np.float32), np.empty(BATCH * np.int64(CARD), np.float32)
+    state, cards = np.empty(6 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
     tile = claim(claims)
     while tile < tiles:

@@ -24,7 +24,8 @@ from progdf.rasterize.blend_backward import SUMS
 from progdf.rasterize.conventions import RasterInfo
 from progdf.rasterize.jit import running
 from progdf.rasterize.projection_backward import CAMERA, PARTS
-from progdf.rasterize.shares import at_once, share
+from progdf.rasterize.shares import Team, at_once
+from progdf.rasterize.threads import threads
 
 Array = NDArray[Any]
 
@@ -106,10 +107,11 @@ def alpha_weights(
     gaussians.append(np.zeros((len(means), 1, 3), np.float32))
     totals = np.zeros((len(means), weights.SUMS))
     with running("weights", 2) as workers:
-        lists, _ = _list_splats(view, gaussians, workers, for_gradients=True)
+        team = Team(workers)
+        lists, _ = _list_splats(view, gaussians, team, for_gradients=True)
         sums = np.zeros((len(lists.members), weights.SUMS))
-        share(
-            workers, weights.weigh,
+        team.share(
+            weights.weigh,
             lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
             _float32(mask).numpy(), sums,
         )  # fmt: skip
@@ -127,12 +129,12 @@ def _view(
     antialiased: bool,
     crop: tuple[int, int, int, int],
 ) -> _View:
-    k = K.detach().cpu().numpy()
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
     x0, y0, x1, y1 = crop
     column, row = x0 // TILE_W, y0 // TILE_H
     return _View(
-        viewmat=np.ascontiguousarray(viewmat.detach().cpu().numpy(), np.float64),
-        intrinsics=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.float64),
+        viewmat=np.array(viewmat.tolist()),
+        intrinsics=np.array([fx, fy, cx, cy]),
         size=np.array([width, height], np.int64),
         window=np.array(crop, np.int64),
         grid=np.array([column, row, -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row], np.int64),
@@ -147,7 +149,7 @@ def _float32(tensor: Tensor) -> Tensor:
 
 
 def _list_splats(
-    view: _View, gaussians: list[Array], workers: int, for_gradients: bool
+    view: _View, gaussians: list[Array], team: Team, for_gradients: bool
 ) -> tuple[_Lists, list[Array]]:
     """Project, sort and bin; also the centres, depths and visibility of all Gaussians."""
     means, quats, scales, opacities, colors = gaussians
@@ -164,31 +166,32 @@ def _list_splats(
         )  # fmt: skip
         _check_intersections(len(ids), total)
         return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), found
-    share(
-        workers, projection.cull,
+    team.share(
+        projection.cull,
         means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
         centres, depths, candidates,
     )  # fmt: skip
-    ids, ranks = order.depth_order(depths, candidates, workers)
+    ids, ranks = order.depth_order(depths, candidates, team)
     splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
-    share(
-        workers, projection.project,
+    team.share(
+        projection.project,
         ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
         view.size, view.window, view.antialiased, splats, rgb, visible,
     )  # fmt: skip
-    counts, per_splat = np.empty((workers, len(tile_starts) - 1), np.int64), np.empty(len(ids) + 1, np.int64)
+    counts = np.empty((team.workers, len(tile_starts) - 1), np.int64)
+    per_splat = np.empty(len(ids) + 1, np.int64)
     tiles = at_once(
         partial(
             binning.find_tiles, splats, part, view.window, view.grid, MOST_INTERSECTIONS, counts, per_splat
         )
-        for part in range(workers)
+        for part in range(team.workers)
     )
     total = binning.place_tiles(counts, tile_starts, per_splat)
     _check_intersections(len(ids), total)
     members, slots = np.empty(total, np.int32), np.empty(total if for_gradients else 0, np.int64)
     at_once(
         partial(binning.fill_tiles, tiles[part], part, counts, per_splat, members, slots)
-        for part in range(workers)
+        for part in range(team.workers)
     )
     return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), found
 
@@ -212,14 +215,17 @@ class _Rasterize(torch.autograd.Function):
         image = np.empty((y1 - y0, x1 - x0, 3), np.float32)
         transmittance, last = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
         with running("forward", 12) as workers:
-            lists, found = _list_splats(view, gaussians, workers, any(ctx.needs_input_grad))
-            share(
-                workers, blend,
+            team = Team(workers)
+            team.call()
+            lists, found = _list_splats(view, gaussians, team, any(ctx.needs_input_grad))
+            team.share(
+                blend,
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
                 background, image, transmittance, last,
             )  # fmt: skip
         results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
         ctx.mark_non_differentiable(*results[2:])
+        ctx.set_materialize_grads(False)
         ctx.view, ctx.grad_rows, ctx.lists, ctx.last = view, grad_rows, lists, last
         ctx.save_for_backward(*tensors, results[1])
         return results
@@ -227,6 +233,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        team = Team(threads())
+        team.call()
         view, lists = ctx.view, ctx.lists
         *tensors, saved_transmittance = ctx.saved_tensors
         *gaussians, background = [tensor.detach().numpy() for tensor in tensors[:6]]
@@ -234,16 +242,17 @@ class _Rasterize(torch.autograd.Function):
         if view.degree < 0:
             gaussians[4] = gaussians[4].reshape(-1, 1, 3)
         transmittance = saved_transmittance.numpy()
-        grad_image, grad_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads[:2])
+        grad_image = _array(grads[0], (*transmittance.shape, 3))
+        grad_transmittance = _array(grads[1], transmittance.shape)
         sums = np.empty((len(lists.members), SUMS), np.float32)
         gradients = [np.zeros(array.shape, np.float32) for array in gaussians]
         means, quats, scales, opacities, colors = gaussians
         by_means, by_quats, by_scales, by_opacities, by_colors = gradients
         grad_camera = np.zeros((PARTS, CAMERA))
         wanted = _wanted_splats(lists, len(means), ctx.grad_rows)
-        with running("backward", 5) as workers:
-            share(
-                workers, backpropagate,
+        with running("backward", 5):
+            team.share(
+                backpropagate,
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
                 lists.slots, background, transmittance, ctx.last, grad_image, grad_transmittance,
                 sums, wanted,
@@ -258,6 +267,11 @@ class _Rasterize(torch.autograd.Function):
         results.append(_background_gradient(transmittance, grad_image) if needs[0] else None)
         results += _camera_gradients(grad_camera, *tensors[6:]) if any(needs[1:]) else (None, None)
         return None, None, *results
+
+
+def _array(grad: Tensor | None, shape: tuple[int, ...]) -> Array:
+    """A gradient; None is zero."""
+    return np.zeros(shape, np.float32) if grad is None else np.ascontiguousarray(grad.numpy())
 
 
 def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:

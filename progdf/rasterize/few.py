@@ -23,6 +23,7 @@ from progdf.rasterize.order import (
     rank_items,
 )
 from progdf.rasterize.projection import cull, project
+from progdf.rasterize.shares import CLAIMS
 
 Array = NDArray[Any]
 
@@ -33,9 +34,9 @@ def _depth_order(depths: Array, candidates: Array) -> tuple[Array, Array]:
     new_keys, new_items = np.empty_like(keys), np.empty_like(items)
     places = np.empty((1, BUCKETS), np.int64)
     for digit in range(DIGITS):
-        count_digits(keys, digit, places, np.zeros(1, np.int64))
+        count_digits(keys, digit, places, np.zeros(CLAIMS, np.int64))
         place_digits(places)
-        move_digits(keys, items, digit, places, new_keys, new_items, np.zeros(1, np.int64))
+        move_digits(keys, items, digit, places, new_keys, new_items, np.zeros(CLAIMS, np.int64))
         keys, new_keys, items, new_items = new_keys, keys, new_items, items
     return ids, rank_items(items)
 
@@ -55,16 +56,16 @@ def list_few(
         ids, ranks, splats, rgb, per_splat, members, slots, and the number of (splat, tile) intersections;
         where that is more than `most`, members and slots are empty
     """
-    claims = np.zeros(2, np.int64)
+    claims = np.zeros((2, CLAIMS), np.int64)
     cull(
         means, scales, opacities, viewmat, intrinsics, size, window, near, centres, depths, candidates,
-        claims[:1],
+        claims[0],
     )  # fmt: skip
     ids, ranks = _depth_order(depths, candidates)
     splats, rgb = np.empty((ids.size, 8)), np.empty((ids.size, 4), np.float32)
     project(
         ids, ranks, means, quats, scales, opacities, colors, degree, viewmat, intrinsics, size, window,
-        antialiased, splats, rgb, visible, claims[1:],
+        antialiased, splats, rgb, visible, claims[1],
     )  # fmt: skip
     counts, per_splat = np.empty((1, grid[2] * grid[3]), np.int64), np.empty(ids.size + 1, np.int64)
     tiles = find_tiles(splats, 0, window, grid, most, counts, per_splat)

@@ -28,7 +28,7 @@ Number = Any
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _lock = threading.RLock()
-_ready: set[Path] = set()  # markers seen
+_ready: set[str] = set()  # stages whose marker was seen
 
 
 def _source_version() -> str:
@@ -107,10 +107,10 @@ def running(stage: str, seconds: int) -> Iterator[int]:
         stage: names the kernels that will run, to tell a cold start from a warm one
         seconds: about how long these take to compile
     """
-    marker = CACHE / f"{stage}.ready"
-    if marker in _ready:
+    if stage in _ready:
         yield threads()
         return
+    marker = CACHE / f"{stage}.ready"
     with _lock:
         cold = not marker.exists()
         if cold:
@@ -120,4 +120,4 @@ def running(stage: str, seconds: int) -> Iterator[int]:
         yield threads()
         if cold:
             marker.touch()
-        _ready.add(marker)
+        _ready.add(stage)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.shares import claim, share
+from progdf.rasterize.shares import Team, claim, enter, leave
 
 Array = NDArray[Any]
 
@@ -56,12 +56,14 @@ def count_digits(keys: Array, digit: int, places: Array, claims: Array) -> None:
     parts = places.shape[0]
     step = (keys.size + parts - 1) // parts
     shift = np.uint32(digit * _DIGIT)
+    enter(claims)
     part = claim(claims)
     while part < parts:
         places[part] = 0
         for k in range(part * step, min(keys.size, (part + 1) * step)):
             places[part, (keys[k] >> shift) & np.uint32(BUCKETS - 1)] += 1
         part = claim(claims)
+    leave(claims)
 
 
 @kernel(cache=True)
@@ -83,6 +85,7 @@ def move_digits(
     parts = places.shape[0]
     step = (keys.size + parts - 1) // parts
     shift = np.uint32(digit * _DIGIT)
+    enter(claims)
     part = claim(claims)
     while part < parts:
         for k in range(part * step, min(keys.size, (part + 1) * step)):
@@ -91,6 +94,7 @@ def move_digits(
             places[part, bucket] = at + 1
             new_keys[at], new_items[at] = keys[k], items[k]
         part = claim(claims)
+    leave(claims)
 
 
 @kernel(cache=True)
@@ -102,24 +106,24 @@ def rank_items(items: Array) -> Array:
     return ranks
 
 
-def depth_order(depths: Array, candidates: Array, workers: int) -> tuple[Array, Array]:
+def depth_order(depths: Array, candidates: Array, team: Team) -> tuple[Array, Array]:
     """The candidates and their places in the order of depth, ties by index.
 
     Args:
         depths: > 0. [N] float32
         candidates: [N] bool
-        workers: threads
+        team: who takes part
 
     Returns:
         indices of the candidates, ascending [V] int64; rank of each, 0 is nearest [V] int64
     """
     ids, keys, items = gather_keys(depths, candidates)
     new_keys, new_items = np.empty_like(keys), np.empty_like(items)
-    workers = min(workers, 1 + len(keys) // _WORTH_A_THREAD)
-    places = np.empty((workers, BUCKETS), np.int64)
+    team = team.at_most(1 + len(keys) // _WORTH_A_THREAD)
+    places = np.empty((team.workers, BUCKETS), np.int64)
     for digit in range(DIGITS):
-        share(workers, count_digits, keys, digit, places)
+        team.share(count_digits, keys, digit, places)
         place_digits(places)
-        share(workers, move_digits, keys, items, digit, places, new_keys, new_items)
+        team.share(move_digits, keys, items, digit, places, new_keys, new_items)
         keys, new_keys, items, new_items = new_keys, keys, new_items, items
     return ids, rank_items(items)

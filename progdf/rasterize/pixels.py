@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.conventions import ALPHA_MIN
+from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import Number, kernel
-from progdf.rasterize.lanes import WIDTH, Lanes, choose, times_power, whole
+from progdf.rasterize.lanes import WIDTH, Lanes, times_power, whole
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
@@ -25,39 +25,49 @@ LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
 # 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding (fitted by reweighted least
 # squares)
-_E1, _E2, _E3 = np.float32(0.6931470643273044), np.float32(0.240224367820186), np.float32(0.05549075707783424)
-_E4, _E5, _E6 = (
-    np.float32(0.009579179674631904),
-    np.float32(0.0012747482964304813),
-    np.float32(0.00010902322854050052),
-)
-_ONE: Number = np.float32(1.0)
-_LOWEST: Number = np.float32(-126.0)
-
-
-@kernel(fast=True, inline=True)
-def exp2(x: Lanes) -> Lanes:
-    """2^x for x ≤ 0, below -126 as at -126."""
-    x = choose(x < _LOWEST, _LOWEST, x)
-    n = whole(x)
-    f = x - n
-    p = _ONE + f * (_E1 + f * (_E2 + f * (_E3 + f * (_E4 + f * (_E5 + f * _E6)))))
-    return times_power(p, n)
-
+_POLYNOMIAL = (
+    0.6931470643273044, 0.240224367820186, 0.05549075707783424, 0.009579179674631904, 0.0012747482964304813,
+    0.00010902322854050052,
+)  # fmt: skip
 
 BATCH = 16
 """Splats whose cards are made out at once: the pixel loops then branch on numbers that are long known."""
 
-START, STOP, PEAK, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
-"""Where a card holds its rows: first column of the support and one past its last, from the tile's left edge
-(none where the second is not the greater); the column nearest to the row's peak; u there, so that u = u_peak
-+ l11 · (column − peak); v; log2 of alpha where u is 0."""
+BEGIN, START, STOP, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
+"""Where a card holds its rows: first column of the support from the tile's left edge; that and one past its
+last from the column nearest to the row's peak (none where the second is not the greater); u at that column,
+so that u = u_peak + l11 · (column − peak); v; log2 of alpha where u is 0."""
 
 FIRST, END, STEP, RED, GREEN, BLUE = (np.uint64(6 * TILE_H + k) for k in range(6))
 """Where a card holds: first row of the support and one past its last, from the tile's top; l11; colour."""
 
 CARD = np.uint64(64)
 """float32 numbers of a card."""
+
+_CONSTANTS = BATCH * int(CARD)
+MOST, LEAST, ONE, EIGHT, _E1, _E2, _E3, _E4, _E5, _E6 = (np.uint64(_CONSTANTS + k) for k in range(10))
+"""Where the cards are followed by constants: ALPHA_MAX, TRANSMITTANCE_MIN, 1, 8, the polynomial. Known to the
+compiler, they would be at a dozen far addresses, built anew for every row."""
+
+_VALUES = np.array([ALPHA_MAX, TRANSMITTANCE_MIN, 1.0, WIDTH, *_POLYNOMIAL], np.float32)
+
+
+@kernel(inline=True)
+def new_cards() -> Array:
+    """An empty batch of cards, with the constants. float32"""
+    cards = np.empty(_CONSTANTS + _VALUES.size, np.float32)
+    cards[_CONSTANTS:] = _VALUES
+    return cards
+
+
+@kernel(fast=True, inline=True)
+def exp2(x: Lanes, cards: Array) -> Lanes:
+    """2^x for -126 ≤ x ≤ 0; anything for other lanes."""
+    n = whole(x)
+    f = x - n
+    p = cards[_E4] + f * (cards[_E5] + f * cards[_E6])
+    p = cards[ONE] + f * (cards[_E1] + f * (cards[_E2] + f * (cards[_E3] + f * p)))
+    return times_power(p, n)
 
 
 @kernel(fast=True, inline=True)
@@ -74,7 +84,7 @@ def make_cards(
         rgb: [V,4] float32
         x, y: the tile's first pixel in the full image
         bounds: left, top, right, bottom of what to look at, from (x, y). [4] int64
-        cards: out. [BATCH · CARD] float32
+        cards: as from `new_cards`; out
     """
     low, high = np.float64(bounds[0]), np.float64(bounds[2])
     for place in range(begin, end):
@@ -94,9 +104,10 @@ def make_cards(
             # counting from the peak keeps u = l11·(column − centre) free of cancellation in float32; far
             # peaks (needles, giants) lie where l11 is small
             peak = min(max(np.floor(centre + 0.5), -65536.0), 65536.0)
-            cards[at + START + row] = min(start, high)
-            cards[at + STOP + row] = max(stop, low) if rest >= 0.0 else low
-            cards[at + PEAK + row] = peak
+            start, stop = min(start, high), max(stop, low) if rest >= 0.0 else low
+            cards[at + BEGIN + row] = start
+            cards[at + START + row] = start - peak
+            cards[at + STOP + row] = stop - peak
             cards[at + U_PEAK + row] = l11 * (peak - centre)
             cards[at + V + row] = v
             cards[at + TOP + row] = rest + LOG2_ALPHA_MIN

@@ -20,7 +20,7 @@ from progdf.rasterize.geometry import Vec, dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.lanes import WIDTH, choose
 from progdf.rasterize.shading import fill_basis, view_direction
-from progdf.rasterize.shares import claim
+from progdf.rasterize.shares import claim, enter, leave
 
 Array = NDArray[Any]
 
@@ -85,9 +85,10 @@ def cull(
         centres: out, [N,2] float32
         depths: out, [N] float32
         candidates: out, [N] bool
-        claims: as `shares.claim` wants it
+        claims: as `shares.Team` gives them
     """
     n = means.shape[0]
+    enter(claims)
     part = claim(claims)
     while part * _CHUNK < n:
         _cull_range(
@@ -95,6 +96,7 @@ def cull(
             window, near, centres, depths, candidates,
         )  # fmt: skip
         part = claim(claims)
+    leave(claims)
 
 
 @kernel(contract=True)
@@ -188,9 +190,10 @@ def project(
         splats: out, the columns named above; R2 is -1 where the splat is not shown. [V,8] float64
         rgb: out, [V,4] opacity last, antialias included. float32
         visible: out, set to True for what is shown. [N] bool
-        claims: as `shares.claim` wants it
+        claims: as `shares.Team` gives them
     """
     count, eye = ids.size, make_lens(viewmat, intrinsics, size).eye
+    enter(claims)
     part = claim(claims)
     while part * _CHUNK < count:
         begin, end = part * _CHUNK, min(count, (part + 1) * _CHUNK)
@@ -200,3 +203,4 @@ def project(
         )  # fmt: skip
         _shade_range(begin, end, ids, ranks, means, colors, degree, eye, splats, rgb, visible)
         part = claim(claims)
+    leave(claims)

@@ -19,8 +19,19 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
+from progdf.rasterize.jit import kernel
+
+Array = NDArray[Any]
 T = TypeVar("T")
+
+CLAIMS = 5
+"""Counters of a shared kernel: the next piece of work and the pieces done; the next piece of a second step,
+where there is one; threads that have entered and left."""
+
+_ENTERED, _LEFT = 3, 4
+_PATIENCE = 1 << 20  # looks at a counter before a thread goes to sleep: a millisecond or two
 
 _pool: ThreadPoolExecutor | None = None
 
@@ -36,15 +47,56 @@ def at_once(calls: Iterable[Callable[[], T]]) -> list[T]:
     return [mine(), *(call.result() for call in pending)]
 
 
-def share(workers: int, kernel: Callable[..., None], *arguments: Any) -> None:
-    """Run `kernel(*arguments, claims)` on several threads at once, this one among them.
+class Team:
+    """The threads of one pass of the rasteriser, this one among them.
 
-    Args:
-        workers: how many threads, ≥ 1
-        kernel: takes its work by `claim`; claims are [3], so that two steps fit in one launch
+    To be woken takes a thread about 50 µs, as long as a small kernel: so they are called while the kernel's
+    arguments are still being made, and one that comes too late is not waited for.
     """
-    call = partial(kernel, *arguments, np.zeros(3, np.int64))
-    at_once([call] * workers)
+
+    def __init__(self, workers: int) -> None:
+        """workers: how many threads, ≥ 1"""
+        self.workers = workers
+        self._called: _Job | None = None
+
+    def at_most(self, workers: int) -> Team:
+        """As many of them as are worth it."""
+        return Team(workers) if workers < self.workers else self
+
+    def call(self) -> None:
+        """Wake the others; they stand by for the next kernel for a millisecond or two."""
+        self._called = _Job(self.workers - 1)
+
+    def share(self, kernel: Callable[..., None], *arguments: Any) -> None:
+        """Run `kernel(*arguments, claims)` on all threads at once.
+
+        Args:
+            kernel: between `enter` and `leave` it takes its work by `claim`; claims are [CLAIMS]
+        """
+        job = self._called or _Job(self.workers - 1)
+        self._called = None
+        job.run(partial(kernel, *arguments, job.claims))
+
+
+class _Job:
+    """A kernel that several threads run."""
+
+    def __init__(self, others: int) -> None:
+        self.claims = np.zeros(CLAIMS, np.int64)
+        self._run: Callable[[], None] | None = None
+        self._others = [_threads().submit(self._help) for _ in range(others)]
+
+    def run(self, call: Callable[[], None]) -> None:
+        self._run = call
+        call()
+        if self._others and not _has_left(self.claims, _PATIENCE):
+            for other in self._others:
+                if not other.cancel():
+                    other.result()
+
+    def _help(self) -> None:
+        if _has_entered(self.claims, _PATIENCE) and self._run is not None:
+            self._run()
 
 
 def _threads() -> ThreadPoolExecutor:
@@ -78,25 +130,71 @@ def claim(typingctx: Any, claims: Any) -> Any:
 @intrinsic  # type: ignore[untyped-decorator]
 def finish(typingctx: Any, claims: Any) -> Any:
     """Inside a kernel: count a claimed piece of work as done."""
-
-    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        one = context.get_constant(types.int64, 1)
-        builder.atomic_rmw("add", _done(context, builder, sig, args), one, "release")
-        return context.get_dummy_value()
-
-    return types.void(claims), generate
+    return _adding(claims, 1)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def finished(typingctx: Any, claims: Any) -> Any:
     """Inside a kernel: how many pieces of work are done; what they wrote may be read. int64"""
+    return _reading(claims, 1)
 
+
+@intrinsic  # type: ignore[untyped-decorator]
+def enter(typingctx: Any, claims: Any) -> Any:
+    """The first thing that a shared kernel does."""
+    return _adding(claims, _ENTERED)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def leave(typingctx: Any, claims: Any) -> Any:
+    """The last thing that a shared kernel does."""
+    return _adding(claims, _LEFT)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _entered(typingctx: Any, claims: Any) -> Any:
+    return _reading(claims, _ENTERED)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _left(typingctx: Any, claims: Any) -> Any:
+    return _reading(claims, _LEFT)
+
+
+@kernel(cache=True)
+def _has_entered(claims: Array, patience: int) -> bool:
+    """Wait until a thread has entered; False: it was not worth waiting."""
+    for _ in range(patience):  # noqa: SIM110 - numba has no generators within a kernel
+        if _entered(claims) > 0:
+            return True
+    return False
+
+
+@kernel(cache=True)
+def _has_left(claims: Array, patience: int) -> bool:
+    """Wait until all who have entered have left; False: it was not worth waiting."""
+    for _ in range(patience):  # noqa: SIM110
+        if _left(claims) == _entered(claims):
+            return True
+    return False
+
+
+def _adding(claims: Any, place: int) -> Any:
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.load_atomic(_done(context, builder, sig, args), "acquire", 8)
+        one = context.get_constant(types.int64, 1)
+        builder.atomic_rmw("add", _counter(context, builder, sig, args, place), one, "release")
+        return context.get_dummy_value()
+
+    return types.void(claims), generate
+
+
+def _reading(claims: Any, place: int) -> Any:
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return builder.load_atomic(_counter(context, builder, sig, args, place), "acquire", 8)
 
     return types.int64(claims), generate
 
 
-def _done(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-    counter = context.make_array(sig.args[0])(context, builder, args[0]).data
-    return builder.gep(counter, [context.get_constant(types.int64, 1)])
+def _counter(context: Any, builder: ir.IRBuilder, sig: Any, args: Any, place: int) -> ir.Value:
+    counters = context.make_array(sig.args[0])(context, builder, args[0]).data
+    return builder.gep(counters, [context.get_constant(types.int64, place)])

@@ -8,15 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total
 from progdf.rasterize.pixels import (
     BATCH,
+    BEGIN,
     CARD,
+    EIGHT,
     END,
     FIRST,
-    PEAK,
+    LEAST,
+    MOST,
+    ONE,
     PLANE,
     START,
     STEP,
@@ -25,17 +28,16 @@ from progdf.rasterize.pixels import (
     U_PEAK,
     exp2,
     make_cards,
+    new_cards,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim
+from progdf.rasterize.shares import claim, enter, leave
 
 Array = NDArray[Any]
 
 SUMS = 4
 """Numbers of one intersection: Σ w·m, Σ m, Σ w, n."""
 
-_ALPHA_MAX: Number = np.float32(ALPHA_MAX)
-_T_MIN: Number = np.float32(TRANSMITTANCE_MIN)
 _ZERO: Number = np.float32(0.0)
 _ONE: Number = np.float32(1.0)
 
@@ -51,19 +53,22 @@ def add_weights(state: Array, cards: Array, card: Number, out: Array) -> None:
     """
     inside = within = weights = pixels = spread(_ZERO)
     step = cards[card + STEP]
-    for row in range(np.uint64(cards[card + FIRST]), np.uint64(max(_ZERO, cards[card + END]))):
-        start, stop, top = cards[card + START + row], cards[card + STOP + row], cards[card + TOP + row]
-        peak, u_peak = cards[card + PEAK + row], cards[card + U_PEAK + row]
-        for j in range(np.int32(start), np.int32(stop), np.int32(WIDTH)):
-            p = row * np.uint64(TILE_W) + np.uint64(j)
-            column = np.float32(j) + count()
-            u = u_peak + step * (column - peak)
-            alpha = exp2(top - u * u)
-            alpha = choose(alpha < _ALPHA_MAX, alpha, _ALPHA_MAX)
+    for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
+        row = np.uint64(line)
+        start, stop = cards[card + START + row], cards[card + STOP + row]
+        if start >= stop:
+            continue
+        u_peak, top = cards[card + U_PEAK + row], cards[card + TOP + row]
+        p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+        offset = start + count()
+        while start < stop:
+            u = u_peak + step * offset
+            reached = offset < stop
+            alpha = choose(reached, exp2(top - u * u, cards), _ZERO)
+            alpha = choose(alpha < cards[MOST], alpha, cards[MOST])
             before, mask = load(state, p), load(state, p + PLANE)
-            after = before * (_ONE - alpha)
-            reached = column < stop
-            taken = reached & (after > _T_MIN)
+            after = before * (cards[ONE] - alpha)
+            taken = reached & (after > cards[LEAST])
             weight = choose(taken, alpha * before, _ZERO)
             done = choose(before < _ZERO, before, _ZERO - before)
             store(state, p, choose(reached, choose(taken, after, done), before))
@@ -71,6 +76,9 @@ def add_weights(state: Array, cards: Array, card: Number, out: Array) -> None:
             within += choose(taken, mask, _ZERO)
             weights += weight
             pixels += choose(taken, _ONE, _ZERO)
+            p += np.uint64(WIDTH)
+            offset += cards[EIGHT]
+            start += cards[EIGHT]
     out[0] += total(inside)
     out[1] += total(within)
     out[2] += total(weights)
@@ -88,11 +96,12 @@ def weigh(
         slots: row of `sums` that belongs to each entry of `members`. [I] int64
         mask: of the full image. [H,W] float32
         sums: out, zero on entry. [I,4] float64
-        claims: as `shares.claim` wants it
+        claims: as `shares.Team` gives them
     """
     tiles = tile_starts.size - 1
     state = np.empty(2 * np.int64(PLANE), np.float32)
-    cards, bounds = np.empty(BATCH * np.int64(CARD), np.float32), np.empty(4, np.int64)
+    cards, bounds = new_cards(), np.empty(4, np.int64)
+    enter(claims)
     tile = claim(claims)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
@@ -108,6 +117,7 @@ def weigh(
                 card = np.uint64(place - begin) * CARD
                 add_weights(state, cards, card, sums[slots[place]])
         tile = claim(claims)
+    leave(claims)
 
 
 @kernel(cache=True)
