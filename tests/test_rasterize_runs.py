@@ -99,6 +99,7 @@ def test_a_cold_start_says_once_that_it_compiles(
     from progdf.rasterize import jit
 
     monkeypatch.setattr(jit, "CACHE", tmp_path)
+    monkeypatch.setattr(jit, "_ready", set())
     with caplog.at_level(logging.WARNING, logger="progdf"):
         for _ in range(2):
             with jit.running("forward", 9):

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.order import depth_order
-from progdf.rasterize.shares import Team, at_once, claim, enter, finish, finished, leave
+from progdf.rasterize.shares import SECOND, Team, at_once, claim, enter, finish, finished, leave
 
 Array = NDArray[Any]
 
 
 @kernel()
 def _tick(times: Array, claims: Array) -> None:
-    enter(claims)
-    piece = claim(claims)
+    seat = enter(claims)
+    piece = claim(claims, seat, times.size)
     while piece < times.size:
         times[piece] += 1
-        piece = claim(claims)
+        piece = claim(claims, seat, times.size)
     leave(claims)
 
 
@@ -37,18 +37,18 @@ def test_every_piece_of_work_is_done_once(workers: int) -> None:
 
 @kernel()
 def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
-    enter(claims)
-    piece = claim(claims)
+    seat = enter(claims)
+    piece = claim(claims, seat, times.size)
     while piece < times.size:
         times[piece] = piece
         finish(claims)
-        piece = claim(claims)
+        piece = claim(claims, seat, times.size)
     while finished(claims) < times.size:
         pass
-    piece = claim(claims[2:])
+    piece = claim(claims[SECOND:], seat, sums.size)
     while piece < sums.size:
         sums[piece] = times.sum()
-        piece = claim(claims[2:])
+        piece = claim(claims[SECOND:], seat, sums.size)
     leave(claims)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from progdf.rasterize.blend_backward import unblend
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection_backward import project_backward
-from progdf.rasterize.shares import enter, finished, leave
+from progdf.rasterize.shares import SECOND, enter, finished, leave
 
 Array = NDArray[Any]
 
@@ -25,10 +25,10 @@ def backpropagate(
     grad_camera: Array, claims: Array,
 ) -> None:  # fmt: skip
     """`unblend`, then `project_backward`, whose arguments these are; claims: as `shares.Team` gives them."""
-    enter(claims)
+    seat = enter(claims)
     unblend(
         splats, rgb, window, grid, tile_starts, members, slots, background, transmittance, last, grad_image,
-        grad_transmittance, sums, wanted, claims,
+        grad_transmittance, sums, wanted, seat, claims,
     )  # fmt: skip
     # what is left is on other threads, at most a tile each: shorter than to sleep and be woken
     while finished(claims) < tile_starts.size - 1:
@@ -36,6 +36,6 @@ def backpropagate(
     project_backward(
         ids, ranks, means, quats, scales, opacities, colors, degree, viewmat, intrinsics, size, antialiased,
         splats, per_splat, sums, wanted, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors,
-        grad_camera, claims[2:],
+        grad_camera, seat, claims[SECOND:],
     )  # fmt: skip
     leave(claims)

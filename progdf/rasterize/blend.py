@@ -137,8 +137,8 @@ def blend(
     plane = np.int64(PLANE)
     state, cards = np.empty(5 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
-    enter(claims)
-    tile = claim(claims)
+    seat = enter(claims)
+    tile = claim(claims, seat, tiles)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         tile_bounds(x, y, window, bounds)
@@ -158,5 +158,5 @@ def blend(
                 image[i, left + k, 0] = state[p + PLANE + k] + through * background[0]
                 image[i, left + k, 1] = state[p + _G + k] + through * background[1]
                 image[i, left + k, 2] = state[p + _B + k] + through * background[2]
-        tile = claim(claims)
+        tile = claim(claims, seat, tiles)
     leave(claims)

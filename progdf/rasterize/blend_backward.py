@@ -156,7 +156,7 @@ def unblend_tile(
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     background: Array, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
-    sums: Array, wanted: Array, claims: Array,
+    sums: Array, wanted: Array, seat: int, claims: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same arguments.
 
@@ -165,13 +165,13 @@ def unblend(
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
         sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
         wanted: splats whose gradients are wanted. [V] bool
-        claims: as `shares.claim` and `shares.finish` want it
+        seat, claims: as `shares.claim` and `shares.finish` want them
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     state, cards = np.empty(6 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
-    tile = claim(claims)
+    tile = claim(claims, seat, tiles)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         state[:plane] = _ONE
@@ -196,4 +196,4 @@ def unblend(
         listed = slice(tile_starts[tile], tile_starts[tile + 1])
         unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted)
         finish(claims)
-        tile = claim(claims)
+        tile = claim(claims, seat, tiles)

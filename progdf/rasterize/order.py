@@ -56,13 +56,13 @@ def count_digits(keys: Array, digit: int, places: Array, claims: Array) -> None:
     parts = places.shape[0]
     step = (keys.size + parts - 1) // parts
     shift = np.uint32(digit * _DIGIT)
-    enter(claims)
-    part = claim(claims)
+    seat = enter(claims)
+    part = claim(claims, seat, parts)
     while part < parts:
         places[part] = 0
         for k in range(part * step, min(keys.size, (part + 1) * step)):
             places[part, (keys[k] >> shift) & np.uint32(BUCKETS - 1)] += 1
-        part = claim(claims)
+        part = claim(claims, seat, parts)
     leave(claims)
 
 
@@ -85,15 +85,15 @@ def move_digits(
     parts = places.shape[0]
     step = (keys.size + parts - 1) // parts
     shift = np.uint32(digit * _DIGIT)
-    enter(claims)
-    part = claim(claims)
+    seat = enter(claims)
+    part = claim(claims, seat, parts)
     while part < parts:
         for k in range(part * step, min(keys.size, (part + 1) * step)):
             bucket = (keys[k] >> shift) & np.uint32(BUCKETS - 1)
             at = places[part, bucket]
             places[part, bucket] = at + 1
             new_keys[at], new_items[at] = keys[k], items[k]
-        part = claim(claims)
+        part = claim(claims, seat, parts)
     leave(claims)
 
 

@@ -88,14 +88,15 @@ def cull(
         claims: as `shares.Team` gives them
     """
     n = means.shape[0]
-    enter(claims)
-    part = claim(claims)
-    while part * _CHUNK < n:
+    parts = (n + _CHUNK - 1) // _CHUNK
+    seat = enter(claims)
+    part = claim(claims, seat, parts)
+    while part < parts:
         _cull_range(
             part * _CHUNK, min(n, (part + 1) * _CHUNK), means, scales, opacities, viewmat, intrinsics, size,
             window, near, centres, depths, candidates,
         )  # fmt: skip
-        part = claim(claims)
+        part = claim(claims, seat, parts)
     leave(claims)
 
 
@@ -193,14 +194,15 @@ def project(
         claims: as `shares.Team` gives them
     """
     count, eye = ids.size, make_lens(viewmat, intrinsics, size).eye
-    enter(claims)
-    part = claim(claims)
-    while part * _CHUNK < count:
+    parts = (count + _CHUNK - 1) // _CHUNK
+    seat = enter(claims)
+    part = claim(claims, seat, parts)
+    while part < parts:
         begin, end = part * _CHUNK, min(count, (part + 1) * _CHUNK)
         _shape_range(
             begin, end, ids, ranks, means, quats, scales, opacities, viewmat, intrinsics, size, window,
             antialiased, splats, rgb,
         )  # fmt: skip
         _shade_range(begin, end, ids, ranks, means, colors, degree, eye, splats, rgb, visible)
-        part = claim(claims)
+        part = claim(claims, seat, parts)
     leave(claims)

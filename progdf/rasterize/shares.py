@@ -26,11 +26,14 @@ from progdf.rasterize.jit import kernel
 Array = NDArray[Any]
 T = TypeVar("T")
 
-CLAIMS = 5
-"""Counters of a shared kernel: the next piece of work and the pieces done; the next piece of a second step,
-where there is one; threads that have entered and left."""
+CLAIMS = 9
+"""Counters of a shared kernel: pieces of work taken, from the front and from the back; the same of a second
+step, where there is one; pieces of the first step done; threads that have entered and left."""
 
-_ENTERED, _LEFT = 3, 4
+SECOND = 3
+"""Where a second step's counters begin."""
+
+_TAKEN, _FRONT, _BACK, _DONE, _ENTERED, _LEFT = 0, 1, 2, 6, 7, 8
 _PATIENCE = 1 << 20  # looks at a counter before a thread goes to sleep: a millisecond or two
 
 _pool: ThreadPoolExecutor | None = None
@@ -116,33 +119,43 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_threads)
 
 
+@kernel(inline=True)
+def claim(claims: Array, seat: int, pieces: int) -> int:
+    """Inside a kernel: the next of so many pieces of work, which no other thread gets; `pieces` when all are
+    taken.
+
+    Every other thread begins at the last piece: so of one pass and the next, and of forward and backward, a
+    processor has much of the same memory.
+    """
+    if _take(claims, _TAKEN) >= pieces:
+        return pieces
+    if seat % 2 == 0:
+        return _take(claims, _FRONT)
+    return pieces - 1 - _take(claims, _BACK)
+
+
 @intrinsic  # type: ignore[untyped-decorator]
-def claim(typingctx: Any, claims: Any) -> Any:
-    """Inside a kernel: the number of the next piece of work, which no other thread gets. int64"""
+def _take(typingctx: Any, claims: Any, place: Any) -> Any:
+    """Add one to a counter; what it was before."""
 
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        counter = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.atomic_rmw("add", counter, context.get_constant(types.int64, 1), "monotonic")
+        counters = context.make_array(sig.args[0])(context, builder, args[0]).data
+        one = context.get_constant(types.int64, 1)
+        return builder.atomic_rmw("add", builder.gep(counters, [args[1]]), one, "monotonic")
 
-    return types.int64(claims), generate
+    return types.int64(claims, types.int64), generate
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def finish(typingctx: Any, claims: Any) -> Any:
     """Inside a kernel: count a claimed piece of work as done."""
-    return _adding(claims, 1)
+    return _adding(claims, _DONE)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
 def finished(typingctx: Any, claims: Any) -> Any:
     """Inside a kernel: how many pieces of work are done; what they wrote may be read. int64"""
-    return _reading(claims, 1)
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def enter(typingctx: Any, claims: Any) -> Any:
-    """The first thing that a shared kernel does."""
-    return _adding(claims, _ENTERED)
+    return _reading(claims, _DONE)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -159,6 +172,12 @@ def _entered(typingctx: Any, claims: Any) -> Any:
 @intrinsic  # type: ignore[untyped-decorator]
 def _left(typingctx: Any, claims: Any) -> Any:
     return _reading(claims, _LEFT)
+
+
+@kernel(inline=True)
+def enter(claims: Array) -> int:
+    """The first thing that a shared kernel does: the thread's seat."""
+    return _take(claims, _ENTERED)
 
 
 @kernel(cache=True)
