@@ -19,15 +19,15 @@ from tests.scenes import front_camera, one_gaussian, orbit_camera, random_gaussi
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 
-@pytest.mark.parametrize("few", [0, 8192])
-def test_bits_do_not_depend_on_the_run_or_the_number_of_threads(
-    few: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("room", [0, 8])
+def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_tiles(
+    room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from progdf.rasterize import cpu
 
     scene, camera = random_gaussians(2000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
-    monkeypatch.setattr(cpu, "FEW", few)  # one thread lists few Gaussians, several list more
+    monkeypatch.setattr(cpu, "_ROOM", room)
     set_threads(1)
     for again in (draw(scene, camera, "cpu"), draw(scene, camera, "cpu")):
         assert torch.equal(again.image, first.image)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.order import depth_order
-from progdf.rasterize.shares import SECOND, Team, at_once, claim, enter, finish, finished, leave
+from progdf.rasterize.order import Sorting, depth_order, new_sorting
+from progdf.rasterize.shares import Team, claim, enter, finish, leave, wait
 
 Array = NDArray[Any]
 
@@ -21,10 +20,10 @@ Array = NDArray[Any]
 @kernel()
 def _tick(times: Array, claims: Array) -> None:
     seat = enter(claims)
-    piece = claim(claims, seat, times.size)
+    piece = claim(claims, 0, seat, times.size)
     while piece < times.size:
         times[piece] += 1
-        piece = claim(claims, seat, times.size)
+        piece = claim(claims, 0, seat, times.size)
     leave(claims)
 
 
@@ -38,17 +37,16 @@ def test_every_piece_of_work_is_done_once(workers: int) -> None:
 @kernel()
 def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
     seat = enter(claims)
-    piece = claim(claims, seat, times.size)
+    piece = claim(claims, 0, seat, times.size)
     while piece < times.size:
         times[piece] = piece
-        finish(claims)
-        piece = claim(claims, seat, times.size)
-    while finished(claims) < times.size:
-        pass
-    piece = claim(claims[SECOND:], seat, sums.size)
+        finish(claims, 0)
+        piece = claim(claims, 0, seat, times.size)
+    wait(claims, 0, times.size)
+    piece = claim(claims, 1, seat, sums.size)
     while piece < sums.size:
         sums[piece] = times.sum()
-        piece = claim(claims[SECOND:], seat, sums.size)
+        piece = claim(claims, 1, seat, sums.size)
     leave(claims)
 
 
@@ -70,21 +68,6 @@ def test_two_python_threads_may_share_out_work_at_the_same_time() -> None:
     assert all((times == 1).all() for times in done)
 
 
-def test_results_come_in_the_order_of_the_calls_and_the_first_is_made_here() -> None:
-    names = at_once(partial(lambda k: (k, threading.get_ident()), k) for k in range(3))
-    assert [k for k, _ in names] == [0, 1, 2]
-    assert names[0][1] == threading.get_ident()
-    assert names[1][1] != threading.get_ident()
-
-
-def test_an_error_in_another_thread_arrives() -> None:
-    def fail() -> None:
-        raise ValueError("there")
-
-    with pytest.raises(ValueError, match="there"):
-        at_once([lambda: None, fail])
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_forked_process_gets_threads_of_its_own() -> None:
@@ -98,11 +81,23 @@ def test_a_forked_process_gets_threads_of_its_own() -> None:
     assert status == 0
 
 
+@kernel()
+def _order(
+    depths: Array, candidates: Array, sorting: Sorting, ids: Array, ranks: Array, found: Array, claims: Array
+) -> None:
+    seat = enter(claims)
+    depth_order(depths, candidates, sorting, ids, ranks, found, seat, claims, 0)
+    leave(claims)
+
+
+@pytest.mark.parametrize("count", [0, 1000, 200_000])
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_depth_order_is_numpys_stable_sort_for_every_number_of_threads(workers: int) -> None:
+def test_depth_order_is_numpys_stable_sort_for_every_number_of_threads(workers: int, count: int) -> None:
     rng = np.random.default_rng(0)
-    depths = rng.choice(np.linspace(0.02, 90.0, 5000).astype(np.float32), 200_000)
-    candidates = rng.random(len(depths)) < 0.9
-    ids, ranks = depth_order(depths, candidates, Team(workers))
-    np.testing.assert_array_equal(ids, np.flatnonzero(candidates))
-    np.testing.assert_array_equal(np.argsort(ranks), np.argsort(depths[ids], kind="stable"))
+    depths = rng.choice(np.linspace(0.02, 90.0, 5000).astype(np.float32), count)
+    candidates = rng.random(count) < 0.9
+    ids, ranks, found = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(1, np.int64)
+    Team(workers).share(_order, depths, candidates, new_sorting(count, workers), ids, ranks, found)
+    np.testing.assert_array_equal(ids[: found[0]], np.flatnonzero(candidates))
+    expected = np.argsort(depths[candidates], kind="stable")
+    np.testing.assert_array_equal(np.argsort(ranks[: found[0]]), expected)

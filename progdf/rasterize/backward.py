@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from progdf.rasterize.blend_backward import unblend
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.projection_backward import project_backward
-from progdf.rasterize.shares import SECOND, enter, finished, leave
+from progdf.rasterize.shares import enter, leave
 
 Array = NDArray[Any]
 
@@ -28,14 +28,11 @@ def backpropagate(
     seat = enter(claims)
     unblend(
         splats, rgb, window, grid, tile_starts, members, slots, background, transmittance, last, grad_image,
-        grad_transmittance, sums, wanted, seat, claims,
+        grad_transmittance, sums, wanted, seat, claims, 0,
     )  # fmt: skip
-    # what is left is on other threads, at most a tile each: shorter than to sleep and be woken
-    while finished(claims) < tile_starts.size - 1:
-        pass
     project_backward(
         ids, ranks, means, quats, scales, opacities, colors, degree, viewmat, intrinsics, size, antialiased,
         splats, per_splat, sums, wanted, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors,
-        grad_camera, seat, claims[SECOND:],
+        grad_camera, seat, claims, 1,
     )  # fmt: skip
     leave(claims)

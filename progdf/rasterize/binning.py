@@ -15,6 +15,7 @@ from progdf.rasterize.gathers import Rows, gather, rows_from
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.lanes import WIDTH, Lanes, any_of, choose, spread, store
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE
+from progdf.rasterize.shares import claim, finish, wait
 
 Array = NDArray[Any]
 
@@ -107,42 +108,29 @@ def _find_spans(splats: Array, s: Rows, window: Array, spans: Array) -> Lanes:
     return met
 
 
-@kernel()
-def _list_spans(spans: Array, lanes: int, grid: Array, at: int, tiles: Array) -> None:
-    """Write the tiles of the first lanes from tiles[at] on, one splat's after the other's."""
+@kernel(inline=True)
+def _list_spans(spans: Array, lanes: int, grid: Array, at: int, tiles: Array, counts: Array) -> None:
+    """Count the tiles of the first lanes and write them from tiles[at] on, one splat's after the other's."""
     place = np.uint64(at)
     for lane in range(lanes):
         base = (int(spans[0, lane]) - grid[1]) * grid[2] - grid[0]
         for row in range(int(spans[1, lane])):
             for column in range(int(spans[2 + 2 * row, lane]), int(spans[3 + 2 * row, lane])):
-                tiles[place] = base + column
+                counts[base + column] += 1
+                if place < np.uint64(tiles.size):
+                    tiles[place] = base + column
                 place += np.uint64(1)
             base += grid[2]
 
 
-@kernel(cache=True)
-def find_tiles(
-    splats: Array, part: int, window: Array, grid: Array, most: int, counts: Array, per_splat: Array
-) -> Array:
-    """The tiles that one part of the splats meets, and how many splats each tile has of it.
-
-    Args:
-        splats: nearest first. [V,8] float64
-        part: a row of `counts`; as many parts as it has rows
-        window: x0, y0, x1, y1 pixels. [4] int64
-        grid: first tile column and row, and how many of each. [4] int64
-        most: tiles beyond which they are only counted
-        counts: out, splats of the part in each tile, in its row. [parts, tiles] int64
-        per_splat: out, tiles of splat s at s + 1, for the part's splats. [V+1] int64
-
-    Returns:
-        tiles of the part's splats, one splat's after the other's. [≥ their number] int32
-    """
-    count = splats.shape[0]
-    step = (count + counts.shape[0] - 1) // counts.shape[0]
-    begin, stop = part * step, min(count, (part + 1) * step)
-    tiles = np.empty(4 * max(0, stop - begin) + 64, np.int32)
+@kernel()
+def _find_tiles(
+    splats: Array, begin: int, stop: int, window: Array, grid: Array, most: int, counts: Array,
+    per_splat: Array, tiles: Array,
+) -> None:  # fmt: skip
+    """The tiles that some splats meet, how many of the splats each tile has, and how many each splat."""
     spans, met = np.empty((2 + 2 * grid[3], WIDTH)), np.empty(WIDTH)
+    counts[:] = 0
     at = 0
     for eight in range(begin, stop, WIDTH):
         lanes, here = min(WIDTH, stop - eight), 0
@@ -151,31 +139,52 @@ def find_tiles(
             per_splat[eight + lane + 1] = int(met[lane])
             here += int(met[lane])
         if at + here <= most:
-            if at + here > tiles.size:
-                more = np.empty(2 * (at + here), np.int32)
-                more[:at] = tiles[:at]
-                tiles = more
-            _list_spans(spans, lanes, grid, at, tiles)
+            _list_spans(spans, lanes, grid, at, tiles, counts)
         at += here
-    counts[part] = 0
-    for k in range(at if at <= most else 0):
-        counts[part, tiles[k]] += 1
-    return tiles
 
 
-@kernel(cache=True)
-def place_tiles(counts: Array, tile_starts: Array, per_splat: Array) -> int:
-    """Turn counts into places, in place: where each part writes in each tile, and where each splat's list
-    begins.
+@kernel()
+def find_tiles(
+    splats: Array, window: Array, grid: Array, most: int, counts: Array, per_splat: Array, tiles: Array,
+    tile_starts: Array, found: Array, seat: int, claims: Array, step: int,
+) -> None:  # fmt: skip
+    """The tiles that each splat meets, and where each tile's list will be; all threads take part.
 
     Args:
-        counts: as from `find_tiles`; out: the first place of each part in each tile. [parts, tiles] int64
+        splats: nearest first. [V,8] float64
+        window: x0, y0, x1, y1 pixels. [4] int64
+        grid: first tile column and row, and how many of each. [4] int64
+        most: intersections beyond which only their number is right
+        counts: out, the first place of each part of the splats in each tile. [parts, tiles] int64
+        per_splat: out, where each splat's intersections begin, counted splat by splat. [V+1] int64
+        tiles: out, tiles of each part's splats, one splat's after the other's, as far as there is room.
+            [parts, room] int32
         tile_starts: out. [tiles+1] int64
-        per_splat: as from `find_tiles`; out: running sum. [V+1] int64
-
-    Returns:
-        The number of (splat, tile) intersections.
+        found: out, the number of (splat, tile) intersections in its second place. [2] int64
+        seat, claims: see `shares`
+        step: the first of 2
     """
+    count, parts = splats.shape[0], counts.shape[0]
+    size = (count + parts - 1) // parts
+    part = claim(claims, step, seat, parts)
+    while part < parts:
+        begin, stop = min(count, part * size), min(count, (part + 1) * size)
+        _find_tiles(splats, begin, stop, window, grid, most, counts[part], per_splat, tiles[part])
+        finish(claims, step)
+        part = claim(claims, step, seat, parts)
+    wait(claims, step, parts)
+    step += 1
+    if claim(claims, step, seat, 1) == 0:
+        _place_tiles(counts, tile_starts, per_splat)
+        found[1] = per_splat[count]
+        finish(claims, step)
+    wait(claims, step, 1)
+
+
+@kernel(inline=True)
+def _place_tiles(counts: Array, tile_starts: Array, per_splat: Array) -> None:
+    """Turn counts into places, in place: where each part writes in each tile, and where each splat's list
+    begins."""
     parts, tiles = counts.shape
     total = 0
     for tile in range(tiles):
@@ -188,32 +197,43 @@ def place_tiles(counts: Array, tile_starts: Array, per_splat: Array) -> int:
     per_splat[0] = 0
     for s in range(per_splat.size - 1):
         per_splat[s + 1] += per_splat[s]
-    return int(per_splat[per_splat.size - 1])
 
 
-@kernel(cache=True)
+@kernel()
 def fill_tiles(
-    tiles: Array, part: int, places: Array, per_splat: Array, members: Array, slots: Array
-) -> None:
-    """List the splats of each tile, nearest first.
+    splats: Array, window: Array, grid: Array, places: Array, per_splat: Array, tiles: Array,
+    members: Array, slots: Array, seat: int, claims: Array, step: int,
+) -> None:  # fmt: skip
+    """List the splats of each tile, nearest first; all threads take part.
 
     Args:
-        tiles: as from `find_tiles`, of this part
-        part: a row of `places`
-        places, per_splat: as from `place_tiles`; the part's places are used up
+        splats, window, grid, tiles, per_splat: as in `find_tiles`
+        places: `counts` of `find_tiles`, which are used up. [parts, tiles] int64
         members: out, the splats of all tiles, tile after tile. [I] int32
         slots: out, for each member its place in an order by splat, so that gradients can be added up in one
             fixed order. [I] int64, or [0] where nobody will ask
+        seat, claims, step: see `shares.claim`
     """
-    count = per_splat.size - 1
-    step = (count + places.shape[0] - 1) // places.shape[0]
-    begin = min(count, part * step)
-    before = per_splat[begin]
-    for s in range(begin, min(count, begin + step)):
-        for slot in range(per_splat[s], per_splat[s + 1]):
-            tile = tiles[slot - before]
-            at = places[part, tile]
-            places[part, tile] = at + 1
-            members[at] = s
-            if slots.size > 0:
-                slots[at] = slot
+    count, parts = splats.shape[0], places.shape[0]
+    size = (count + parts - 1) // parts
+    part = claim(claims, step, seat, parts)
+    while part < parts:
+        begin, stop = min(count, part * size), min(count, (part + 1) * size)
+        before = per_splat[begin]
+        found = per_splat[stop] - before
+        listed = tiles[part]
+        if found > listed.size:  # no room: once more
+            listed = np.empty(found, np.int32)
+            spare = np.empty(per_splat.size, np.int64)
+            _find_tiles(splats, begin, stop, window, grid, found, np.empty_like(places[0]), spare, listed)
+        for s in range(begin, stop):
+            for slot in range(per_splat[s], per_splat[s + 1]):
+                tile = listed[slot - before]
+                at = places[part, tile]
+                places[part, tile] = at + 1
+                members[at] = s
+                if slots.size > 0:
+                    slots[at] = slot
+        finish(claims, step)
+        part = claim(claims, step, seat, parts)
+    wait(claims, step, parts)

@@ -35,7 +35,7 @@ from progdf.rasterize.pixels import (
     new_cards,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim, enter, leave
+from progdf.rasterize.shares import claim
 
 Array = NDArray[Any]
 
@@ -115,10 +115,11 @@ def blend_tile(
             break
 
 
-@kernel(cache=True)
+@kernel()
 def blend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array,
-    background: Array, image: Array, transmittance: Array, last: Array, claims: Array,
+    background: Array, image: Array, transmittance: Array, last: Array, seat: int,
+    claims: Array, step: int,
 ) -> None:  # fmt: skip
     """Blend all tiles.
 
@@ -131,14 +132,13 @@ def blend(
         image: out, [h,w,3] float32
         transmittance: out, [h,w] float32
         last: out, place in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
-        claims: as `shares.Team` gives them
+        seat, claims, step: see `shares.claim`
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     state, cards = np.empty(5 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
-    seat = enter(claims)
-    tile = claim(claims, seat, tiles)
+    tile = claim(claims, step, seat, tiles)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         tile_bounds(x, y, window, bounds)
@@ -158,5 +158,4 @@ def blend(
                 image[i, left + k, 0] = state[p + PLANE + k] + through * background[0]
                 image[i, left + k, 1] = state[p + _G + k] + through * background[1]
                 image[i, left + k, 2] = state[p + _B + k] + through * background[2]
-        tile = claim(claims, seat, tiles)
-    leave(claims)
+        tile = claim(claims, step, seat, tiles)

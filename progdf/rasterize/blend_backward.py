@@ -39,7 +39,7 @@ from progdf.rasterize.pixels import (
     new_cards,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim, finish
+from progdf.rasterize.shares import claim, finish, wait
 
 Array = NDArray[Any]
 
@@ -156,7 +156,7 @@ def unblend_tile(
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     background: Array, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
-    sums: Array, wanted: Array, seat: int, claims: Array,
+    sums: Array, wanted: Array, seat: int, claims: Array, step: int,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same arguments.
 
@@ -165,13 +165,13 @@ def unblend(
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
         sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
         wanted: splats whose gradients are wanted. [V] bool
-        seat, claims: as `shares.claim` and `shares.finish` want them
+        seat, claims, step: see `shares.claim`
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     state, cards = np.empty(6 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
-    tile = claim(claims, seat, tiles)
+    tile = claim(claims, step, seat, tiles)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         state[:plane] = _ONE
@@ -195,5 +195,6 @@ def unblend(
                 state[p + _BEHIND + k] = state[p + k] * seen
         listed = slice(tile_starts[tile], tile_starts[tile + 1])
         unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted)
-        finish(claims)
-        tile = claim(claims, seat, tiles)
+        finish(claims, step)
+        tile = claim(claims, step, seat, tiles)
+    wait(claims, step, tiles)

@@ -7,7 +7,6 @@ The picture and the gradients are the same bits in every run and for every numbe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,15 +15,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.rasterize import binning, few, order, projection, weights
+from progdf.rasterize import weights
 from progdf.rasterize.backward import backpropagate
 from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.blend import blend
 from progdf.rasterize.blend_backward import SUMS
 from progdf.rasterize.conventions import RasterInfo
+from progdf.rasterize.forward import draw, list_splats, list_tiles
 from progdf.rasterize.jit import running
+from progdf.rasterize.order import new_sorting
 from progdf.rasterize.projection_backward import CAMERA, PARTS
-from progdf.rasterize.shares import Team, at_once
+from progdf.rasterize.shares import Team
 from progdf.rasterize.threads import threads
 
 Array = NDArray[Any]
@@ -33,8 +33,8 @@ MOST_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 
-FEW = 8192
-"""Gaussians up to which one thread lists them: handing work to others would take longer than the work."""
+_TILES_WORTH_A_THREAD = 16
+_ROOM = 8  # tiles of a splat that there is room for at once; a scene with more is gone through twice
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,8 @@ class _Lists:
     members: Array
     slots: Array
     per_splat: Array
+    places: Array
+    listed: Array
 
 
 def rasterize(
@@ -107,8 +109,13 @@ def alpha_weights(
     gaussians.append(np.zeros((len(means), 1, 3), np.float32))
     totals = np.zeros((len(means), weights.SUMS))
     with running("weights", 2) as workers:
-        team = Team(workers)
+        team = _team(view, workers)
         lists, _ = _list_splats(view, gaussians, team, for_gradients=True)
+        team.share(
+            list_tiles,
+            lists.splats, view.window, view.grid, lists.places, lists.per_splat, lists.listed, lists.members,
+            lists.slots,
+        )  # fmt: skip
         sums = np.zeros((len(lists.members), weights.SUMS))
         team.share(
             weights.weigh,
@@ -117,6 +124,23 @@ def alpha_weights(
         )  # fmt: skip
         weights.gather(lists.ids, lists.ranks, lists.per_splat, sums, totals)
     return torch.from_numpy(totals.astype(np.float32))
+
+
+def _keep_freed_memory() -> None:
+    """Free one large block: from then on glibc keeps blocks up to this size, the largest that it ever keeps.
+
+    Otherwise every pass would hand its memory back to the system and take it anew page by page, which was a
+    fifth of the time of 20 000 Gaussians. Nothing touches the block, so it costs nothing, there or elsewhere.
+    """
+    np.empty((32 << 20) - (64 << 10), np.uint8)
+
+
+_keep_freed_memory()
+
+
+def _team(view: _View, workers: int) -> Team:
+    tiles = int(view.grid[2] * view.grid[3])
+    return Team(min(workers, 1 + tiles // _TILES_WORTH_A_THREAD))
 
 
 def _view(
@@ -151,57 +175,33 @@ def _float32(tensor: Tensor) -> Tensor:
 def _list_splats(
     view: _View, gaussians: list[Array], team: Team, for_gradients: bool
 ) -> tuple[_Lists, list[Array]]:
-    """Project, sort and bin; also the centres, depths and visibility of all Gaussians."""
-    means, quats, scales, opacities, colors = gaussians
-    n = len(means)
+    """Project and sort, and count the tiles; also the centres, depths and visibility of all Gaussians."""
+    n, tiles = len(gaussians[0]), int(view.grid[2] * view.grid[3])
     centres, depths, candidates = np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_)
     visible = np.zeros(n, np.bool_)
-    tile_starts = np.empty(int(view.grid[2] * view.grid[3]) + 1, np.int64)
-    found = [centres, depths, visible]
-    if n <= FEW:
-        ids, ranks, splats, rgb, per_splat, members, slots, total = few.list_few(
-            means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics, view.size,
-            view.window, view.near, view.antialiased, view.grid, MOST_INTERSECTIONS, for_gradients, centres,
-            depths, candidates, visible, tile_starts,
-        )  # fmt: skip
-        _check_intersections(len(ids), total)
-        return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), found
+    ids, ranks, per_splat = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n + 1, np.int64)
+    splats, rgb = np.empty((n, 8)), np.empty((n, 4), np.float32)
+    places, tile_starts = np.empty((team.workers, tiles), np.int64), np.empty(tiles + 1, np.int64)
+    listed = np.empty((team.workers, _ROOM * n // team.workers + _ROOM), np.int32)
+    found = np.empty(2, np.int64)
     team.share(
-        projection.cull,
-        means, scales, opacities, view.viewmat, view.intrinsics, view.size, view.window, view.near,
-        centres, depths, candidates,
+        list_splats,
+        *gaussians, view.degree, view.viewmat, view.intrinsics, view.size, view.window, view.near,
+        view.antialiased, view.grid, MOST_INTERSECTIONS, centres, depths, candidates, visible,
+        new_sorting(n, team.workers), ids, ranks, splats, rgb, places, per_splat, listed, tile_starts, found,
     )  # fmt: skip
-    ids, ranks = order.depth_order(depths, candidates, team)
-    splats, rgb = np.empty((len(ids), 8)), np.empty((len(ids), 4), np.float32)
-    team.share(
-        projection.project,
-        ids, ranks, means, quats, scales, opacities, colors, view.degree, view.viewmat, view.intrinsics,
-        view.size, view.window, view.antialiased, splats, rgb, visible,
-    )  # fmt: skip
-    counts = np.empty((team.workers, len(tile_starts) - 1), np.int64)
-    per_splat = np.empty(len(ids) + 1, np.int64)
-    tiles = at_once(
-        partial(
-            binning.find_tiles, splats, part, view.window, view.grid, MOST_INTERSECTIONS, counts, per_splat
-        )
-        for part in range(team.workers)
-    )
-    total = binning.place_tiles(counts, tile_starts, per_splat)
-    _check_intersections(len(ids), total)
-    members, slots = np.empty(total, np.int32), np.empty(total if for_gradients else 0, np.int64)
-    at_once(
-        partial(binning.fill_tiles, tiles[part], part, counts, per_splat, members, slots)
-        for part in range(team.workers)
-    )
-    return _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat), found
-
-
-def _check_intersections(splats: int, total: int) -> None:
+    count, total = found.tolist()
     if total > MOST_INTERSECTIONS:
         raise ProgdfError(
-            f"{splats} Gaussians meet {total} tiles of the image, more than {MOST_INTERSECTIONS}; "
+            f"{count} Gaussians meet {total} tiles of the image, more than {MOST_INTERSECTIONS}; "
             "draw a smaller image or a crop, or take giant Gaussians out of the scene"
         )
+    members, slots = np.empty(total, np.int32), np.empty(total if for_gradients else 0, np.int64)
+    ids, ranks, splats, rgb = ids[:count], ranks[:count], splats[:count], rgb[:count]
+    lists = _Lists(
+        ids, ranks, splats, rgb, tile_starts, members, slots, per_splat[: count + 1], places, listed
+    )
+    return lists, [centres, depths, visible]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -215,13 +215,13 @@ class _Rasterize(torch.autograd.Function):
         image = np.empty((y1 - y0, x1 - x0, 3), np.float32)
         transmittance, last = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
         with running("forward", 12) as workers:
-            team = Team(workers)
-            team.call()
+            team = _team(view, workers)
+            team.call(2)
             lists, found = _list_splats(view, gaussians, team, any(ctx.needs_input_grad))
             team.share(
-                blend,
-                lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
-                background, image, transmittance, last,
+                draw,
+                lists.splats, lists.rgb, view.window, view.grid, lists.places, lists.per_splat, lists.listed,
+                lists.tile_starts, lists.members, lists.slots, background, image, transmittance, last,
             )  # fmt: skip
         results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
         ctx.mark_non_differentiable(*results[2:])
@@ -233,9 +233,9 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        team = Team(threads())
-        team.call()
         view, lists = ctx.view, ctx.lists
+        team = _team(view, threads())
+        team.call()
         *tensors, saved_transmittance = ctx.saved_tensors
         *gaussians, background = [tensor.detach().numpy() for tensor in tensors[:6]]
         shapes = [array.shape for array in gaussians]

@@ -6,124 +6,171 @@ result does not depend on the number of threads.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.shares import Team, claim, enter, leave
+from progdf.rasterize.shares import claim, finish, wait
 
 Array = NDArray[Any]
 
 _DIGIT = 11  # bits
-DIGITS = 3
-"""Digits of a key, least significant first."""
-
-BUCKETS = 1 << _DIGIT
-"""Values of a digit."""
+_DIGITS = 3  # of a key, least significant first
+_BUCKETS = 1 << _DIGIT
 
 _WORTH_A_THREAD = 65_536  # keys below which handing half of them over takes longer than moving them
 
+STEPS = 1 + 3 * _DIGITS + 1
+"""Steps of `depth_order`, see `shares.claim`."""
 
-@kernel(cache=True)
-def gather_keys(depths: Array, candidates: Array) -> tuple[Array, Array, Array]:
-    """The candidates, ready to be sorted.
+
+class Sorting(NamedTuple):
+    """What the sort works in.
 
     Args:
-        depths: > 0. [N] float32
-        candidates: [N] bool
-
-    Returns:
-        their indices, ascending [V] int64; keys that sort as their depths do [V] uint32; 0, 1, 2, … [V] int32
+        keys, items: keys that sort as depths do, and what they belong to. [N] uint32, [N] int32
+        new_keys, new_items: the same after a digit
+        places: where each part of the keys puts those with each value of a digit. [threads, 2048] int64
     """
+
+    keys: Array
+    items: Array
+    new_keys: Array
+    new_items: Array
+    places: Array
+
+
+def new_sorting(count: int, workers: int) -> Sorting:
+    """For so many Gaussians and threads."""
+    return Sorting(
+        np.empty(count, np.uint32), np.empty(count, np.int32), np.empty(count, np.uint32),
+        np.empty(count, np.int32), np.empty((workers, _BUCKETS), np.int64),
+    )  # fmt: skip
+
+
+@kernel(inline=True)
+def _gather_keys(depths: Array, candidates: Array, ids: Array, keys: Array, items: Array) -> int:
+    """List the candidates, ready to be sorted; how many there are."""
+    bits = depths.view(np.uint32)  # positive floats sort as their bits
     count = 0
     for i in range(depths.size):
-        count += candidates[i]
-    bits = depths.view(np.uint32)  # positive floats sort as their bits
-    ids, keys, items = np.empty(count, np.int64), np.empty(count, np.uint32), np.empty(count, np.int32)
-    at = 0
-    for i in range(depths.size):
         if candidates[i]:
-            ids[at], keys[at], items[at] = i, bits[i], at
-            at += 1
-    return ids, keys, items
+            ids[count], keys[count], items[count] = i, bits[i], count
+            count += 1
+    return count
 
 
-@kernel(cache=True)
-def count_digits(keys: Array, digit: int, places: Array, claims: Array) -> None:
-    """How often each value of a digit occurs in each part of the keys; places: out, [parts, BUCKETS]."""
-    parts = places.shape[0]
-    step = (keys.size + parts - 1) // parts
+@kernel(inline=True)
+def _count_digits(keys: Array, begin: int, end: int, digit: int, places: Array) -> None:
+    """How often each value of a digit occurs; places: out, [BUCKETS]."""
     shift = np.uint32(digit * _DIGIT)
-    seat = enter(claims)
-    part = claim(claims, seat, parts)
-    while part < parts:
-        places[part] = 0
-        for k in range(part * step, min(keys.size, (part + 1) * step)):
-            places[part, (keys[k] >> shift) & np.uint32(BUCKETS - 1)] += 1
-        part = claim(claims, seat, parts)
-    leave(claims)
+    places[:] = 0
+    for k in range(begin, end):
+        places[(keys[k] >> shift) & np.uint32(_BUCKETS - 1)] += 1
 
 
-@kernel(cache=True)
-def place_digits(places: Array) -> None:
+@kernel(inline=True)
+def _place_digits(places: Array) -> None:
     """Turn counts into the places where each part puts its keys, bucket by bucket; in place."""
     total = 0
-    for bucket in range(BUCKETS):
+    for bucket in range(_BUCKETS):
         for part in range(places.shape[0]):
             here = places[part, bucket]
             places[part, bucket] = total
             total += here
 
 
-@kernel(cache=True)
-def move_digits(
-    keys: Array, items: Array, digit: int, places: Array, new_keys: Array, new_items: Array, claims: Array
-) -> None:
+@kernel(inline=True)
+def _move_digits(
+    keys: Array, items: Array, begin: int, end: int, digit: int, places: Array, new_keys: Array,
+    new_items: Array,
+) -> None:  # fmt: skip
     """Put keys and items where `places` says, which is used up."""
-    parts = places.shape[0]
-    step = (keys.size + parts - 1) // parts
     shift = np.uint32(digit * _DIGIT)
-    seat = enter(claims)
-    part = claim(claims, seat, parts)
-    while part < parts:
-        for k in range(part * step, min(keys.size, (part + 1) * step)):
-            bucket = (keys[k] >> shift) & np.uint32(BUCKETS - 1)
-            at = places[part, bucket]
-            places[part, bucket] = at + 1
-            new_keys[at], new_items[at] = keys[k], items[k]
-        part = claim(claims, seat, parts)
-    leave(claims)
+    for k in range(begin, end):
+        bucket = (keys[k] >> shift) & np.uint32(_BUCKETS - 1)
+        at = places[bucket]
+        places[bucket] = at + 1
+        new_keys[at], new_items[at] = keys[k], items[k]
 
 
-@kernel(cache=True)
-def rank_items(items: Array) -> Array:
-    """The place of each item. [V] int64"""
-    ranks = np.empty(items.size, np.int64)
-    for place in range(items.size):
+@kernel(inline=True)
+def _sort(sorting: Sorting, count: int, ranks: Array) -> None:
+    """All digits, on one thread."""
+    keys, items, new_keys, new_items, places = sorting
+    for digit in range(_DIGITS):
+        _count_digits(keys, 0, count, digit, places[0])
+        _place_digits(places[:1])
+        _move_digits(keys, items, 0, count, digit, places[0], new_keys, new_items)
+        keys, new_keys, items, new_items = new_keys, keys, new_items, items
+    for place in range(count):
         ranks[items[place]] = place
-    return ranks
 
 
-def depth_order(depths: Array, candidates: Array, team: Team) -> tuple[Array, Array]:
-    """The candidates and their places in the order of depth, ties by index.
+@kernel()
+def depth_order(
+    depths: Array, candidates: Array, sorting: Sorting, ids: Array, ranks: Array, found: Array, seat: int,
+    claims: Array, step: int,
+) -> int:  # fmt: skip
+    """The candidates and their places in the order of depth, ties by index; all threads take part.
 
     Args:
         depths: > 0. [N] float32
         candidates: [N] bool
-        team: who takes part
+        sorting: as from `new_sorting`
+        ids: out, indices of the V candidates, ascending. [N] int64
+        ranks: out, the place of each, 0 is nearest. [N] int64
+        found: out, V. [≥1] int64
+        seat, claims: see `shares`
+        step: the first of STEPS
 
     Returns:
-        indices of the candidates, ascending [V] int64; rank of each, 0 is nearest [V] int64
+        V
     """
-    ids, keys, items = gather_keys(depths, candidates)
-    new_keys, new_items = np.empty_like(keys), np.empty_like(items)
-    team = team.at_most(1 + len(keys) // _WORTH_A_THREAD)
-    places = np.empty((team.workers, BUCKETS), np.int64)
-    for digit in range(DIGITS):
-        team.share(count_digits, keys, digit, places)
-        place_digits(places)
-        team.share(move_digits, keys, items, digit, places, new_keys, new_items)
+    keys, items, new_keys, new_items, places = sorting
+    if claim(claims, step, seat, 1) == 0:
+        found[0] = _gather_keys(depths, candidates, ids, keys, items)
+        if found[0] < _WORTH_A_THREAD:
+            _sort(sorting, found[0], ranks)
+        finish(claims, step)
+    wait(claims, step, 1)
+    count: int = found[0]
+    if count < _WORTH_A_THREAD:
+        return count
+    parts = min(places.shape[0], 1 + count // _WORTH_A_THREAD)
+    size = (count + parts - 1) // parts
+    for digit in range(_DIGITS):
+        step += 1
+        part = claim(claims, step, seat, parts)
+        while part < parts:
+            _count_digits(keys, part * size, min(count, (part + 1) * size), digit, places[part])
+            finish(claims, step)
+            part = claim(claims, step, seat, parts)
+        wait(claims, step, parts)
+        step += 1
+        if claim(claims, step, seat, 1) == 0:
+            _place_digits(places[:parts])
+            finish(claims, step)
+        wait(claims, step, 1)
+        step += 1
+        part = claim(claims, step, seat, parts)
+        while part < parts:
+            _move_digits(
+                keys, items, part * size, min(count, (part + 1) * size), digit, places[part], new_keys,
+                new_items,
+            )  # fmt: skip
+            finish(claims, step)
+            part = claim(claims, step, seat, parts)
+        wait(claims, step, parts)
         keys, new_keys, items, new_items = new_keys, keys, new_items, items
-    return ids, rank_items(items)
+    step += 1
+    part = claim(claims, step, seat, parts)
+    while part < parts:
+        for place in range(part * size, min(count, (part + 1) * size)):
+            ranks[items[place]] = place
+        finish(claims, step)
+        part = claim(claims, step, seat, parts)
+    wait(claims, step, parts)
+    return count

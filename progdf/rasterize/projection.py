@@ -20,7 +20,7 @@ from progdf.rasterize.geometry import Vec, dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.lanes import WIDTH, choose
 from progdf.rasterize.shading import fill_basis, view_direction
-from progdf.rasterize.shares import claim, enter, leave
+from progdf.rasterize.shares import claim, finish, wait
 
 Array = NDArray[Any]
 
@@ -68,10 +68,11 @@ def _cull_range(
         scatter(candidates, i, 0, usable & near_x & near_y)
 
 
-@kernel(cache=True)
+@kernel()
 def cull(
     means: Array, scales: Array, opacities: Array, viewmat: Array, intrinsics: Array, size: Array,
-    window: Array, near: float, centres: Array, depths: Array, candidates: Array, claims: Array,
+    window: Array, near: float, centres: Array, depths: Array, candidates: Array, seat: int,
+    claims: Array, step: int,
 ) -> None:  # fmt: skip
     """Mark the Gaussians that may touch the window, by a bound that needs no covariance.
 
@@ -85,19 +86,19 @@ def cull(
         centres: out, [N,2] float32
         depths: out, [N] float32
         candidates: out, [N] bool
-        claims: as `shares.Team` gives them
+        seat, claims, step: see `shares.claim`
     """
     n = means.shape[0]
     parts = (n + _CHUNK - 1) // _CHUNK
-    seat = enter(claims)
-    part = claim(claims, seat, parts)
+    part = claim(claims, step, seat, parts)
     while part < parts:
         _cull_range(
             part * _CHUNK, min(n, (part + 1) * _CHUNK), means, scales, opacities, viewmat, intrinsics, size,
             window, near, centres, depths, candidates,
         )  # fmt: skip
-        part = claim(claims, seat, parts)
-    leave(claims)
+        finish(claims, step)
+        part = claim(claims, step, seat, parts)
+    wait(claims, step, parts)
 
 
 @kernel(contract=True)
@@ -174,11 +175,11 @@ def _shade_range(
         rgb[s, 0], rgb[s, 1], rgb[s, 2] = red, green, blue
 
 
-@kernel(cache=True)
+@kernel()
 def project(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, window: Array, antialiased: bool,
-    splats: Array, rgb: Array, visible: Array, claims: Array,
+    splats: Array, rgb: Array, visible: Array, seat: int, claims: Array, step: int,
 ) -> None:  # fmt: skip
     """Project and shade the candidates; read in the order of the scene, written in the order of depth.
 
@@ -191,12 +192,11 @@ def project(
         splats: out, the columns named above; R2 is -1 where the splat is not shown. [V,8] float64
         rgb: out, [V,4] opacity last, antialias included. float32
         visible: out, set to True for what is shown. [N] bool
-        claims: as `shares.Team` gives them
+        seat, claims, step: see `shares.claim`
     """
     count, eye = ids.size, make_lens(viewmat, intrinsics, size).eye
     parts = (count + _CHUNK - 1) // _CHUNK
-    seat = enter(claims)
-    part = claim(claims, seat, parts)
+    part = claim(claims, step, seat, parts)
     while part < parts:
         begin, end = part * _CHUNK, min(count, (part + 1) * _CHUNK)
         _shape_range(
@@ -204,5 +204,6 @@ def project(
             antialiased, splats, rgb,
         )  # fmt: skip
         _shade_range(begin, end, ids, ranks, means, colors, degree, eye, splats, rgb, visible)
-        part = claim(claims, seat, parts)
-    leave(claims)
+        finish(claims, step)
+        part = claim(claims, step, seat, parts)
+    wait(claims, step, parts)

@@ -240,7 +240,7 @@ def project_backward(
     degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
     splats: Array, per_splat: Array, sums: Array, wanted: Array,
     grad_means: Array, grad_quats: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
-    grad_camera: Array, seat: int, claims: Array,
+    grad_camera: Array, seat: int, claims: Array, step: int,
 ) -> None:  # fmt: skip
     """Gradients of `projection.project`, which has the same first arguments.
 
@@ -252,19 +252,19 @@ def project_backward(
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes
             of inputs
         grad_camera: out, zero on entry. [PARTS, CAMERA] float64
-        seat, claims: as `shares.claim` wants them
+        seat, claims, step: see `shares.claim`
     """
-    step = (ids.size + PARTS - 1) // PARTS
+    most = (ids.size + PARTS - 1) // PARTS
     scratch = _Scratch(
-        np.empty(step, np.int64), np.empty(step, np.int64), np.zeros((WIDTH, SUMS + 3)), np.arange(WIDTH),
+        np.empty(most, np.int64), np.empty(most, np.int64), np.zeros((WIDTH, SUMS + 3)), np.arange(WIDTH),
         np.empty(16), np.zeros((16, 3)), np.empty(CAMERA * WIDTH),
     )  # fmt: skip
-    part = claim(claims, seat, PARTS)
+    part = claim(claims, step, seat, PARTS)
     while part < PARTS:
         _project_backward_range(
-            part * step, min(ids.size, (part + 1) * step), ids, ranks, means, quats, scales, opacities,
+            part * most, min(ids.size, (part + 1) * most), ids, ranks, means, quats, scales, opacities,
             colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums, wanted,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, scratch,
             grad_camera[part],
         )  # fmt: skip
-        part = claim(claims, seat, PARTS)
+        part = claim(claims, step, seat, PARTS)

@@ -102,7 +102,7 @@ def weigh(
     state = np.empty(2 * np.int64(PLANE), np.float32)
     cards, bounds = new_cards(), np.empty(4, np.int64)
     seat = enter(claims)
-    tile = claim(claims, seat, tiles)
+    tile = claim(claims, 0, seat, tiles)
     while tile < tiles:
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         state[:] = _ONE
@@ -116,7 +116,7 @@ def weigh(
             for place in range(begin, end):
                 card = np.uint64(place - begin) * CARD
                 add_weights(state, cards, card, sums[slots[place]])
-        tile = claim(claims, seat, tiles)
+        tile = claim(claims, 0, seat, tiles)
     leave(claims)
 
 
