@@ -93,7 +93,10 @@ class _Job:
 
 
 class _Crew:
-    """Threads that wait for jobs. An executor's would hold the interpreter's lock for 20 µs with each."""
+    """Threads that wait for jobs, one for each processor but the caller's, so that they take them in turn.
+
+    An executor's would hold the interpreter's lock for 20 µs with each job.
+    """
 
     def __init__(self, count: int) -> None:
         jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -110,7 +113,7 @@ def _work(jobs: SimpleQueue[Callable[[], None]]) -> None:
 def _crew() -> _Crew:
     global _threads
     if _threads is None:
-        _threads = _Crew(os.cpu_count() or 1)
+        _threads = _Crew(max(1, (os.cpu_count() or 1) - 1))
     return _threads
 
 
