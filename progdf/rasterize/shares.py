@@ -9,7 +9,9 @@ Python threads launch at once.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 import threading
 import time
 from collections import deque
@@ -19,6 +21,7 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+from llvmlite import binding as llvm
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
@@ -34,7 +37,8 @@ _TAKEN, _FRONT, _BACK, _DONE = range(2, 6)  # pieces of a step's work, from the 
 _COUNTERS = 4  # of a step
 _CLAIMS = 2 + _COUNTERS * _STEPS
 
-_PATIENCE = 1 << 20  # looks at a counter before a thread goes to sleep: a millisecond or two
+_LOOKS = 64  # at a counter, before a thread lets others have its processor for a moment
+_PATIENCE = 2000  # such moments before it goes to sleep: a millisecond or so
 
 _threads: _Crew | None = None
 
@@ -79,13 +83,13 @@ class _Job:
     def run(self, call: Callable[[], None]) -> None:
         self._run = call
         call()
-        while self._others and not _has_left(self.claims, _PATIENCE):
+        while self._others and not _has_left(self.claims):
             if self._error is not None:
                 raise self._error
             time.sleep(0.001)
 
     def help(self) -> None:
-        if _has_entered(self.claims, _PATIENCE) and self._run is not None:
+        if _has_entered(self.claims) and self._run is not None:
             try:
                 self._run()
             except BaseException as error:
@@ -125,6 +129,18 @@ def _forget_threads() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_threads)
+
+
+def _system_yield() -> int:
+    """Where in memory the system's function is that lets other threads have the processor."""
+    if sys.platform == "win32":
+        return ctypes.cast(ctypes.windll.kernel32.SwitchToThread, ctypes.c_void_p).value or 0
+    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
+
+
+# a thread that waits must not keep from the processor the one that it waits for
+llvm.add_symbol("progdf_make_way", _system_yield())
+_make_way = types.ExternalFunction("progdf_make_way", types.int32())
 
 
 def new_claims() -> Array:
@@ -171,8 +187,11 @@ def wait(claims: Array, step: int, pieces: int) -> None:
 
     What is left is on other threads, at most a piece each: shorter than to sleep and be woken.
     """
+    looks = 0
     while _seen(claims, _DONE + _COUNTERS * step) < pieces:
-        pass
+        looks += 1
+        if looks % _LOOKS == 0:
+            _make_way()
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -201,18 +220,22 @@ def _counter(context: Any, builder: ir.IRBuilder, sig: Any, claims: ir.Value, pl
 
 
 @kernel(cache=True)
-def _has_entered(claims: Array, patience: int) -> bool:
+def _has_entered(claims: Array) -> bool:
     """Wait until a thread has entered; False: it was not worth waiting."""
-    for _ in range(patience):  # noqa: SIM110 - numba has no generators within a kernel
-        if _seen(claims, _ENTERED) > 0:
-            return True
+    for _ in range(_PATIENCE):
+        for _ in range(_LOOKS):
+            if _seen(claims, _ENTERED) > 0:
+                return True
+        _make_way()
     return False
 
 
 @kernel(cache=True)
-def _has_left(claims: Array, patience: int) -> bool:
+def _has_left(claims: Array) -> bool:
     """Wait until all who have entered have left; False: it was not worth waiting."""
-    for _ in range(patience):  # noqa: SIM110
-        if _seen(claims, _LEFT) == _seen(claims, _ENTERED):
-            return True
+    for _ in range(_PATIENCE):
+        for _ in range(_LOOKS):
+            if _seen(claims, _LEFT) == _seen(claims, _ENTERED):
+                return True
+        _make_way()
     return False
