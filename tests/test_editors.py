@@ -56,6 +56,16 @@ BLUE, ORANGE = torch.tensor([0.19, 0.38, 0.82]), torch.tensor([0.85, 0.45, 0.10]
 ORANGE_ONE = palette_of(ORANGE[None], torch.ones(1))
 
 
+def test_a_region_that_is_pale_all_over_goes_straight_and_not_through_other_hues() -> None:
+    wallpaper = torch.tensor([[0.56, 0.65, 0.66], [0.60, 0.63, 0.61], [0.59, 0.62, 0.64]])
+    target = colour.parse_color("#e0a458")
+    palette = palette_of(wallpaper, torch.ones(3))
+    for s in (0.25, 0.5):
+        lab = colour.srgb_to_oklab(recolored(wallpaper, target, s, palette))
+        ends = [colour.srgb_to_oklab(recolored(wallpaper, target, end, palette)) for end in (0.0, 1.0)]
+        torch.testing.assert_close(lab, torch.lerp(*ends, s), atol=2e-3, rtol=0.0)
+
+
 def test_the_greys_of_a_thing_do_not_turn_through_the_rainbow_when_its_colour_does() -> None:
     for s in (0.2, 0.4, 0.6, 0.8):
         warm, cool = recolored(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE_ONE)

@@ -21,6 +21,7 @@ from trainer.editors.base import EditKind, EditorSettings
 from trainer.views import View, drawn, seen_colors
 
 _GREY, _COLOURED = 0.5, 1.1  # of the chroma of what is coloured: up to here a grey, from here a colour
+_PALE, _COLOURFUL = 0.03, 0.06  # chroma of what is coloured: up to here the whole region is a grey
 _KIN, _OTHER = math.radians(50), math.radians(100)  # from the region's hue: its kin up to here; another
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
@@ -168,7 +169,8 @@ def recolored(rgb: Tensor, target: Tensor, strength: float | Tensor, palette: Pa
     The rest goes straight to its end in OKLab. A grey's hue is noise, and turned it shines in every colour of
     the rainbow half way. A hue far from the region's own has its own way to go, short or long, and next to
     one that is opposite, neighbours would go round either side: the robot's eyes, cyan in an orange region,
-    went once round the circle to become blue.
+    went once round the circle to become blue. And in a region that is pale all over, the hues of its greys
+    would shine half way as green and pink where it was never green nor pink.
 
     Args:
         rgb: sRGB colours. [...,3]
@@ -184,7 +186,12 @@ def recolored(rgb: Tensor, target: Tensor, strength: float | Tensor, palette: Pa
     own = colour.srgb_to_oklab(palette.typical)[1:]
     across, along = lab[..., 1] * own[1] - lab[..., 2] * own[0], lab[..., 1:] @ own
     coloured = lab[..., 1:].norm(dim=-1) / max(palette.chroma, 1e-3)
-    share = _rise(coloured, _GREY, _COLOURED) * (1 - _rise(torch.atan2(across, along).abs(), _KIN, _OTHER))
+    pale = 1 - _rise(torch.tensor(palette.chroma), _PALE, _COLOURFUL)
+    share = (
+        (1 - pale)
+        * _rise(coloured, _GREY, _COLOURED)
+        * (1 - _rise(torch.atan2(across, along).abs(), _KIN, _OTHER))
+    )
     share = torch.where((s == 0) | (s == 1), 1.0, share)
     return torch.lerp(straight, turned, share[..., None])
 
