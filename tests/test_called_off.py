@@ -137,6 +137,15 @@ def grips_key(hand: Rig, x: float, y: float) -> bool:
     return moved
 
 
+@ways
+def test_the_divider_of_a_split_goes_back(hand: Rig, call_off: CallOff) -> None:
+    hand.key("Y")
+    hand.drag((0.5 * LEFT, 300), (0.3 * LEFT, 300))
+    dragged_and_called_off(hand, call_off, (0.3 * LEFT, 300), (0.6 * LEFT, 300), (0.8 * LEFT, 310))
+    hand.drag((0.3 * LEFT, 300), (0.7 * LEFT, 300))
+    assert hand.stage.work.view.compare.divider == pytest.approx(0.7), "it can be gripped again"
+
+
 def test_escape_without_a_drag_and_while_the_camera_turns_focuses_no_layer(hand: Rig) -> None:
     hand.move(100, 200)
     hand.press()

@@ -28,7 +28,11 @@ def near(view: ViewState, area: Area, ui: UiContext) -> bool:
 
 def moved(view: ViewState, area: Area) -> ViewState:
     """The divider under the mouse, never out of the picture."""
-    divider = max(0.0, min(1.0, imgui.get_io().mouse_pos.x / area.width))
+    return placed(view, max(0.0, min(1.0, imgui.get_io().mouse_pos.x / area.width)))
+
+
+def placed(view: ViewState, divider: float) -> ViewState:
+    """The divider at this share of the picture's width, 0..1."""
     return replace(view, compare=replace(view.compare, divider=divider))
 
 

@@ -28,10 +28,12 @@ class Hand:
     Args:
         drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER` or `brush.DRAG`; None while it holds nothing
         stroke: of the brush, from its first drag on
+        divider: where that of a split stood when it was gripped, share of the picture's width
     """
 
     drag: str | None = None
     stroke: Stroke | None = None
+    divider: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def moved(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace]:
     if grips_divider(hand, work.view, sight):
         compare_overlay.show_grip()
         if imgui.is_mouse_clicked(0):
-            return replace(hand, drag=compare_overlay.DIVIDER), work
+            return Hand(compare_overlay.DIVIDER, divider=work.view.compare.divider), work
     if work.view.brush.active and imgui.is_mouse_clicked(0):
         return _stroke_begun(hand, work, sight)
     camera = work.view.camera
@@ -94,6 +96,14 @@ def moved(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace]:
     if io.mouse_wheel:
         work = workspace.with_camera(work, controls.zoom(camera, io.mouse_wheel, sight.facts.bounds.radius))
     return hand, work
+
+
+def called_off(hand: Hand, work: Workspace) -> Workspace:
+    """What is dragged goes back to where it was; undo knows where, but for the divider, which is no edit."""
+    work = workspace.called_off(work)
+    if hand.drag != compare_overlay.DIVIDER:
+        return work
+    return replace(work, view=compare_overlay.placed(work.view, hand.divider))
 
 
 def grips_divider(hand: Hand, view: ViewState, sight: Sight) -> bool:

@@ -193,7 +193,7 @@ class Stage:
 
     def _call_off(self) -> None:
         """What is dragged goes back to where it was, and nothing is held any more."""
-        self.work, self._hand = workspace.called_off(self.work), Hand()
+        self.work, self._hand = hand.called_off(self._hand, self.work), Hand()
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
