@@ -14,19 +14,22 @@ import torch
 
 from progdf.gaussians import Gaussians
 from progdf.metrics import psnr
-from progdf.scenes import bear
-from tests.ui_rig import rig
+from progdf.scenes import bear, room
+from progdf.subject import subject_rows
+from tests.stacks import bear_stack
+from tests.ui_rig import first_view, rig
 from viewer import controls, turntable, workspace
+from viewer.document import Document
 from viewer.engine import Engine
 from viewer.headless import headless_context
 from viewer.painters import Image
 from viewer.state import Vec3, ViewCamera, ViewState
-from viewer.turntable import Bounds, bounds_of, first_camera, to_camera
-from viewer.workspace import SceneFacts
+from viewer.turntable import Bounds, axes, bounds_of, first_camera, to_camera
 
 pytestmark = pytest.mark.gl
 SIZE = (64, 48)
 DRAWS = pytest.mark.parametrize("draw", ["gl", "cpu"])
+UP = torch.tensor([0.0, 1.0, 0.0])
 BACKGROUND: Vec3 = (1.0, 1.0, 1.0)
 
 
@@ -154,16 +157,55 @@ def test_a_window_of_any_shape_shows_the_whole_scene_when_framed(
     assert bool(((x >= 0) & (x <= size[0]) & (y >= 0) & (y <= size[1])).all())
 
 
+def filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> np.ndarray:
+    """How far left, right, up and down these Gaussians reach, strays aside: 1 at the edges. [4]"""
+    built = to_camera(camera, round(1200 * aspect), 1200)
+    local = shown.means @ built.viewmat[:3, :3].T + built.viewmat[:3, 3]
+    assert bool((local[:, 2] > 0).all())
+    across = local[:, :2] / local[:, 2:] * built.K.diagonal()[:2] / built.K[:2, 2]
+    low, high = across.quantile(0.005, dim=0), across.quantile(0.995, dim=0)
+    return torch.stack([-low[0], high[0], -low[1], high[1]]).numpy()
+
+
+def is_filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> bool:
+    """Whether they fill the tighter side of the picture and stand in its middle."""
+    left, right, up, down = filled(camera, shown, aspect)
+    widest = max(left, right, up, down)  # of centres: Gaussians as large as the ears' here add a third
+    return abs(left - right) < 0.07 and abs(up - down) < 0.07 and 0.45 < widest < turntable.FILL
+
+
 @pytest.mark.parametrize("aspect", [0.25, 0.5, 1.0, 4.0])
-@pytest.mark.parametrize("radius", [1e-3, 1.0, 1e4])
-def test_f_without_a_layer_shows_all_of_the_scene_in_any_window(aspect: float, radius: float) -> None:
-    bounds = Bounds((radius, 0.0, 0.0), radius)
-    facts = SceneFacts("x.ply", 3, bounds, ())
-    wide = turntable.frame(ViewCamera(azimuth=30.0), bounds, 1.5)
-    work = workspace.perform(workspace.opened(ViewState(camera=wide)), "frame", facts, aspect)
-    camera = work.view.camera
-    half = math.atan(math.tan(math.radians(camera.fov_y) / 2) * min(1.0, aspect))
-    assert bounds.radius / camera.distance <= math.sin(half)
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
+def test_f_without_a_layer_fills_any_window_with_what_the_scene_is_about(
+    aspect: float, factor: float
+) -> None:
+    scene = scaled(the_bear(), factor)
+    for azimuth, elevation in ((20.0, 15.0), (110.0, 40.0)):
+        view = ViewState(camera=ViewCamera(azimuth=azimuth, elevation=elevation))
+        work = workspace.perform(workspace.opened(view), "frame", Document("x", scene).facts(), aspect)
+        assert is_filled(work.view.camera, scene[subject_rows(scene, UP)], aspect)
+        assert axes(work.view.camera) == axes(view.camera)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.5])
+@pytest.mark.parametrize("layer", [0, 1])
+def test_f_fills_the_window_with_the_members_of_the_focused_layer(aspect: float, layer: int) -> None:
+    stack = bear_stack(1500)
+    view = first_view(stack, 0.5, 0.5)
+    work = replace(workspace.opened(view), focus=layer)
+    facts = Document("x", stack.scene, stack.gdfs).facts()
+    camera = workspace.perform(work, "frame", facts, aspect).view.camera
+    assert is_filled(camera, stack.scene[stack.gdfs[layer].region.members], aspect)
+    assert axes(camera) == axes(view.camera)
+
+
+def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
+    scene = room(4000).gaussians
+    inside = workspace.opened(ViewState(camera=first_camera(scene)))
+    outside = workspace.perform(inside, "frame", Document("x", scene).facts()).view.camera
+    assert filled(outside, scene, 1.0).max() < 1.0
+    nothing = workspace.perform(inside, "frame", Document("x", scene[:0]).facts()).view.camera
+    assert nothing == turntable.frame(inside.view.camera, Bounds())
 
 
 @pytest.mark.parametrize("points", [(400, 900), (1600, 400)])

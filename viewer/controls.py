@@ -203,7 +203,7 @@ KEYS = (
     Key("Ctrl+Shift+Z", "redo", "redo", repeats=True),
     Key("Ctrl+Y", "redo", "", repeats=True),
     Key("V", "fly", "orbit or fly"),
-    Key("F", "frame", "frame the focused layer, or all"),
+    Key("F", "frame", "frame the focused layer, or the scene"),
     Key("Shift+F", "home", "home"),
     Key("Y", "split", "original and edited side by side"),
     Key("Shift+Y", "difference", "difference from the original"),

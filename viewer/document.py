@@ -13,7 +13,7 @@ from progdf.ply import load_ply
 from . import arguments
 from .layer_rows import layer_rows
 from .recordings import Recording, found
-from .turntable import bounds_of
+from .turntable import bounds_of, fit_all
 from .workspace import SceneFacts
 
 
@@ -37,8 +37,15 @@ class Document:
 
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""
-        rows = layer_rows(self.scene, self.gdfs)
-        return SceneFacts(self.title, len(self.scene), bounds_of(self.scene), rows, self.recordings())
+        scene, rows = self.scene, layer_rows(self.scene, self.gdfs)
+        return SceneFacts(
+            title=self.title,
+            count=len(scene),
+            bounds=bounds_of(scene),
+            rows=rows,
+            recordings=self.recordings(),
+            fit=lambda camera, aspect: fit_all(camera, scene, aspect),
+        )
 
     def recordings(self) -> tuple[Recording, ...]:
         """Where each edit was recorded."""

@@ -14,7 +14,7 @@ from progdf.layers import KINDS
 from progdf.sh import sh0_to_rgb
 
 from .change_curve import Curve, curve_of, flat
-from .turntable import Bounds, bounds_of
+from .turntable import Bounds, Fit, bounds_of, fit, unmoved
 
 Rgb = tuple[float, float, float]
 
@@ -28,11 +28,12 @@ class LayerRow:
         swatch: their mean colour at full strength, 0..1
         recorded: strengths of the recorded snapshots
         instruction: what was asked for
-        bounds: what the camera frames for this layer
+        bounds: of the bulk of its members
         shared: per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
         kinds: which gains of `Gains` have something to scale
         curve: the visible change over the strength, measured when it is first asked for
         points: centres of its members in the original, world units. [M,3] float32
+        fit: gives the camera that frames this layer
     """
 
     count: int
@@ -44,6 +45,7 @@ class LayerRow:
     kinds: frozenset[str] = frozenset(KINDS.values())
     curve: Curve = flat
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
+    fit: Fit = unmoved
 
 
 def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:
@@ -63,6 +65,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
         kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
         curve=curve_of(scene, gdf),
         points=scene.means[members].numpy(),
+        fit=lambda camera, aspect: fit(camera, scene[members], aspect),
     )
 
 

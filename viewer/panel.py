@@ -175,7 +175,7 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
         actions.append("frame")
-    tip("Frame the focused layer, or the whole scene (F)")
+    tip("Frame the focused layer, or the scene (F)")
     imgui.same_line(0.0, 6.0 * ui.scale)
     if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
         actions.append("home")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -44,6 +45,18 @@ class Axes:
     right: Vec3
     up: Vec3
     back: Vec3
+
+
+class Fit(Protocol):
+    """Gives the camera of the same direction whose picture something fills."""
+
+    def __call__(self, camera: ViewCamera, aspect: float) -> ViewCamera:
+        """`aspect`: width / height of the picture"""
+
+
+def unmoved(camera: ViewCamera, aspect: float) -> ViewCamera:
+    """The fit of something of which nothing is known."""
+    return camera
 
 
 def dot(a: Vec3, b: Vec3) -> float:
@@ -179,9 +192,11 @@ def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera
     """The same direction, with these Gaussians filling `FILL` of the tighter side of the picture.
 
     Args:
-        shown: at least one
+        shown: of none at all, the surroundings of the origin are framed
         aspect: width / height of the picture
     """
+    if not len(shown):
+        return frame(camera, bounds_of(shown), aspect)
     picture = axes(camera)
     tangent = math.tan(math.radians(camera.fov_y) / 2)
     frame_axes = torch.tensor([picture.right, picture.up, picture.back], dtype=torch.float64)
@@ -198,6 +213,14 @@ def fit_subject(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> Vi
     """The same direction, filled by what the scene is about (`subject_rows`); in a room the same view."""
     up = torch.tensor(camera.up)
     return camera if is_room(scene, up) else fit(camera, scene[subject_rows(scene, up)], aspect)
+
+
+def fit_all(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, filled by what the scene is about; a room is seen from outside, all of it."""
+    up = torch.tensor(camera.up)
+    if not len(scene) or is_room(scene, up):
+        return frame(camera, bounds_of(scene), aspect)
+    return fit(camera, scene[subject_rows(scene, up)], aspect)
 
 
 def first_camera(

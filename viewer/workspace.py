@@ -14,14 +14,14 @@ import numpy as np
 
 from progdf.layers import BLENDS
 
-from . import compare, controls, draft, history, paint, playback, snapshots, stack, timeline, turntable
+from . import compare, controls, draft, history, paint, playback, snapshots, stack, timeline
 from .history import Edit, History
 from .layer_rows import LayerRow
 from .playback import Player
 from .recordings import Recording
 from .snapshots import Snapshot
 from .state import Comparison, ViewCamera, ViewState
-from .turntable import FARTHEST, Bounds
+from .turntable import FARTHEST, Bounds, Fit, unmoved
 
 MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
 FEATHER = 0.1
@@ -35,9 +35,10 @@ class SceneFacts:
     Args:
         title: the scene's name
         count: Gaussians in the scene
-        bounds: what `frame` shows with no layer focused
+        bounds: of the bulk of the scene
         rows: one per .gdf, indexed by `LayerState.gdf`
         recordings: where each .gdf was recorded, in the same order
+        fit: gives the camera that `frame` takes with no layer focused
     """
 
     title: str
@@ -45,6 +46,7 @@ class SceneFacts:
     bounds: Bounds
     rows: Sequence[LayerRow]
     recordings: Sequence[Recording] = ()
+    fit: Fit = unmoved
 
 
 @dataclass(frozen=True)
@@ -200,11 +202,11 @@ def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
 
 
 def _framed(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
-    """The focused layer, or all, as large as the picture allows; the direction stays."""
-    bounds = facts.bounds
+    """The focused layer, or what the scene is about, fills the picture; the direction stays."""
+    fit = facts.fit
     if workspace.focus is not None:
-        bounds = facts.rows[workspace.view.layers[workspace.focus].gdf].bounds
-    return with_camera(workspace, turntable.frame(workspace.view.camera, bounds, aspect))
+        fit = facts.rows[workspace.view.layers[workspace.focus].gdf].fit
+    return with_camera(workspace, fit(workspace.view.camera, aspect))
 
 
 def _home(workspace: Workspace) -> Workspace:
