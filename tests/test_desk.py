@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imgui_bundle import imgui
 
 from progdf.camera_files import save_cameras
 from progdf.ply import save_ply
@@ -16,6 +17,7 @@ from tests.ui_rig import bear, first_view
 from viewer import app as application
 from viewer import desk, recent, session
 from viewer.turntable import to_camera
+from viewer.workspace import Dialog
 
 
 @pytest.fixture
@@ -39,6 +41,11 @@ def message(app: application.App) -> str:
     return app.stage.work.message.text if app.stage.work.message else ""
 
 
+def question(app: application.App) -> Dialog:
+    assert app.stage.work.dialog is not None
+    return app.stage.work.dialog
+
+
 def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("a.ply", "b.gdf", "c.ply")]
     for file in files:
@@ -54,9 +61,7 @@ def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
 @pytest.mark.gl
 def test_ctrl_s_asks_where_once_and_then_saves_there(window: application.App, folder: Path) -> None:
     press(window, "Ctrl+S")
-    asked = window.stage.work.dialog
-    assert asked is not None
-    assert asked.text == str(folder / "bear.session.json")
+    assert question(window).text == str(folder / "bear.session.json")
     press(window, "Enter")
     assert window.stage.work.dialog is None
     assert (folder / "bear.session.json").is_file()
@@ -82,8 +87,6 @@ def test_keys_do_nothing_behind_a_question_and_escape_takes_it_away(window: appl
 
 @pytest.mark.gl
 def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: Path) -> None:
-    from imgui_bundle import imgui
-
     press(window, "Ctrl+O")
     imgui.get_io().add_input_characters_utf8(str(saved))
     for _ in range(3):
@@ -100,9 +103,7 @@ def test_quitting_asks_only_when_something_would_be_lost(window: application.App
     assert window._left
     window._left = False
     press(window, "Shift+Left", "Ctrl+Q")
-    asked = window.stage.work.dialog
-    assert asked is not None
-    assert asked.kind == "leave"
+    assert question(window).kind == "leave"
     press(window, "Escape")
     assert not window._left
     press(window, "Ctrl+Q", "S", "Enter")  # save, under the name that is offered
@@ -206,4 +207,59 @@ def test_saving_never_writes_over_another_kind_of_file(window: application.App, 
     before = (folder / "cameras.json").read_bytes()
     window.desk.serve(f"save_to:{folder / 'cameras.json'}")
     assert (folder / "cameras.json").read_bytes() == before
-    assert "no session" in message(window)
+    assert "no session" in question(window).error
+
+
+def by_hand(window: application.App, *keys: imgui.Key, text: str = "") -> None:
+    """Keys as the path field hears them, then a text."""
+    window.stage.ui.make_current()
+    io = imgui.get_io()
+    for key in keys:
+        for down in (True, False):
+            io.add_key_event(key, down)
+            window.draw()
+    io.add_input_characters_utf8(text)
+    window.stage.wake()
+    for _ in range(4):
+        window.draw()
+
+
+@pytest.mark.gl
+def test_a_place_that_cannot_be_written_is_asked_for_again_with_what_was_typed(
+    window: application.App, folder: Path
+) -> None:
+    press(window, "Shift+Left", "Ctrl+S")
+    typed = str(folder / "gone" / "bear.session.json")
+    by_hand(window, text=typed)
+    by_hand(window, imgui.Key.enter)  # the field lets go of the keys
+    press(window, "Enter")
+    asked, before = question(window), window.stage.work.view
+    assert asked.text == typed
+    assert "gone does not exist" in asked.error
+    assert window.desk.unsaved
+    press(window, "V", "Shift+Left")
+    assert window.stage.work.view == before, "keys are no shortcuts meanwhile"
+    by_hand(window, *[imgui.Key.end] * 2, *[imgui.Key.backspace] * len(".session.json"), text="-2")
+    assert question(window).text == str(folder / "gone" / "bear-2")
+    (folder / "gone").mkdir()
+    press(window, "Enter")
+    assert window.stage.work.dialog is None
+    assert (folder / "gone" / "bear-2.session.json").is_file()
+    press(window, "V")
+    assert window.stage.work.view.camera.mode == "fly"
+
+
+@pytest.mark.gl
+def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application.App, folder: Path) -> None:
+    (folder / "kept").mkdir()
+    window.desk.save(folder / "kept" / "bear")
+    (folder / "kept").rename(folder / "away")
+    press(window, "Shift+Left", "Ctrl+Q", "S")
+    assert "kept does not exist" in question(window).error
+    assert question(window).text == str(folder / "kept" / "bear.session.json")
+    press(window, "Enter")
+    assert not window._left
+    (folder / "away").rename(folder / "kept")
+    press(window, "Enter")
+    assert window._left
+    assert not window.desk.unsaved

@@ -76,7 +76,8 @@ class Desk:
         if name in ("save", "save_as"):
             self._save_where(argument, ask=name == "save_as")
         elif name == "save_to":
-            self._told(lambda: self.save(Path(argument).expanduser()))
+            asked = self._app.stage.work.dialog
+            self._save_to(argument, asked.then if asked else "")
         elif name == "open":
             self._app.stage.ask(Dialog("open"))
         elif name == "browse":
@@ -220,7 +221,7 @@ class Desk:
         opened = self._app.document
         with all_threads():
             gdf = load_gdf(path, opened.scene)
-        layer = LayerState(len(opened.gdfs), _free_name(gdf.name, opened), strength=1.0)
+        layer = LayerState(len(opened.gdfs), opened.free_name(gdf.name), strength=1.0)
         paths = (*opened.gdf_paths, path) if len(opened.gdf_paths) == len(opened.gdfs) else ()
         gdfs = (*opened.gdfs, replace(gdf, name=layer.name))
         self._app.show(replace(opened, gdfs=gdfs, gdf_paths=paths))
@@ -243,9 +244,18 @@ class Desk:
             path = self.path or session.default_path(self._app.document)
             self._app.stage.ask(Dialog("save", str(path), then))
             return
-        path = self.path
-        if self._told(lambda: self.save(path)) and then:
-            self._app.stage.request(then)
+        self._save_to(str(self.path), then)
+
+    def _save_to(self, path: str, then: str) -> None:
+        """Save there, then do what was put off; where that fails, ask for another place and say why."""
+        stage = self._app.stage
+        error = _failure(lambda: self.save(Path(path).expanduser()))
+        if error:
+            stage.ask(Dialog("save", path, then, error=error))
+            return
+        stage.work = replace(stage.work, dialog=None)
+        if then:
+            stage.request(then)
 
     def _browse(self) -> None:
         """The desktop's own dialog beside the question that is open."""
@@ -263,18 +273,10 @@ class Desk:
     def _leaving(self, then: str) -> Dialog:
         return Dialog("leave", str(self.path or session.default_path(self._app.document)), then)
 
-    def _told(self, act: Callable[[], None]) -> bool:
-        """Do it; what goes wrong is a line in the window. Whether it went well."""
-        try:
-            act()
-        except ProgdfError as error:
-            self._app.stage.tell(str(error), error=True)
-        except OSError as error:
-            name = error.filename or "the file"
-            self._app.stage.tell(f"{name} cannot be read or written: {error.strerror}", error=True)
-        else:
-            return True
-        return False
+    def _told(self, act: Callable[[], None]) -> None:
+        """Do it; what goes wrong is a line in the window."""
+        if error := _failure(act):
+            self._app.stage.tell(error, error=True)
 
     def _autosave_path(self) -> Path:
         return session.autosave_path(self.path, self._app.document)
@@ -291,9 +293,12 @@ class Desk:
         return recent.remember(paths, self._memory)
 
 
-def _free_name(name: str, opened: Document) -> str:
-    """The edit's name, with a number where another edit has it."""
-    taken, free, number = {gdf.name for gdf in opened.gdfs}, name, 2
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
+def _failure(act: Callable[[], None]) -> str:
+    """Do it; what went wrong, in one line, "" for nothing."""
+    try:
+        act()
+    except ProgdfError as error:
+        return " ".join(str(error).split())
+    except OSError as error:
+        return f"{error.filename or 'the file'} cannot be read or written: {error.strerror}"
+    return ""

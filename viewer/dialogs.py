@@ -1,6 +1,7 @@
 """Questions over the picture: where to save, what to open, what becomes of unsaved changes.
 
-All of it goes by keys too: Enter takes the marked button, Escape leaves all as it was.
+All of it goes by keys too: Enter takes the marked button, Escape leaves all as it was. Where to save is asked
+until it is saved: the desk takes that question away.
 """
 
 from __future__ import annotations
@@ -79,8 +80,8 @@ def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui:
         return _given(dialog, dialog.chosen)
     if dialog.kind == "leave":
         return _leaving(dialog, pressed, ui)
-    if imgui.is_window_appearing():
-        imgui.set_keyboard_focus_here()
+    if imgui.is_window_appearing() or (dialog.error and not imgui.is_any_item_active()):
+        imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
     _, text = imgui.input_text("##path", dialog.text)
@@ -94,6 +95,8 @@ def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui:
         return Answer(dialog, ("browse",))
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
+    if dialog.error:
+        _wrapped(dialog.error)
     if dialog.kind == "open":
         chosen = _recent(recent, ui)
         if chosen is not None:
@@ -111,8 +114,18 @@ def _content(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui:
 
 def _given(dialog: Dialog, path: str) -> Answer:
     """The file that was asked for."""
-    request = {"save": "save_to", "open": "open_file"}[dialog.kind]
-    return Answer(None, (f"{request}:{path}", *((dialog.then,) if dialog.then else ())))
+    if dialog.kind == "save":
+        return Answer(replace(dialog, text=path, chosen=""), (f"save_to:{path}",))
+    return Answer(None, (f"open_file:{path}",))
+
+
+def _wrapped(error: str) -> None:
+    """Why the path did not serve, in as many lines as it takes."""
+    imgui.push_font(None, SMALL_PX)
+    imgui.push_text_wrap_pos(0.0)
+    imgui.text_colored(imgui.ImVec4(*PALETTE.error), error)
+    imgui.pop_text_wrap_pos()
+    imgui.pop_font()
 
 
 def _leaving(dialog: Dialog, pressed: Sequence[str], ui: UiContext) -> Answer:

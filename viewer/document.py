@@ -53,6 +53,13 @@ class Document:
             return (Recording(),) * len(self.gdfs)
         return tuple(found(gdf, path) for gdf, path in zip(self.gdfs, self.gdf_paths, strict=True))
 
+    def free_name(self, name: str) -> str:
+        """An edit's name, with a number where another edit has it."""
+        taken, free, number = {gdf.name for gdf in self.gdfs}, name, 2
+        while free in taken:
+            free, number = f"{name}-{number}", number + 1
+        return free
+
 
 def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
     """Read a scene and its edits.

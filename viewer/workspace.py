@@ -69,6 +69,7 @@ class Dialog:
         notice: a line about the desktop's own dialog, "" for none
         choosing: that dialog is on screen
         chosen: the file that was chosen in it
+        error: why the path did not serve, one line, "" where it was not tried
     """
 
     kind: str
@@ -77,6 +78,7 @@ class Dialog:
     notice: str = ""
     choosing: bool = False
     chosen: str = ""
+    error: str = ""
 
 
 @dataclass(frozen=True)
