@@ -263,3 +263,11 @@ def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application
     press(window, "Enter")
     assert window._left
     assert not window.desk.unsaved
+
+
+@pytest.mark.gl
+def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: application.App) -> None:
+    window.desk.serve("save_to:~nobody-here/bear")
+    assert "~nobody-here does not exist" in question(window).error
+    window.desk.serve("open_file:~nobody-here/bear.ply")
+    assert "~nobody-here/bear.ply" in message(window)

@@ -5,6 +5,7 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,7 +84,7 @@ class Desk:
         elif name == "browse":
             self._browse()
         elif name == "open_file":
-            self.open(Path(argument).expanduser())
+            self.open(_typed(argument))
         elif name == "discard":
             self._app.stage.work = workspace.as_saved(self._app.stage.work)
         elif name == "quit":
@@ -249,7 +250,7 @@ class Desk:
     def _save_to(self, path: str, then: str) -> None:
         """Save there, then do what was put off; where that fails, ask for another place and say why."""
         stage = self._app.stage
-        error = _failure(lambda: self.save(Path(path).expanduser()))
+        error = _failure(lambda: self.save(_typed(path)))
         if error:
             stage.ask(Dialog("save", path, then, error=error))
             return
@@ -291,6 +292,11 @@ class Desk:
         if not paths:
             return recent.read(self._memory)
         return recent.remember(paths, self._memory)
+
+
+def _typed(path: str) -> Path:
+    """A path as a person types it; the home of an unknown user is a name like any other, and missing."""
+    return Path(os.path.expanduser(path))  # pathlib's raises there
 
 
 def _failure(act: Callable[[], None]) -> str:
