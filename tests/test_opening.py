@@ -41,6 +41,21 @@ def run(*argv: str) -> int:
     return main(list(argv))
 
 
+@pytest.mark.parametrize("command", ["view", "render", "export"])
+def test_an_edit_given_twice_is_refused_however_its_file_is_named(
+    here: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bear().save(here)
+    (here / "link.gdf").symlink_to("ears.gdf")
+    out = {"render": ("-o", "x.png"), "export": ("-o", "x.ply")}.get(command, ())
+    for again, told in (("./ears.gdf", "ears.gdf was given twice"), ("link.gdf", "first as ears.gdf")):
+        assert run(command, "bear.ply", "ears.gdf", "scarf.gdf", again, *out) == 2
+        error = capsys.readouterr().err
+        assert told in error
+        assert error.count("\n") == 1
+    assert not list(here.glob("x.*"))
+
+
 @pytest.mark.parametrize("blend", ["normalised", "sum", "over"])
 def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) -> None:
     """Strengths, gains, paint, which layers show, their order and how they blend."""

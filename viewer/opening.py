@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -52,11 +53,12 @@ def opened(options: StackOptions) -> Opened:
     """Open what the options name.
 
     Raises:
-        ProgdfError: a file is missing or broken, an edit was made for another scene, options name no edit;
-            or they say what a session says already.
+        ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, options
+            name no edit; or they say what a session says already.
     """
     if is_session(options.scene):
         return _session(options)
+    _check_each_once(options.gdfs)
     view = ViewState(blend=options.blend, overshoot=options.overshoot)
     if isinstance(options, PictureOptions):
         view = replace(view, background=arguments.parse_background(options.background))
@@ -86,6 +88,16 @@ def without_name(argv: Sequence[str]) -> list[str]:
         else:
             found.append(argument)
     return [*first, *found]
+
+
+def _check_each_once(gdfs: Sequence[Path]) -> None:
+    """Raises ProgdfError where an edit is named twice, which is a slip; sessions may hold one twice."""
+    seen: dict[str, Path] = {}
+    for path in gdfs:
+        first = seen.setdefault(os.path.realpath(path), path)
+        if first is not path:
+            again = "" if first == path else f", first as {first}"
+            raise ProgdfError(f"{path} was given twice{again}; give each edit once")
 
 
 def _session(options: StackOptions) -> Opened:
