@@ -30,9 +30,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
     except OSError as error:
-        raise ProgdfError(
-            f"{target} cannot be written ({error.strerror or error}); give a place that can be written to"
-        ) from None
+        raise unwritable(target, error) from None
     os.close(handle)
     beside = Path(name)
     try:
@@ -41,6 +39,26 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(beside, target)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Make a folder, and those above it, where there is none yet.
+
+    Raises:
+        ProgdfError: a file has its place, or it cannot be made.
+    """
+    if Path(path).exists() and not Path(path).is_dir():
+        raise ProgdfError(f"{path} is a file; give the name of a folder")
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
+    """The one line for a file or a folder that cannot be written."""
+    reason = error.strerror or error
+    return ProgdfError(f"{path} cannot be written ({reason}); give a place that can be written to")
 
 
 def open_failure(path: str | os.PathLike[str], error: OSError) -> ProgdfError:

@@ -15,6 +15,7 @@ from PIL import Image
 import trainer.resume
 import trainer.run
 from progdf import scenes
+from progdf.__main__ import main
 from progdf.camera_files import load_cameras
 from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.errors import ProgdfError
@@ -134,6 +135,24 @@ def test_a_demo_with_too_few_gaussians_writes_nothing(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="too few for a bear"):
         demo.main(["--size", "10", "--out", str(tmp_path / "demo")])
     assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "told"),
+    [
+        ("/proc/demo", "/proc/demo cannot be written ("),
+        ("taken", "taken is a file; give the name of a folder"),
+        ("taken/demo", "taken/demo cannot be written ("),
+    ],
+)
+def test_a_demo_without_a_place_for_its_folder_is_one_line(
+    out: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("taken").touch()
+    assert main(["demo", "--size", str(SIZE), "--out", out]) == 2
+    assert capsys.readouterr().err.startswith(f"progdf: {told}")
+    assert list(tmp_path.iterdir()) == [tmp_path / "taken"]
 
 
 def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(

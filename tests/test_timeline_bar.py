@@ -236,6 +236,8 @@ def test_a_film_as_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> N
         (("-o", "film.png"), "film.png cannot hold a film"),
         (("-o", "taken"), "taken exists and is not an empty folder"),
         (("-o", "none/frames"), "does not exist"),
+        (("-o", "/proc/frames"), "/proc/frames cannot be written ("),
+        (("-o", "dangling"), "dangling exists and is not an empty folder"),
         (("-o", "x.gif", "--sweep", "scarf"), "were both given"),
         (("-o", "x.gif", "--orbit", "0,0", "--timeline", "moving.json"), "moving.json moves the camera"),
     ],
@@ -245,6 +247,7 @@ def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
 ) -> None:
     Path("taken").mkdir()
     Path("taken/notes.txt").write_text("mine")
+    Path("dangling").symlink_to("nowhere")
     view = keyed()
     timeline_file.save(Path("moving.json"), view.timeline, view.layers)
     before = sorted(Path().iterdir())
@@ -255,14 +258,33 @@ def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
     assert sorted(Path().iterdir()) == before
 
 
-def test_frames_that_fail_on_the_way_leave_no_folder(tmp_path: Path) -> None:
+def test_an_empty_folder_is_filled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a link, or where one stands: neither can be put aside and replaced."""
+    frames = [np.zeros((4, 4, 3), np.uint8)] * 2
+    for folder in ("linked", "here"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "link").symlink_to("linked")
+    monkeypatch.chdir(tmp_path / "here")
+    for given, filled in ((tmp_path / "link", "linked"), (Path(), "here")):
+        film.write_sequence(given, frames)
+        names = sorted(path.name for path in (tmp_path / filled).iterdir())
+        assert names == ["frame_0000.png", "frame_0001.png"]
+    assert (tmp_path / "link").is_symlink()
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_frames_that_fail_on_the_way_leave_nothing(tmp_path: Path, there: bool) -> None:
+    folder = tmp_path / "frames"
+    if there:
+        folder.mkdir()
+
     def torn() -> Iterator[film.Pixels]:
         yield np.zeros((4, 4, 3), np.uint8)
         raise ProgdfError("no more")
 
     with pytest.raises(ProgdfError):
-        film.write_sequence(tmp_path / "frames", torn())
-    assert list(tmp_path.iterdir()) == []
+        film.write_sequence(folder, torn())
+    assert list(tmp_path.rglob("*")) == [folder] * there
 
 
 def test_the_timeline_in_use(screenshot: Callable[[str, np.ndarray], None]) -> None:

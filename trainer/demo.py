@@ -21,7 +21,7 @@ from progdf.camera_files import save_cameras
 from progdf.checkpoint import Gdf, load_gdf
 from progdf.command_line import parsed
 from progdf.compose import Layer, compose
-from progdf.files import written_whole
+from progdf.files import make_folder, written_whole
 from progdf.pictures import contact_sheet, write_image
 from progdf.ply import load_ply, save_ply
 from progdf.rasterize import render
@@ -156,8 +156,12 @@ def main(argv: Sequence[str]) -> int:
 
 
 def write_scene(folder: Path, scene: DemoScene) -> None:
-    """Write scene.ply, labels.npy ([N] uint8) and cameras.json; the folder is made if need be."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write scene.ply, labels.npy ([N] uint8) and cameras.json; the folder is made if need be.
+
+    Raises:
+        ProgdfError: the folder cannot be made or written to.
+    """
+    make_folder(folder)
     save_ply(folder / "scene.ply", scene.gaussians)
     with written_whole(folder / "labels.npy") as beside:
         np.save(beside, scene.labels.numpy())

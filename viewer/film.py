@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,6 +17,7 @@ from PIL import Image
 
 from progdf import pictures
 from progdf.errors import ProgdfError
+from progdf.files import unwritable
 
 from .state import ViewState
 
@@ -100,27 +102,38 @@ def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> 
 
 
 def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
-    """Frames as frame_0000.png, frame_0001.png, …: the folder appears when all are written.
+    """Frames as frame_0000.png, frame_0001.png, …: they appear when all are written.
 
     Raises:
-        ProgdfError: see `check_sequence`.
+        ProgdfError: see `check_sequence`; or the place cannot be written.
     """
     check_sequence(folder)
-    beside = Path(tempfile.mkdtemp(dir=folder.absolute().parent, prefix=f".{folder.name}."))
+    there = folder.is_dir()
+    try:  # within a folder that is there, which may be a link, a mounted disk or where one stands
+        home = folder if there else folder.absolute().parent
+        drawn = Path(tempfile.mkdtemp(dir=home, prefix=f".{folder.name}."))
+    except OSError as error:
+        raise unwritable(folder, error) from None
     try:
         for number, frame in enumerate(frames):
-            Image.fromarray(frame).save(beside / f"frame_{number:04d}.png")
-        beside.chmod(0o755)
-        if folder.exists():
-            folder.rmdir()  # it is empty; some systems rename onto nothing
-        beside.rename(folder)
+            Image.fromarray(frame).save(drawn / f"frame_{number:04d}.png")
+        if there:
+            for path in sorted(drawn.iterdir()):
+                path.rename(folder / path.name)
+        else:
+            drawn.chmod(0o755)
+            drawn.rename(folder)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(drawn, ignore_errors=True)
 
 
 def check_sequence(folder: Path) -> None:
     """Raises ProgdfError where no folder of frames can be made: its place is taken, or its parent missing."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    try:
+        taken = os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir()))
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    if taken:
         raise ProgdfError(f"{folder} exists and is not an empty folder; give a new name for the frames")
     if not folder.absolute().parent.is_dir():
         raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; make it first")
