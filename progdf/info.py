@@ -123,7 +123,8 @@ def _timeline_lines(path: Path) -> Iterator[str]:
 
 def _form(gdf: GdfHead) -> str:
     """What a field is made of."""
-    bases = ", ".join(f"{name} {count}" for name, count in gdf.bases().items())
+    # the first is the offset at strength 1 as it was recorded, see `AttributeBases.full`
+    bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
     if "network" not in gdf.field:
         return f"{gdf.nodes} nodes; bases: {bases or 'none, nothing moves'}"
     network = gdf.field["network"]
