@@ -66,11 +66,14 @@ def test_a_number_of_threads_that_cannot_be_is_told(
     assert "--threads is" in stderr_of(capsys, command, str(tmp_path), "--threads", threads)
 
 
-@pytest.mark.parametrize("psnr", ["nan", "inf"])
-def test_a_refit_to_no_number_of_decibels_is_refused(
+@pytest.mark.parametrize("psnr", ["nan", "inf", "0", "-3", "99.1", "1e99"])
+def test_a_refit_to_what_no_field_can_measure_is_refused(
     psnr: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert "--target-psnr is" in stderr_of(capsys, "fit", str(tmp_path), "--target-psnr", psnr)
+    out = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "night", "--target-psnr", psnr)
+    assert "--target-psnr is" in stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *out)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

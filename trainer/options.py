@@ -12,6 +12,7 @@ import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.neural import Bins, Inputs, Size
+from progdf.field.ranks import NO_DIFFERENCE
 from progdf.lpips import Net
 from trainer.objective import Progressive
 from trainer.pgs import Rates
@@ -324,9 +325,10 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
     Raises:
         ProgdfError: one does not.
     """
-    if not math.isfinite(options.target_psnr):
+    if not 0 < options.target_psnr <= NO_DIFFERENCE:
         raise ProgdfError(
-            f"--target-psnr is {options.target_psnr}; a number of decibels, as 40, would be right"
+            f"--target-psnr is {options.target_psnr:g}; above 0 and up to {NO_DIFFERENCE:g} dB, which stands "
+            "for no difference, would be right"
         )
     for name, default in NETWORK_OPTIONS.items():
         option = "--" + name.replace("_", "-")
