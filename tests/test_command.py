@@ -77,6 +77,26 @@ def test_a_refit_to_what_no_field_can_measure_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("option", "number"),
+    [
+        ("--seed", "-1"),
+        ("--seed", "9" * 20),
+        ("--edit-seed", "9" * 20),
+        ("--steps", "9" * 20),
+        ("--steps", "-1"),
+    ],
+)
+def test_a_run_of_numbers_that_cannot_be_is_not_begun(
+    option: str, number: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    save_ply(tmp_path / "scene.ply", random_gaussians(20))
+    words = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "instruct:make it blue")
+    said = stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *words, option, number)
+    assert said.startswith(f"progdf: {option} is {number}; ")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
     "editor", ["recolor:#30", "tint:", "stripes:red", "darken:nan", "style:99", "folder:nope"]
 )
 def test_an_editor_that_cannot_be_is_told_before_a_folder_is_made(

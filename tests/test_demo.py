@@ -131,6 +131,19 @@ def test_with_a_display_the_window_opens_in_a_process_of_its_own(
     assert len(commands) == 1
 
 
+@pytest.mark.parametrize(
+    ("option", "number"),
+    [("--seed", "-1"), ("--seed", "9" * 20), ("--threads", "-1"), ("--size", "9" * 12), ("--size", "9" * 20)],
+)
+def test_a_demo_asked_for_numbers_that_cannot_be_writes_nothing(
+    option: str, number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = () if option == "--size" else ("--size", str(SIZE))
+    assert main(["demo", *size, "--out", str(tmp_path / "demo"), option, number]) == 2
+    assert capsys.readouterr().err.startswith(f"progdf: {option} is {number}; ")
+    assert not (tmp_path / "demo").exists()
+
+
 def test_a_demo_with_too_few_gaussians_writes_nothing(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="too few for a bear"):
         demo.main(["--size", "10", "--out", str(tmp_path / "demo")])

@@ -21,15 +21,18 @@ from progdf.camera_files import save_cameras
 from progdf.checkpoint import Gdf, load_gdf
 from progdf.command_line import parsed
 from progdf.compose import Layer, compose
+from progdf.errors import ProgdfError
 from progdf.files import make_folder, written_whole
 from progdf.pictures import contact_sheet, write_image
 from progdf.ply import load_ply, save_ply
 from progdf.rasterize import render
 from progdf.scenes import DemoScene, bear, room
-from trainer.options import TrainOptions
+from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions, check_ranges
 from trainer.state import StateFolder
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
+MOST_GAUSSIANS = 5_000_000
+"""As many as large trained scenes have: what --size says at most."""
 _HERO_HEIGHT = 400
 _GRID = (0.0, 1 / 3, 2 / 3, 1.0)
 
@@ -134,6 +137,7 @@ class DemoOptions:
 def main(argv: Sequence[str]) -> int:
     """Run the demo. Raises ProgdfError for options that cannot be met."""
     options = parsed(DemoOptions, argv, "progdf demo")
+    _check(options)
     begun = time.perf_counter()
     show = SHOWS[options.scene]
     scene = show.make(show.size if options.size is None else options.size, options.seed)
@@ -153,6 +157,13 @@ def main(argv: Sequence[str]) -> int:
         # another process, as the trainer and the viewer share nothing but files
         return subprocess.run([sys.executable, "-m", "progdf", *command], check=False).returncode
     return 0
+
+
+def _check(options: DemoOptions) -> None:
+    """Raises ProgdfError for a number that cannot be, before anything is made or written."""
+    if options.size is not None and options.size > MOST_GAUSSIANS:
+        raise ProgdfError(f"--size is {options.size}; {MOST_GAUSSIANS} or fewer would be right")
+    check_ranges(("--seed", options.seed, 0, LARGEST_SEED), ("--threads", options.threads, 0, MOST_THREADS))
 
 
 def write_scene(folder: Path, scene: DemoScene) -> None:

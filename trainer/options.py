@@ -39,6 +39,10 @@ MOST_STAGES = 8
 
 MOST_THREADS = 1024
 """More than any machine has: what --threads says at most."""
+MOST_STEPS = 1_000_000
+"""Hours on any machine: what --steps says at most."""
+LARGEST_SEED = 2**32 - 1
+"""What every generator of random numbers takes."""
 STAGE_STEPS = 40
 """A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
 one is met. `QUICK_STAGES` are asked for then. Room's walls, 200 steps, PSNR on held-out views at .25, .5, .75
@@ -270,11 +274,13 @@ def settled(options: TrainOptions) -> TrainOptions:
     name = options.name or options.out.resolve().name
     if not name or "/" in name or name.startswith("."):
         raise ProgdfError(f"'{name}' cannot be a layer's name; choose one with --name, as --name shirt")
-    for what, value, low, high in (
+    check_ranges(
         ("--views", options.views, 3, 96),
         ("--image-size", options.image_size, 32, 2048),
         ("--stages", options.stages, 0, 16),
         ("--group-steps", options.group_steps, 0, 10_000),
+        ("--seed", options.seed, 0, LARGEST_SEED),
+        ("--edit-seed", options.edit_seed, 0, LARGEST_SEED),
         ("--threads", options.threads, 0, MOST_THREADS),
         ("--perceptual-every", options.perceptual_every, 1, 1000),
         ("--guidance", options.guidance, 1, 100),
@@ -284,14 +290,11 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--lift-threshold", options.lift_threshold, 0, 1),
         ("--detect-least", options.detect_least, 0, 1),
         ("--reedit-every", options.reedit_every, 0, 100_000),
-    ):
-        if value is not None and not low <= value <= high:
-            raise ProgdfError(f"{what} is {value}; {low} to {high} would be right")
+    )
     stages = options.stages or MOST_STAGES
-    if options.steps < 4 * stages:
-        raise ProgdfError(
-            f"--steps is {options.steps}; at least {4 * stages} would be right for {stages} stages"
-        )
+    if not 4 * stages <= options.steps <= MOST_STEPS:
+        right = f"{4 * stages} to {MOST_STEPS} would be right for {stages} stages"
+        raise ProgdfError(f"--steps is {options.steps}; {right}")
     for what, weight in (
         ("--perceptual-weight", options.perceptual_weight),
         ("--progressive-weight", options.progressive_weight),
@@ -304,6 +307,17 @@ def settled(options: TrainOptions) -> TrainOptions:
     _check_editor_options(options)
     check_network_options(options)
     return replace(options, name=name)
+
+
+def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
+    """Raises ProgdfError at the first value outside its range.
+
+    Args:
+        ranges: the option, its value or None where it has none, the least and the largest that is right
+    """
+    for what, value, low, high in ranges:
+        if value is not None and not low <= value <= high:
+            raise ProgdfError(f"{what} is {value}; {low} to {high} would be right")
 
 
 def _check_editor_options(options: TrainOptions) -> None:
