@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from progdf.errors import ProgdfError
+from progdf.files import disk_full
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.demo:main", "make a scene, train its region edits, write previews, open the window"),
@@ -67,7 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"progdf: {where}{error.strerror or _one_line(error)}", file=sys.stderr)
+        right = "; the disk takes no more, free some space" if disk_full(error) else ""
+        print(f"progdf: {where}{error.strerror or _one_line(error)}{right}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"progdf: interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", file=sys.stderr)

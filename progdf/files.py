@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterator
@@ -9,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from progdf.errors import ProgdfError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -19,7 +22,8 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
             beside.write_bytes(…)
 
     Raises:
-        ProgdfError: the folder does not exist or cannot be written to, or `path` is a folder.
+        ProgdfError: the folder does not exist or cannot be written to, the disk is full, or `path` is a
+            folder.
     """
     target = Path(path)
     if target.is_dir():
@@ -30,13 +34,18 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
     except OSError as error:
-        raise unwritable(target, error) from None
+        raise unwritable(target, error) from error
     os.close(handle)
     beside = Path(name)
     try:
         beside.chmod(target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask())
         yield beside
         os.replace(beside, target)
+    except (OSError, ProgdfError) as error:  # the latter of one within, which knows `beside` alone
+        full = disk_full(error)
+        if full is None:
+            raise
+        raise unwritable(target, full) from full
     finally:
         beside.unlink(missing_ok=True)
 
@@ -59,6 +68,12 @@ def unwritable(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     """The one line for a file or a folder that cannot be written."""
     reason = error.strerror or error
     return ProgdfError(f"{path} cannot be written ({reason}); give a place that can be written to")
+
+
+def disk_full(error: BaseException) -> OSError | None:
+    """What the system said of a disk that takes no more, if that is behind `error`."""
+    cause = error if isinstance(error, OSError) else error.__cause__
+    return cause if isinstance(cause, OSError) and cause.errno in _FULL else None
 
 
 def open_failure(path: str | os.PathLike[str], error: OSError) -> ProgdfError:

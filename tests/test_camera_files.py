@@ -14,6 +14,7 @@ from PIL import Image
 import progdf
 from progdf.camera import Camera
 from progdf.camera_files import load_cameras, save_cameras
+from progdf.errors import ProgdfError
 from progdf.lens import Lens
 from tests.camera_tables import inria, nerfstudio, some_cameras, written
 from tests.full_disk import files_up_to
@@ -149,7 +150,7 @@ def test_a_save_that_fails_leaves_the_old_cameras_and_nothing_else(tmp_path: Pat
     path = tmp_path / "cameras.json"
     save_cameras(path, some_cameras())
     old = path.read_bytes()
-    with files_up_to(100), pytest.raises(OSError, match="too large"):
+    with files_up_to(100), pytest.raises(ProgdfError, match=r"cameras\.json cannot be written \("):
         save_cameras(path, some_cameras()[:2])
     assert path.read_bytes() == old
     assert [entry.name for entry in tmp_path.iterdir()] == ["cameras.json"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -42,6 +44,16 @@ def test_a_missing_file_is_one_line_and_exit_2(
     }
     assert "nowhere.ply" in stderr_of(capsys, command, missing, *more.get(command, []))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_says_what_to_do(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(argv: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("progdf.check.main", full)
+    assert "free some space" in stderr_of(capsys, "check", "scene.ply")
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))

@@ -8,6 +8,7 @@ import pytest
 
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
+from tests.full_disk import files_up_to
 
 
 def test_a_file_appears_when_it_is_complete_and_not_before(tmp_path: Path) -> None:
@@ -34,6 +35,17 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_beside_it(
 
     with pytest.raises(error):
         write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    path.write_text("old")
+    told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); give a place")
+    with told as caught, files_up_to(100), written_whole(path) as beside, written_whole(beside) as within:
+        within.write_text("x" * 1000)
+    assert isinstance(caught.value.__cause__, OSError), "training tells a full disk by it"
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

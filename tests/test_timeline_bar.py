@@ -13,6 +13,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from tests.full_disk import files_up_to
 from tests.ui_rig import STEP_S, Rig, bear, first_view, rig
 from viewer import film, panel, timeline, timeline_bar, timeline_file
 from viewer.headless import headless_context, is_software
@@ -285,6 +286,12 @@ def test_frames_that_fail_on_the_way_leave_nothing(tmp_path: Path, there: bool) 
     with pytest.raises(ProgdfError):
         film.write_sequence(folder, torn())
     assert list(tmp_path.rglob("*")) == [folder] * there
+
+
+def test_frames_for_a_full_disk_are_one_line_and_leave_no_folder(tmp_path: Path) -> None:
+    with files_up_to(20), pytest.raises(ProgdfError, match=r"frames cannot be written \("):
+        film.write_sequence(tmp_path / "frames", [np.zeros((4, 4, 3), np.uint8)])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_timeline_in_use(screenshot: Callable[[str, np.ndarray], None]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import torch
 
 from progdf.errors import ProgdfError
+from progdf.files import disk_full
 from progdf.region import Region
 from trainer.artefacts import RunFolder, begin_log, remove_leftovers
 from trainer.options import TrainOptions, settled
@@ -23,8 +23,6 @@ _ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
 
 REGION = "region"
 """Of the saved state: members and score."""
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @dataclass(frozen=True)
@@ -122,9 +120,7 @@ def one_line(folder: RunFolder) -> Iterator[None]:
             f"what is done is kept in {folder.root}; give the same command with --resume to go on"
         ) from None
     except (OSError, ProgdfError) as error:
-        cause = error if isinstance(error, OSError) else error.__cause__
-        full = isinstance(cause, OSError) and cause.errno in _FULL
-        if full:
+        if disk_full(error):
             trouble = f"the disk of {folder.root} is full; free some space"
         elif isinstance(error, OSError):
             trouble = f"{folder.root} cannot be written ({error.strerror or error}); make it writable"

@@ -105,7 +105,7 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
     """Frames as frame_0000.png, frame_0001.png, …: they appear when all are written.
 
     Raises:
-        ProgdfError: see `check_sequence`; or the place cannot be written.
+        ProgdfError: see `check_sequence`; or the place cannot be written, or is full.
     """
     check_sequence(folder)
     there = folder.is_dir()
@@ -123,6 +123,8 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
         else:
             drawn.chmod(0o755)
             drawn.rename(folder)
+    except OSError as error:
+        raise unwritable(folder, error) from error
     finally:
         shutil.rmtree(drawn, ignore_errors=True)
 
