@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from progdf.files import written_whole
+from progdf.files import make_folder, written_whole
 
 _PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -98,7 +98,7 @@ def to_picture(image: Tensor) -> Image.Image:
 
 def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
     """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    make_folder(Path(path).parent)
     with written_whole(path) as beside:
         to_picture(image).save(beside)
 

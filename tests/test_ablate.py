@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,6 +78,18 @@ def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: Train
         chosen(variants, "base,warmup")
     with pytest.raises(ProgdfError, match="'sharpness-off' makes no difference to this run; "):
         chosen(variants, "sharpness-off")
+    with pytest.raises(ProgdfError, match="--only ' ,' names no variant; choose of base,"):
+        chosen(variants, " ,")
+
+
+def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
+    options: TrainOptions, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
+    (copy / "ablation").touch()
+    with pytest.raises(ProgdfError, match="ablation is a file; give the name of a folder"):
+        ablate(AblateOptions(copy, threads=1), quiet=True)
 
 
 def test_the_options_of_a_run_are_read_back_as_they_were(options: TrainOptions) -> None:

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from progdf.errors import ProgdfError
 from progdf.pictures import contact_sheet, write_image
 
 
@@ -62,3 +63,9 @@ def test_an_image_is_written_whole_and_cut_to_what_a_file_can_hold(tmp_path: Pat
     write_image(path, torch.tensor([[[-1.0, 0.5, 2.0]]]))
     assert np.asarray(Image.open(path)).tolist() == [[[0, 128, 255]]]
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
+
+
+def test_an_image_for_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "taken").touch()
+    with pytest.raises(ProgdfError, match="taken is a file; give the name of a folder"):
+        write_image(tmp_path / "taken" / "a.png", torch.zeros(1, 1, 3))

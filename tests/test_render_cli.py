@@ -187,6 +187,7 @@ def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: R
         (("--orbit", "a,b"), "--orbit a,b is not a list of numbers"),
         (("--orbit", "0,91"), "--orbit 0,91: the elevation is 91"),
         (("--orbit", "0,0,0"), "--orbit 0,0,0: the distance is 0"),
+        (("--orbit", "0,0,1e300"), "--orbit 0,0,1e300: the distance is 1e+300; above 0 and up to 1e+"),
         (("--background", "pink"), "'pink' is not a colour"),
         (("--sweep", "scarf"), "x.png cannot hold an animation"),
         (("--sheet", "scarf,hat"), "--sheet hat: there is no edit of that name"),

@@ -21,7 +21,7 @@ from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.dial import same
-from progdf.files import written_whole
+from progdf.files import make_folder, written_whole
 from progdf.pictures import write_image
 from progdf.slider_statistics import slider_statistics
 from progdf.trajectory import Trajectory
@@ -83,7 +83,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
     variants = sensible(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
     wanted = chosen(variants, options.only)
     root = run.folder.root / "ablation"
-    root.mkdir(exist_ok=True)
+    make_folder(root)
     with stopping(), locked(RunFolder(root)):
         log = RunLog(root / "log.txt", quiet)
         try:

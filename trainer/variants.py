@@ -87,10 +87,12 @@ def chosen(variants: Sequence[Variant], only: str) -> list[Variant]:
     """Those that `only` names, in their own order, or all.
 
     Raises:
-        ProgdfError: a name that is none, or that makes no difference to this run.
+        ProgdfError: a name that is none, or that makes no difference to this run; or no name but commas.
     """
     names = {name.strip() for name in only.split(",") if name.strip()}
     known = {variant.name for variant in variants}
+    if only and not names:
+        raise ProgdfError(f"--only '{only}' names no variant; choose of {','.join(v.name for v in variants)}")
     for name in sorted(names - known):
         about = "makes no difference to this run" if name in {v.name for v in VARIANTS} else "does not exist"
         raise ProgdfError(f"the variant '{name}' {about}; choose of {','.join(v.name for v in variants)}")

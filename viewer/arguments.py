@@ -128,7 +128,9 @@ def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
         )
     distance = numbers[2] if len(numbers) == 3 else framed.distance
     if not 0 < distance <= FARTHEST:
-        raise ProgdfError(f"--orbit {text}: the distance is {distance:g}; it must be above 0, in world units")
+        raise ProgdfError(
+            f"--orbit {text}: the distance is {distance:g}; above 0 and up to {FARTHEST:g} would be right"
+        )
     return replace(framed, azimuth=numbers[0], elevation=numbers[1], distance=distance)
 
 
