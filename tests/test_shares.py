@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.order import Sorting, depth_order, new_sorting
-from progdf.rasterize.shares import Team, claim, enter, finish, leave, wait
+from progdf.rasterize.shares import _ENTERED, Team, _crew, _make_way, _seen, enter, leave, pieces
 
 Array = NDArray[Any]
 
@@ -20,10 +20,8 @@ Array = NDArray[Any]
 @kernel()
 def _tick(times: Array, claims: Array) -> None:
     seat = enter(claims)
-    piece = claim(claims, 0, seat, times.size)
-    while piece < times.size:
+    for piece in pieces(claims, 0, seat, times.size):
         times[piece] += 1
-        piece = claim(claims, 0, seat, times.size)
     leave(claims)
 
 
@@ -37,16 +35,10 @@ def test_every_piece_of_work_is_done_once(workers: int) -> None:
 @kernel()
 def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
     seat = enter(claims)
-    piece = claim(claims, 0, seat, times.size)
-    while piece < times.size:
+    for piece in pieces(claims, 0, seat, times.size):
         times[piece] = piece
-        finish(claims, 0)
-        piece = claim(claims, 0, seat, times.size)
-    wait(claims, 0, times.size)
-    piece = claim(claims, 1, seat, sums.size)
-    while piece < sums.size:
+    for piece in pieces(claims, 1, seat, sums.size):
         sums[piece] = times.sum()
-        piece = claim(claims, 1, seat, sums.size)
     leave(claims)
 
 
@@ -66,6 +58,40 @@ def test_two_python_threads_may_share_out_work_at_the_same_time() -> None:
     for caller in callers:
         caller.join()
     assert all((times == 1).all() for times in done)
+
+
+def test_a_helper_that_comes_too_late_is_not_waited_for() -> None:
+    busy = threading.Event()
+    for _ in range(os.cpu_count() or 1):
+        _crew().put(busy.wait)  # all helpers have something else to do
+    times = np.zeros(100, np.int64)
+    Team(2).share(_tick, times)
+    busy.set()
+    assert (times == 1).all()
+
+
+@kernel()
+def _fail_unless_first(patience: int, claims: Array) -> None:
+    seat = enter(claims)
+    if seat > 0:
+        raise ValueError("there")
+    for _ in range(patience):
+        if _seen(claims, _ENTERED) < 2:
+            _make_way()
+    leave(claims)
+
+
+def test_an_error_in_a_helper_arrives() -> None:
+    Team(1).share(_fail_unless_first, 0)  # is compiled
+    with pytest.raises(ValueError, match="there"):
+        Team(2).share(_fail_unless_first, 10_000_000)
+
+
+def test_helpers_that_were_called_for_nothing_give_up() -> None:
+    Team(2).call(3)  # as where a scene is refused between two launches
+    times = np.zeros(100, np.int64)
+    Team(2).share(_tick, times)
+    assert (times == 1).all()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")

@@ -15,7 +15,7 @@ from progdf.rasterize.gathers import Rows, gather, rows_from
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.lanes import WIDTH, Lanes, any_of, choose, spread, store
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE
-from progdf.rasterize.shares import claim, finish, wait
+from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
@@ -166,19 +166,13 @@ def find_tiles(
     """
     count, parts = splats.shape[0], counts.shape[0]
     size = (count + parts - 1) // parts
-    part = claim(claims, step, seat, parts)
-    while part < parts:
+    for part in pieces(claims, step, seat, parts):
         begin, stop = min(count, part * size), min(count, (part + 1) * size)
         _find_tiles(splats, begin, stop, window, grid, most, counts[part], per_splat, tiles[part])
-        finish(claims, step)
-        part = claim(claims, step, seat, parts)
-    wait(claims, step, parts)
     step += 1
-    if claim(claims, step, seat, 1) == 0:
+    for _ in pieces(claims, step, seat, 1):
         _place_tiles(counts, tile_starts, per_splat)
         found[1] = per_splat[count]
-        finish(claims, step)
-    wait(claims, step, 1)
 
 
 @kernel(inline=True)
@@ -212,12 +206,11 @@ def fill_tiles(
         members: out, the splats of all tiles, tile after tile. [I] int32
         slots: out, for each member its place in an order by splat, so that gradients can be added up in one
             fixed order. [I] int64, or [0] where nobody will ask
-        seat, claims, step: see `shares.claim`
+        seat, claims, step: see `shares.pieces`
     """
     count, parts = splats.shape[0], places.shape[0]
     size = (count + parts - 1) // parts
-    part = claim(claims, step, seat, parts)
-    while part < parts:
+    for part in pieces(claims, step, seat, parts):
         begin, stop = min(count, part * size), min(count, (part + 1) * size)
         before = per_splat[begin]
         found = per_splat[stop] - before
@@ -234,6 +227,3 @@ def fill_tiles(
                 members[at] = s
                 if slots.size > 0:
                     slots[at] = slot
-        finish(claims, step)
-        part = claim(claims, step, seat, parts)
-    wait(claims, step, parts)

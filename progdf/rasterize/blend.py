@@ -13,7 +13,6 @@ from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import WIDTH, choose, count, load, store
 from progdf.rasterize.pixels import (
     BATCH,
-    BEGIN,
     BLUE,
     CARD,
     EIGHT,
@@ -25,17 +24,14 @@ from progdf.rasterize.pixels import (
     ONE,
     PLANE,
     RED,
-    START,
     STEP,
-    STOP,
-    TOP,
-    U_PEAK,
     exp2,
     make_cards,
     new_cards,
+    row_of,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim
+from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
@@ -51,12 +47,9 @@ _G, _B, _LAST = PLANE * np.uint64(2), PLANE * np.uint64(3), PLANE * np.uint64(4)
 @kernel(fast=True, inline=True)
 def blend_row(state: Array, cards: Array, card: Number, row: Number, place: Number) -> None:
     """Blend one row of a splat into a tile's state; `card` is where its card begins, see `pixels`."""
-    start, stop = cards[card + START + row], cards[card + STOP + row]
-    if start >= stop:
-        return
-    u_peak, top, step = cards[card + U_PEAK + row], cards[card + TOP + row], cards[card + STEP]
+    start, stop, p, u_peak, top = row_of(cards, card, row)
+    step = cards[card + STEP]
     red, green, blue = cards[card + RED], cards[card + GREEN], cards[card + BLUE]
-    p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
     offset = start + count()
     while start < stop:
         u = u_peak + step * offset
@@ -132,14 +125,13 @@ def blend(
         image: out, [h,w,3] float32
         transmittance: out, [h,w] float32
         last: out, place in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
-        seat, claims, step: see `shares.claim`
+        seat, claims, step: see `shares.pieces`
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     state, cards = np.empty(5 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
-    tile = claim(claims, step, seat, tiles)
-    while tile < tiles:
+    for tile in pieces(claims, step, seat, tiles):
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         tile_bounds(x, y, window, bounds)
         listed = members[tile_starts[tile] : tile_starts[tile + 1]]
@@ -158,4 +150,3 @@ def blend(
                 image[i, left + k, 0] = state[p + PLANE + k] + through * background[0]
                 image[i, left + k, 1] = state[p + _G + k] + through * background[1]
                 image[i, left + k, 2] = state[p + _B + k] + through * background[2]
-        tile = claim(claims, step, seat, tiles)

@@ -17,7 +17,6 @@ from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total, totals
 from progdf.rasterize.pixels import (
     BATCH,
-    BEGIN,
     BLUE,
     CARD,
     EIGHT,
@@ -28,18 +27,15 @@ from progdf.rasterize.pixels import (
     ONE,
     PLANE,
     RED,
-    START,
     STEP,
-    STOP,
-    TOP,
-    U_PEAK,
     V,
     exp2,
     make_cards,
     new_cards,
+    row_of,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim, finish, wait
+from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
@@ -61,11 +57,8 @@ def unblend_splat(state: Array, cards: Array, card: Number, place: Number, sums:
     s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = spread(_ZERO)
     for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
         row = np.uint64(line)
-        start, stop = cards[card + START + row], cards[card + STOP + row]
-        if start >= stop:
-            continue
-        u_peak, v, top = cards[card + U_PEAK + row], cards[card + V + row], cards[card + TOP + row]
-        p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+        start, stop, p, u_peak, top = row_of(cards, card, row)
+        v = cards[card + V + row]
         offset = start + count()
         while start < stop:
             u = u_peak + step * offset
@@ -106,11 +99,7 @@ def pass_splat(state: Array, cards: Array, card: Number, place: Number) -> None:
     red, green, blue, step = cards[card + RED], cards[card + GREEN], cards[card + BLUE], cards[card + STEP]
     for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
         row = np.uint64(line)
-        start, stop = cards[card + START + row], cards[card + STOP + row]
-        if start >= stop:
-            continue
-        u_peak, top = cards[card + U_PEAK + row], cards[card + TOP + row]
-        p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+        start, stop, p, u_peak, top = row_of(cards, card, row)
         offset = start + count()
         while start < stop:
             u = u_peak + step * offset
@@ -165,14 +154,13 @@ def unblend(
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
         sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
         wanted: splats whose gradients are wanted. [V] bool
-        seat, claims, step: see `shares.claim`
+        seat, claims, step: see `shares.pieces`
     """
     tiles = tile_starts.size - 1
     plane = np.int64(PLANE)
     state, cards = np.empty(6 * plane, np.float32), new_cards()
     bounds = np.empty(4, np.int64)
-    tile = claim(claims, step, seat, tiles)
-    while tile < tiles:
+    for tile in pieces(claims, step, seat, tiles):
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         state[:plane] = _ONE
         state[plane : 5 * plane] = _ZERO
@@ -195,6 +183,3 @@ def unblend(
                 state[p + _BEHIND + k] = state[p + k] * seen
         listed = slice(tile_starts[tile], tile_starts[tile + 1])
         unblend_tile(state, x, y, members[listed], slots[listed], splats, rgb, bounds, cards, sums, wanted)
-        finish(claims, step)
-        tile = claim(claims, step, seat, tiles)
-    wait(claims, step, tiles)

@@ -63,8 +63,14 @@ class _Lists:
     members: Array
     slots: Array
     per_splat: Array
+
+
+@dataclass(frozen=True)
+class _Unplaced:
+    """Tiles splat by splat, see `binning.find_tiles`; of no use once the lists are filled."""
+
     places: Array
-    listed: Array
+    tiles: Array
 
 
 def rasterize(
@@ -110,11 +116,11 @@ def alpha_weights(
     totals = np.zeros((len(means), weights.SUMS))
     with running("weights", 2) as workers:
         team = _team(view, workers)
-        lists, _ = _list_splats(view, gaussians, team, for_gradients=True)
+        lists, unplaced, _ = _list_splats(view, gaussians, team, for_gradients=True)
         team.share(
             list_tiles,
-            lists.splats, view.window, view.grid, lists.places, lists.per_splat, lists.listed, lists.members,
-            lists.slots,
+            lists.splats, view.window, view.grid, unplaced.places, lists.per_splat, unplaced.tiles,
+            lists.members, lists.slots,
         )  # fmt: skip
         sums = np.zeros((len(lists.members), weights.SUMS))
         team.share(
@@ -174,7 +180,7 @@ def _float32(tensor: Tensor) -> Tensor:
 
 def _list_splats(
     view: _View, gaussians: list[Array], team: Team, for_gradients: bool
-) -> tuple[_Lists, list[Array]]:
+) -> tuple[_Lists, _Unplaced, list[Array]]:
     """Project and sort, and count the tiles; also the centres, depths and visibility of all Gaussians."""
     n, tiles = len(gaussians[0]), int(view.grid[2] * view.grid[3])
     centres, depths, candidates = np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_)
@@ -198,10 +204,8 @@ def _list_splats(
         )
     members, slots = np.empty(total, np.int32), np.empty(total if for_gradients else 0, np.int64)
     ids, ranks, splats, rgb = ids[:count], ranks[:count], splats[:count], rgb[:count]
-    lists = _Lists(
-        ids, ranks, splats, rgb, tile_starts, members, slots, per_splat[: count + 1], places, listed
-    )
-    return lists, [centres, depths, visible]
+    lists = _Lists(ids, ranks, splats, rgb, tile_starts, members, slots, per_splat[: count + 1])
+    return lists, _Unplaced(places, listed), [centres, depths, visible]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -217,11 +221,12 @@ class _Rasterize(torch.autograd.Function):
         with running("forward", 12) as workers:
             team = _team(view, workers)
             team.call(2)
-            lists, found = _list_splats(view, gaussians, team, any(ctx.needs_input_grad))
+            lists, unplaced, found = _list_splats(view, gaussians, team, any(ctx.needs_input_grad))
             team.share(
                 draw,
-                lists.splats, lists.rgb, view.window, view.grid, lists.places, lists.per_splat, lists.listed,
-                lists.tile_starts, lists.members, lists.slots, background, image, transmittance, last,
+                lists.splats, lists.rgb, view.window, view.grid, unplaced.places, lists.per_splat,
+                unplaced.tiles, lists.tile_starts, lists.members, lists.slots, background, image,
+                transmittance, last,
             )  # fmt: skip
         results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
         ctx.mark_non_differentiable(*results[2:])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.shares import claim, finish, wait
+from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
@@ -23,7 +23,7 @@ _BUCKETS = 1 << _DIGIT
 _WORTH_A_THREAD = 65_536  # keys below which handing half of them over takes longer than moving them
 
 STEPS = 1 + 3 * _DIGITS + 1
-"""Steps of `depth_order`, see `shares.claim`."""
+"""Steps of `depth_order`, see `shares.pieces`."""
 
 
 class Sorting(NamedTuple):
@@ -130,12 +130,10 @@ def depth_order(
         V
     """
     keys, items, new_keys, new_items, places = sorting
-    if claim(claims, step, seat, 1) == 0:
+    for _ in pieces(claims, step, seat, 1):
         found[0] = _gather_keys(depths, candidates, ids, keys, items)
         if found[0] < _WORTH_A_THREAD:
             _sort(sorting, found[0], ranks)
-        finish(claims, step)
-    wait(claims, step, 1)
     count: int = found[0]
     if count < _WORTH_A_THREAD:
         return count
@@ -143,34 +141,20 @@ def depth_order(
     size = (count + parts - 1) // parts
     for digit in range(_DIGITS):
         step += 1
-        part = claim(claims, step, seat, parts)
-        while part < parts:
+        for part in pieces(claims, step, seat, parts):
             _count_digits(keys, part * size, min(count, (part + 1) * size), digit, places[part])
-            finish(claims, step)
-            part = claim(claims, step, seat, parts)
-        wait(claims, step, parts)
         step += 1
-        if claim(claims, step, seat, 1) == 0:
+        for _ in pieces(claims, step, seat, 1):
             _place_digits(places[:parts])
-            finish(claims, step)
-        wait(claims, step, 1)
         step += 1
-        part = claim(claims, step, seat, parts)
-        while part < parts:
+        for part in pieces(claims, step, seat, parts):
             _move_digits(
                 keys, items, part * size, min(count, (part + 1) * size), digit, places[part], new_keys,
                 new_items,
             )  # fmt: skip
-            finish(claims, step)
-            part = claim(claims, step, seat, parts)
-        wait(claims, step, parts)
         keys, new_keys, items, new_items = new_keys, keys, new_items, items
     step += 1
-    part = claim(claims, step, seat, parts)
-    while part < parts:
+    for part in pieces(claims, step, seat, parts):
         for place in range(part * size, min(count, (part + 1) * size)):
             ranks[items[place]] = place
-        finish(claims, step)
-        part = claim(claims, step, seat, parts)
-    wait(claims, step, parts)
     return count

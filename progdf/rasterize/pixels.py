@@ -117,6 +117,16 @@ def make_cards(
         cards[at + RED], cards[at + GREEN], cards[at + BLUE] = rgb[s, 0], rgb[s, 1], rgb[s, 2]
 
 
+@kernel(fast=True, inline=True)
+def row_of(cards: Array, card: Number, row: Number) -> tuple[Number, Number, Number, Number, Number]:
+    """Where a row of a splat begins and ends, from its peak; its place in a tile's state; u_peak and top."""
+    begin = np.uint64(np.int32(cards[card + BEGIN + row]))
+    return (
+        cards[card + START + row], cards[card + STOP + row], row * np.uint64(TILE_W) + begin,
+        cards[card + U_PEAK + row], cards[card + TOP + row],
+    )  # fmt: skip
+
+
 @kernel(inline=True)
 def tile_bounds(x: int, y: int, window: Array, bounds: Array) -> None:
     """left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""

@@ -20,7 +20,7 @@ from progdf.rasterize.geometry import Vec, dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.lanes import WIDTH, choose
 from progdf.rasterize.shading import fill_basis, view_direction
-from progdf.rasterize.shares import claim, finish, wait
+from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
@@ -86,19 +86,15 @@ def cull(
         centres: out, [N,2] float32
         depths: out, [N] float32
         candidates: out, [N] bool
-        seat, claims, step: see `shares.claim`
+        seat, claims, step: see `shares.pieces`
     """
     n = means.shape[0]
     parts = (n + _CHUNK - 1) // _CHUNK
-    part = claim(claims, step, seat, parts)
-    while part < parts:
+    for part in pieces(claims, step, seat, parts):
         _cull_range(
             part * _CHUNK, min(n, (part + 1) * _CHUNK), means, scales, opacities, viewmat, intrinsics, size,
             window, near, centres, depths, candidates,
         )  # fmt: skip
-        finish(claims, step)
-        part = claim(claims, step, seat, parts)
-    wait(claims, step, parts)
 
 
 @kernel(contract=True)
@@ -192,18 +188,14 @@ def project(
         splats: out, the columns named above; R2 is -1 where the splat is not shown. [V,8] float64
         rgb: out, [V,4] opacity last, antialias included. float32
         visible: out, set to True for what is shown. [N] bool
-        seat, claims, step: see `shares.claim`
+        seat, claims, step: see `shares.pieces`
     """
     count, eye = ids.size, make_lens(viewmat, intrinsics, size).eye
     parts = (count + _CHUNK - 1) // _CHUNK
-    part = claim(claims, step, seat, parts)
-    while part < parts:
+    for part in pieces(claims, step, seat, parts):
         begin, end = part * _CHUNK, min(count, (part + 1) * _CHUNK)
         _shape_range(
             begin, end, ids, ranks, means, quats, scales, opacities, viewmat, intrinsics, size, window,
             antialiased, splats, rgb,
         )  # fmt: skip
         _shade_range(begin, end, ids, ranks, means, colors, degree, eye, splats, rgb, visible)
-        finish(claims, step)
-        part = claim(claims, step, seat, parts)
-    wait(claims, step, parts)

@@ -34,7 +34,7 @@ from progdf.rasterize.jit import kernel
 from progdf.rasterize.lanes import WIDTH, Lanes, Mask, choose, load, spread, store, total, widen
 from progdf.rasterize.projection import R2, UNIT
 from progdf.rasterize.shading import shade_backward
-from progdf.rasterize.shares import claim
+from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
@@ -252,19 +252,17 @@ def project_backward(
         grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes
             of inputs
         grad_camera: out, zero on entry. [PARTS, CAMERA] float64
-        seat, claims, step: see `shares.claim`
+        seat, claims, step: see `shares.pieces`
     """
     most = (ids.size + PARTS - 1) // PARTS
     scratch = _Scratch(
         np.empty(most, np.int64), np.empty(most, np.int64), np.zeros((WIDTH, SUMS + 3)), np.arange(WIDTH),
         np.empty(16), np.zeros((16, 3)), np.empty(CAMERA * WIDTH),
     )  # fmt: skip
-    part = claim(claims, step, seat, PARTS)
-    while part < PARTS:
+    for part in pieces(claims, step, seat, PARTS):
         _project_backward_range(
             part * most, min(ids.size, (part + 1) * most), ids, ranks, means, quats, scales, opacities,
             colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums, wanted,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, scratch,
             grad_camera[part],
         )  # fmt: skip
-        part = claim(claims, step, seat, PARTS)

@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from queue import SimpleQueue
 from typing import Any
@@ -63,7 +63,7 @@ class Team:
         """Run `kernel(*arguments, claims)` on all threads at once.
 
         Args:
-            kernel: between `enter` and `leave` it takes its work by `claim`; claims: as `new_claims`
+            kernel: between `enter` and `leave` it gets its work from `pieces`; claims: as `new_claims`
         """
         job = self._called.popleft() if self._called else _Job(self.workers - 1)
         job.run(partial(kernel, *arguments, job.claims))
@@ -76,9 +76,9 @@ class _Job:
         self.claims = new_claims()
         self._run: Callable[[], None] | None = None
         self._error: BaseException | None = None
-        for _ in range(others):
+        self._others = min(others, _crew().count) if others else 0
+        for _ in range(self._others):
             _crew().put(self.help)
-        self._others = others
 
     def run(self, call: Callable[[], None]) -> None:
         self._run = call
@@ -104,7 +104,7 @@ class _Crew:
 
     def __init__(self, count: int) -> None:
         jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self.put = jobs.put
+        self.put, self.count = jobs.put, count
         for k in range(count):
             threading.Thread(target=_work, args=(jobs,), name=f"rasterize-{k}", daemon=True).start()
 
@@ -160,35 +160,24 @@ def leave(claims: Array) -> None:
     _take(claims, _LEFT)
 
 
-@kernel(inline=True)
-def claim(claims: Array, step: int, seat: int, pieces: int) -> Number:
-    """Inside a kernel: the next of so many pieces of a step's work, which no other thread gets; `pieces` when
-    all are taken.
+@kernel()
+def pieces(claims: Array, step: int, seat: int, count: int) -> Iterator[Number]:
+    """Inside a kernel: the pieces of a step's work that this thread is to do, of so many; then it waits until
+    the others have done theirs, so that what they wrote may be read.
 
     Every other thread begins at the last piece: so of one pass and the next, and of forward and backward, a
-    processor has much of the same memory.
+    processor has much of the same memory. What is waited for is at most a piece of each of the others:
+    shorter than to sleep and be woken.
     """
-    if _take(claims, _TAKEN + _COUNTERS * step) >= pieces:
-        return pieces
-    if seat % 2 == 0:
-        return _take(claims, _FRONT + _COUNTERS * step)
-    return pieces - 1 - _take(claims, _BACK + _COUNTERS * step)
-
-
-@kernel(inline=True)
-def finish(claims: Array, step: int) -> None:
-    """Inside a kernel: a claimed piece is done; for a step that others wait for."""
-    _take(claims, _DONE + _COUNTERS * step)
-
-
-@kernel(inline=True)
-def wait(claims: Array, step: int, pieces: int) -> None:
-    """Inside a kernel: until all pieces of a step are done, so that what they wrote may be read.
-
-    What is left is on other threads, at most a piece each: shorter than to sleep and be woken.
-    """
+    begin = _COUNTERS * step
+    while _take(claims, _TAKEN + begin) < count:
+        if seat % 2 == 0:
+            yield _take(claims, _FRONT + begin)
+        else:
+            yield count - 1 - _take(claims, _BACK + begin)
+        _take(claims, _DONE + begin)
     looks = 0
-    while _seen(claims, _DONE + _COUNTERS * step) < pieces:
+    while _seen(claims, _DONE + begin) < count:
         looks += 1
         if looks % _LOOKS == 0:
             _make_way()

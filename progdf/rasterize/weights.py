@@ -12,7 +12,6 @@ from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total
 from progdf.rasterize.pixels import (
     BATCH,
-    BEGIN,
     CARD,
     EIGHT,
     END,
@@ -21,17 +20,14 @@ from progdf.rasterize.pixels import (
     MOST,
     ONE,
     PLANE,
-    START,
     STEP,
-    STOP,
-    TOP,
-    U_PEAK,
     exp2,
     make_cards,
     new_cards,
+    row_of,
     tile_bounds,
 )  # fmt: skip
-from progdf.rasterize.shares import claim, enter, leave
+from progdf.rasterize.shares import enter, leave, pieces
 
 Array = NDArray[Any]
 
@@ -55,11 +51,7 @@ def add_weights(state: Array, cards: Array, card: Number, out: Array) -> None:
     step = cards[card + STEP]
     for line in range(np.int32(cards[card + FIRST]), np.int32(cards[card + END])):
         row = np.uint64(line)
-        start, stop = cards[card + START + row], cards[card + STOP + row]
-        if start >= stop:
-            continue
-        u_peak, top = cards[card + U_PEAK + row], cards[card + TOP + row]
-        p = row * np.uint64(TILE_W) + np.uint64(np.int32(cards[card + BEGIN + row]))
+        start, stop, p, u_peak, top = row_of(cards, card, row)
         offset = start + count()
         while start < stop:
             u = u_peak + step * offset
@@ -102,8 +94,7 @@ def weigh(
     state = np.empty(2 * np.int64(PLANE), np.float32)
     cards, bounds = new_cards(), np.empty(4, np.int64)
     seat = enter(claims)
-    tile = claim(claims, 0, seat, tiles)
-    while tile < tiles:
+    for tile in pieces(claims, 0, seat, tiles):
         x, y = (grid[0] + tile % grid[2]) * TILE_W, (grid[1] + tile // grid[2]) * TILE_H
         state[:] = _ONE
         tile_bounds(x, y, window, bounds)
@@ -116,7 +107,6 @@ def weigh(
             for place in range(begin, end):
                 card = np.uint64(place - begin) * CARD
                 add_weights(state, cards, card, sums[slots[place]])
-        tile = claim(claims, 0, seat, tiles)
     leave(claims)
 
 
