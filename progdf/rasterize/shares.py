@@ -33,8 +33,9 @@ Array = NDArray[Any]
 
 _STEPS = 15  # of a kernel, at most
 _ENTERED, _LEFT = 0, 1  # threads that have
-_TAKEN, _FRONT, _BACK, _DONE = range(2, 6)  # pieces of a step's work, from the front and from the back
-_COUNTERS = 4  # of a step
+_TAKEN, _DONE = 2, 3  # pieces of a step's work
+_COUNTERS = 2  # of a step
+_FROM_THE_BACK = 1 << 32  # what a piece from the back adds to those taken; one from the front adds 1
 _CLAIMS = 2 + _COUNTERS * _STEPS
 
 _LOOKS = 64  # at a counter, before a thread lets others have its processor for a moment
@@ -151,47 +152,51 @@ def new_claims() -> Array:
 @kernel(inline=True)
 def enter(claims: Array) -> Number:
     """The first thing that a shared kernel does: the thread's seat."""
-    return _take(claims, _ENTERED)
+    return _take(claims, _ENTERED, 1)
 
 
 @kernel(inline=True)
 def leave(claims: Array) -> None:
     """The last thing that a shared kernel does."""
-    _take(claims, _LEFT)
+    _take(claims, _LEFT, 1)
 
 
 @kernel()
 def pieces(claims: Array, step: int, seat: int, count: int) -> Iterator[Number]:
-    """Inside a kernel: the pieces of a step's work that this thread is to do, of so many; then it waits until
-    the others have done theirs, so that what they wrote may be read.
+    """Inside a kernel: the pieces of a step's work that this thread is to do, of so many (< 2³¹); then it
+    waits until the others have done theirs, so that what they wrote may be read.
 
     Every other thread begins at the last piece: so of one pass and the next, and of forward and backward, a
     processor has much of the same memory. What is waited for is at most a piece of each of the others:
     shorter than to sleep and be woken.
     """
-    begin = _COUNTERS * step
-    while _take(claims, _TAKEN + begin) < count:
-        if seat % 2 == 0:
-            yield _take(claims, _FRONT + begin)
-        else:
-            yield count - 1 - _take(claims, _BACK + begin)
-        _take(claims, _DONE + begin)
+    taken, done = _COUNTERS * step + _TAKEN, _COUNTERS * step + _DONE
+    one = 1 if seat % 2 == 0 else _FROM_THE_BACK
+    own = 0
+    while True:
+        before = _take(claims, taken, one)
+        front, back = before & (_FROM_THE_BACK - 1), before >> 32
+        if front + back >= count:
+            break
+        yield front if one == 1 else count - 1 - back
+        own += 1
+    _take(claims, done, own)
     looks = 0
-    while _seen(claims, _DONE + begin) < count:
+    while _seen(claims, done) < count:
         looks += 1
         if looks % _LOOKS == 0:
             _make_way()
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def _take(typingctx: Any, claims: Any, place: Any) -> Any:
-    """Add one to a counter; what it was before. What was written before is seen by who sees the counter."""
+def _take(typingctx: Any, claims: Any, place: Any, amount: Any) -> Any:
+    """Add to a counter; what it was before. What was written before is seen by who sees the counter."""
 
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        counter = _counter(context, builder, sig, *args)
-        return builder.atomic_rmw("add", counter, context.get_constant(types.int64, 1), "release")
+        counter = _counter(context, builder, sig, *args[:2])
+        return builder.atomic_rmw("add", counter, args[2], "release")
 
-    return types.int64(claims, types.int64), generate
+    return types.int64(claims, types.int64, types.int64), generate
 
 
 @intrinsic  # type: ignore[untyped-decorator]
