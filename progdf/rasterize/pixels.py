@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from progdf.rasterize.binning import TILE_H, TILE_W
 from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from progdf.rasterize.jit import Number, kernel
-from progdf.rasterize.lanes import WIDTH, Lanes, times_power, whole
+from progdf.rasterize.lanes import WIDTH, Lanes, prefetch, times_power, whole
 from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
@@ -87,6 +87,9 @@ def make_cards(
         cards: as from `new_cards`; out
     """
     low, high = np.float64(bounds[0]), np.float64(bounds[2])
+    for place in range(begin, end):
+        prefetch(splats, members[place])
+        prefetch(rgb, members[place])
     for place in range(begin, end):
         at = np.uint64(place - begin) * CARD
         s = members[place]

@@ -18,7 +18,7 @@ from progdf.rasterize.conventions import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
 from progdf.rasterize.gathers import gather, gather_vec, rows_at, rows_from, scatter
 from progdf.rasterize.geometry import Vec, dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import WIDTH, choose
+from progdf.rasterize.lanes import WIDTH, choose, prefetch
 from progdf.rasterize.shading import fill_basis, view_direction
 from progdf.rasterize.shares import pieces
 
@@ -109,6 +109,8 @@ def _shape_range(
     x1, y1 = np.float64(window[2]), np.float64(window[3])
     for k in range(begin, end, WIDTH):
         i, s = rows_at(ids, k, end), rows_at(ranks, k, end)
+        for ahead in range(min(k + WIDTH, end), min(k + 2 * WIDTH, end)):
+            prefetch(splats, ranks[ahead])
         seen = footprint(
             lens, gather_vec(means, i), gather(quats, i, 0), gather(quats, i, 1), gather(quats, i, 2),
             gather(quats, i, 3), gather_vec(scales, i),

@@ -31,7 +31,7 @@ from progdf.rasterize.geometry import (
     vec,
 )  # fmt: skip
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import WIDTH, Lanes, Mask, choose, load, spread, store, total, widen
+from progdf.rasterize.lanes import WIDTH, Lanes, Mask, choose, load, prefetch, spread, store, total, widen
 from progdf.rasterize.projection import R2, UNIT
 from progdf.rasterize.shading import shade_backward
 from progdf.rasterize.shares import pieces
@@ -177,6 +177,9 @@ def _project_backward_range(
             count += 1
     for k in range(0, count, WIDTH):
         for lane in range(WIDTH):
+            ahead = per_splat[scratch.places[min(k + WIDTH + lane, count - 1)]]
+            prefetch(sums, ahead)
+            prefetch(sums, ahead + 2)
             at = min(k + lane, count - 1)
             n, s = scratch.rows[at], scratch.places[at]
             _add_up(per_splat[s], per_splat[s + 1], sums, scratch.sums, lane)
