@@ -173,7 +173,16 @@ def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
 
     What another processor wrote last takes longer to come than most of what is done with it.
     """
+    return types.void(array, types.int64), _fetch(0)
 
+
+@intrinsic  # type: ignore[untyped-decorator]
+def prefetch_to_write(typingctx: Any, array: Any, row: Any) -> Any:
+    """As `prefetch`, so that no other processor has them."""
+    return types.void(array, types.int64), _fetch(1)
+
+
+def _fetch(write: int) -> Callable[..., ir.Value]:
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         fields = context.make_array(sig.args[0])(context, builder, args[0])
         byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -181,10 +190,10 @@ def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         offset = builder.mul(builder.extract_value(fields.strides, 0), args[1])
         address = builder.gep(builder.bitcast(fields.data, byte), [offset])
-        builder.call(function, [address, number(0), number(3), number(1)])  # to read, for long, data
+        builder.call(function, [address, number(write), number(3), number(1)])  # to be kept; data
         return context.get_dummy_value()
 
-    return types.void(array, types.int64), generate
+    return generate
 
 
 @intrinsic  # type: ignore[untyped-decorator]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.jit import Number, kernel
 from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
@@ -22,7 +22,7 @@ _BUCKETS = 1 << _DIGIT
 
 _WORTH_A_THREAD = 65_536  # keys below which handing half of them over takes longer than moving them
 
-STEPS = 1 + 3 * _DIGITS + 1
+STEPS = 1 + 3 * _DIGITS
 """Steps of `depth_order`, see `shares.pieces`."""
 
 
@@ -32,7 +32,7 @@ class Sorting(NamedTuple):
     Args:
         keys, items: keys that sort as depths do, and what they belong to. [N] uint32, [N] int32
         new_keys, new_items: the same after a digit
-        places: where each part of the keys puts those with each value of a digit. [threads, 2048] int64
+        places: where each part of the keys puts those with each value of a digit. [≥ threads, 2048] int64
     """
 
     keys: Array
@@ -46,7 +46,7 @@ def new_sorting(count: int, workers: int) -> Sorting:
     """For so many Gaussians and threads."""
     return Sorting(
         np.empty(count, np.uint32), np.empty(count, np.int32), np.empty(count, np.uint32),
-        np.empty(count, np.int32), np.empty((workers, _BUCKETS), np.int64),
+        np.empty(count, np.int32), np.empty((max(workers, _DIGITS), _BUCKETS), np.int64),
     )  # fmt: skip
 
 
@@ -63,19 +63,17 @@ def _gather_keys(depths: Array, candidates: Array, ids: Array, keys: Array, item
 
 
 @kernel(inline=True)
-def _count_digits(keys: Array, begin: int, end: int, digit: int, places: Array) -> None:
-    """How often each value of a digit occurs; places: out, [BUCKETS]."""
-    shift = np.uint32(digit * _DIGIT)
-    places[:] = 0
+def _count_digits(keys: Array, begin: int, end: int, shift: Number, mask: Number, places: Array) -> None:
+    """How often each value of a digit occurs; places: out, zero on entry."""
     for k in range(begin, end):
-        places[(keys[k] >> shift) & np.uint32(_BUCKETS - 1)] += 1
+        places[keys[k] >> shift & mask] += 1
 
 
 @kernel(inline=True)
 def _place_digits(places: Array) -> None:
     """Turn counts into the places where each part puts its keys, bucket by bucket; in place."""
     total = 0
-    for bucket in range(_BUCKETS):
+    for bucket in range(places.shape[1]):
         for part in range(places.shape[0]):
             here = places[part, bucket]
             places[part, bucket] = total
@@ -84,29 +82,60 @@ def _place_digits(places: Array) -> None:
 
 @kernel(inline=True)
 def _move_digits(
-    keys: Array, items: Array, begin: int, end: int, digit: int, places: Array, new_keys: Array,
-    new_items: Array,
+    keys: Array, items: Array, begin: int, end: int, shift: Number, mask: Number, places: Array,
+    new_keys: Array, new_items: Array,
 ) -> None:  # fmt: skip
     """Put keys and items where `places` says, which is used up."""
-    shift = np.uint32(digit * _DIGIT)
     for k in range(begin, end):
-        bucket = (keys[k] >> shift) & np.uint32(_BUCKETS - 1)
+        bucket = keys[k] >> shift & mask
         at = places[bucket]
         places[bucket] = at + 1
         new_keys[at], new_items[at] = keys[k], items[k]
 
 
 @kernel(inline=True)
+def _rank_digits(
+    keys: Array, items: Array, begin: int, end: int, shift: Number, mask: Number, places: Array, ranks: Array
+) -> None:
+    """As `_move_digits` for the last digit: what an item's place is, is all that is wanted."""
+    for k in range(begin, end):
+        bucket = keys[k] >> shift & mask
+        ranks[items[k]] = places[bucket]
+        places[bucket] += 1
+
+
+@kernel(inline=True)
+def _spread_of(keys: Array, count: int) -> tuple[Number, Number]:
+    """The least key, and how many bits the others are above it."""
+    low, high = keys[0], keys[0]
+    for k in range(count):
+        low, high = min(low, keys[k]), max(high, keys[k])
+    bits = 0
+    while (high - low) >> np.uint32(bits) > 0:
+        bits += 1
+    return low, bits
+
+
+@kernel(inline=True)
 def _sort(sorting: Sorting, count: int, ranks: Array) -> None:
-    """All digits, on one thread."""
+    """On one thread: with digits as small as the keys allow, all of them counted at once."""
     keys, items, new_keys, new_items, places = sorting
-    for digit in range(_DIGITS):
-        _count_digits(keys, 0, count, digit, places[0])
-        _place_digits(places[:1])
-        _move_digits(keys, items, 0, count, digit, places[0], new_keys, new_items)
-        keys, new_keys, items, new_items = new_keys, keys, new_items, items
-    for place in range(count):
-        ranks[items[place]] = place
+    low, bits = _spread_of(keys, count)
+    digit = (bits + _DIGITS - 1) // _DIGITS
+    mask, second, third = np.uint32((1 << digit) - 1), np.uint32(digit), np.uint32(2 * digit)
+    places = places[:_DIGITS, : 1 << digit]
+    places[:] = 0
+    for k in range(count):
+        key = keys[k] - low
+        keys[k] = key
+        places[0, key & mask] += 1
+        places[1, key >> second & mask] += 1
+        places[2, key >> third & mask] += 1
+    for d in range(_DIGITS):
+        _place_digits(places[d : d + 1])
+    _move_digits(keys, items, 0, count, np.uint32(0), mask, places[0], new_keys, new_items)
+    _move_digits(new_keys, new_items, 0, count, second, mask, places[1], keys, items)
+    _rank_digits(keys, items, 0, count, third, mask, places[2], ranks)
 
 
 @kernel()
@@ -132,29 +161,29 @@ def depth_order(
     keys, items, new_keys, new_items, places = sorting
     for _ in pieces(claims, step, seat, 1):
         found[0] = _gather_keys(depths, candidates, ids, keys, items)
-        if found[0] < _WORTH_A_THREAD:
+        if 0 < found[0] < _WORTH_A_THREAD:
             _sort(sorting, found[0], ranks)
     count: int = found[0]
     if count < _WORTH_A_THREAD:
         return count
     parts = min(places.shape[0], 1 + count // _WORTH_A_THREAD)
     size = (count + parts - 1) // parts
+    mask = np.uint32(_BUCKETS - 1)
     for digit in range(_DIGITS):
+        shift = np.uint32(digit * _DIGIT)
         step += 1
         for part in pieces(claims, step, seat, parts):
-            _count_digits(keys, part * size, min(count, (part + 1) * size), digit, places[part])
+            places[part] = 0
+            _count_digits(keys, part * size, min(count, (part + 1) * size), shift, mask, places[part])
         step += 1
         for _ in pieces(claims, step, seat, 1):
             _place_digits(places[:parts])
         step += 1
         for part in pieces(claims, step, seat, parts):
-            _move_digits(
-                keys, items, part * size, min(count, (part + 1) * size), digit, places[part], new_keys,
-                new_items,
-            )  # fmt: skip
+            begin, end = part * size, min(count, (part + 1) * size)
+            if digit + 1 == _DIGITS:
+                _rank_digits(keys, items, begin, end, shift, mask, places[part], ranks)
+            else:
+                _move_digits(keys, items, begin, end, shift, mask, places[part], new_keys, new_items)
         keys, new_keys, items, new_items = new_keys, keys, new_items, items
-    step += 1
-    for part in pieces(claims, step, seat, parts):
-        for place in range(part * size, min(count, (part + 1) * size)):
-            ranks[items[place]] = place
     return count

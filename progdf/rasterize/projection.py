@@ -18,7 +18,7 @@ from progdf.rasterize.conventions import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
 from progdf.rasterize.gathers import gather, gather_vec, rows_at, rows_from, scatter
 from progdf.rasterize.geometry import Vec, dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import WIDTH, choose, prefetch
+from progdf.rasterize.lanes import WIDTH, choose, prefetch_to_write
 from progdf.rasterize.shading import fill_basis, view_direction
 from progdf.rasterize.shares import pieces
 
@@ -110,7 +110,8 @@ def _shape_range(
     for k in range(begin, end, WIDTH):
         i, s = rows_at(ids, k, end), rows_at(ranks, k, end)
         for ahead in range(min(k + WIDTH, end), min(k + 2 * WIDTH, end)):
-            prefetch(splats, ranks[ahead])
+            prefetch_to_write(splats, ranks[ahead])
+            prefetch_to_write(rgb, ranks[ahead])
         seen = footprint(
             lens, gather_vec(means, i), gather(quats, i, 0), gather(quats, i, 1), gather(quats, i, 2),
             gather(quats, i, 3), gather_vec(scales, i),
@@ -141,7 +142,7 @@ def _shape_range(
         scatter(rgb, s, 3, opacity)
 
 
-@kernel(contract=True)
+@kernel(contract=True, allocates=True)
 def _shade_range(
     begin: int, end: int, ids: Array, ranks: Array, means: Array, colors: Array, degree: int, eye: Vec,
     splats: Array, rgb: Array, visible: Array,
@@ -173,7 +174,7 @@ def _shade_range(
         rgb[s, 0], rgb[s, 1], rgb[s, 2] = red, green, blue
 
 
-@kernel()
+@kernel(allocates=True)
 def project(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, window: Array, antialiased: bool,
