@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from progdf.rasterize.atomics import seen
+from progdf.rasterize.crew import HELPERS, make_way
 from progdf.rasterize.jit import kernel
 from progdf.rasterize.order import Sorting, depth_order, new_sorting
-from progdf.rasterize.shares import _ENTERED, Team, _crew, _make_way, _seen, enter, leave, pieces
+from progdf.rasterize.shares import _ENTERED, Team, enter, leave, pieces
 
 Array = NDArray[Any]
 
@@ -22,7 +28,7 @@ def _tick(times: Array, claims: Array) -> None:
     seat = enter(claims)
     for piece in pieces(claims, 0, seat, times.size):
         times[piece] += 1
-    leave(claims)
+    leave(seat, claims)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -32,14 +38,14 @@ def test_every_piece_of_work_is_done_once(workers: int) -> None:
     assert (times == 1).all()
 
 
-@kernel()
+@kernel(allocates=True)
 def _tick_and_add(times: Array, sums: Array, claims: Array) -> None:
     seat = enter(claims)
     for piece in pieces(claims, 0, seat, times.size):
         times[piece] = piece
     for piece in pieces(claims, 1, seat, sums.size):
         sums[piece] = times.sum()
-    leave(claims)
+    leave(seat, claims)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -60,38 +66,90 @@ def test_two_python_threads_may_share_out_work_at_the_same_time() -> None:
     assert all((times == 1).all() for times in done)
 
 
-def test_a_helper_that_comes_too_late_is_not_waited_for() -> None:
-    busy = threading.Event()
-    for _ in range(os.cpu_count() or 1):
-        _crew().put(busy.wait)  # all helpers have something else to do
+def test_a_team_without_helpers_does_all_by_itself() -> None:
+    everyone = Team(1 + HELPERS)  # and stands by
     times = np.zeros(100, np.int64)
     Team(2).share(_tick, times)
-    busy.set()
     assert (times == 1).all()
+    everyone.share(_tick, times)
+    assert (times == 2).all()
 
 
 @kernel()
-def _fail_unless_first(patience: int, claims: Array) -> None:
+def _count_threads(patience: int, found: Array, claims: Array) -> None:
     seat = enter(claims)
-    if seat > 0:
-        raise ValueError("there")
     for _ in range(patience):
-        if _seen(claims, _ENTERED) < 2:
-            _make_way()
-    leave(claims)
+        if seen(claims.ctypes.data + 8 * _ENTERED) > 1:
+            found[seat] = 1
+            break
+        make_way()
+    leave(seat, claims)
 
 
-def test_an_error_in_a_helper_arrives() -> None:
-    Team(1).share(_fail_unless_first, 0)  # is compiled
-    with pytest.raises(ValueError, match="there"):
-        Team(2).share(_fail_unless_first, 10_000_000)
+def _meet(team: Team) -> bool:
+    """Whether a helper comes to a kernel that gives it the time to."""
+    found = np.zeros(2 + HELPERS, np.int64)
+    team.share(_count_threads, 100_000, found)
+    return bool(found[1:].any())
 
 
-def test_helpers_that_were_called_for_nothing_give_up() -> None:
-    Team(2).call(3)  # as where a scene is refused between two launches
+def test_helpers_come() -> None:
+    assert _soon(lambda: _meet(Team(2)))
+    team = Team(2, launches=3)
+    assert all([_meet(team), _meet(team), _meet(team)])
+
+
+def test_helpers_that_were_called_for_nothing_give_up_and_belong_to_who_calls_next() -> None:
+    forgotten = Team(1 + HELPERS, launches=3)  # as where a scene is refused between two launches
+    time.sleep(0.2)
+    team = Team(2, launches=2)
+    assert _soon(lambda: _meet(Team(2))) or _meet(team)
     times = np.zeros(100, np.int64)
-    Team(2).share(_tick, times)
+    forgotten.share(_tick, times)
     assert (times == 1).all()
+    assert _meet(team) or _soon(lambda: _meet(Team(2)))
+
+
+def _soon(holds: Callable[[], bool]) -> bool:
+    """Whether something holds within a few tries: a helper may have something else to do for a moment."""
+    return any(holds() or time.sleep(0.05) for _ in range(40))
+
+
+@kernel()
+def _fail_at(failing: int, patience: int, times: Array, claims: Array) -> None:
+    seat = enter(claims)
+    for _ in range(patience):
+        if seen(claims.ctypes.data + 8 * _ENTERED) < 2:
+            make_way()
+    for piece in pieces(claims, 0, seat, times.size):
+        if seat == failing:
+            raise ValueError("there")
+        times[piece] += 1
+    leave(seat, claims)
+
+
+@pytest.mark.parametrize(("failing", "error"), [(0, ValueError), (1, MemoryError)])
+def test_an_error_in_one_thread_ends_all(failing: int, error: type[Exception]) -> None:
+    def fails() -> bool:
+        try:
+            Team(2).share(_fail_at, failing, 100_000, np.zeros(1_000_000, np.int64))
+        except error:
+            return True
+        return False
+
+    assert _soon(fails)
+    assert _soon(lambda: _meet(Team(2)))
+
+
+_ENDS = """
+from progdf.rasterize.shares import Team
+Team(2, launches=2)
+"""
+
+
+def test_python_ends_while_helpers_stand_by() -> None:
+    for _ in range(3):
+        assert subprocess.run([sys.executable, "-c", _ENDS], timeout=60).returncode == 0
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
@@ -107,13 +165,13 @@ def test_a_forked_process_gets_threads_of_its_own() -> None:
     assert status == 0
 
 
-@kernel()
+@kernel(allocates=True)
 def _order(
     depths: Array, candidates: Array, sorting: Sorting, ids: Array, ranks: Array, found: Array, claims: Array
 ) -> None:
     seat = enter(claims)
     depth_order(depths, candidates, sorting, ids, ranks, found, seat, claims, 0)
-    leave(claims)
+    leave(seat, claims)
 
 
 @pytest.mark.parametrize("count", [0, 1000, 200_000])

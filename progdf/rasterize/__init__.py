@@ -33,6 +33,9 @@ ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.c
 """Engine name -> module with `rasterize` and `alpha_weights`, imported when first used."""
 
 
+_engines: dict[str, ModuleType] = {}
+
+
 def rasterize(
     means: Tensor,
     quats: Tensor,
@@ -168,7 +171,9 @@ def alpha_weights(
 def _engine(name: str) -> ModuleType:
     if name not in ENGINES:
         raise ValueError(f"there is no rasteriser '{name}', expected one of {', '.join(ENGINES)}")
-    return importlib.import_module(ENGINES[name])
+    if name not in _engines:
+        _engines[name] = importlib.import_module(ENGINES[name])
+    return _engines[name]
 
 
 def _check_shapes(
@@ -182,21 +187,18 @@ def _check_shapes(
     sh_degree: int | None,
 ) -> None:
     n = means.shape[0] if means.ndim else 0
-    expected = {
-        "means": (means, (n, 3)),
-        "quats": (quats, (n, 4)),
-        "scales": (scales, (n, 3)),
-        "opacities": (opacities, (n,)),
-        "viewmat": (viewmat, (4, 4)),
-        "K": (K, (3, 3)),
-    }
-    for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(
-                f"{name} has shape {list(tensor.shape)}, expected {list(shape)} (N={n} from means)"
-            )
+    tensors = {
+        "means": means, "quats": quats, "scales": scales, "opacities": opacities, "viewmat": viewmat, "K": K
+    }  # fmt: skip
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (4, 4), (3, 3))
+    if tuple(tensor.shape for tensor in tensors.values()) != shapes:
+        for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
+            if tensor.shape != shape:
+                raise ValueError(
+                    f"{name} has shape {list(tensor.shape)}, expected {list(shape)} (N={n} from means)"
+                )
     if sh_degree is None:
-        if tuple(colors.shape) != (n, 3):
+        if colors.shape != (n, 3):
             raise ValueError(f"colors has shape {list(colors.shape)}, expected [{n}, 3] (rgb)")
         return
     if not 0 <= sh_degree <= 3:

@@ -14,7 +14,7 @@ from progdf.rasterize.shares import enter, leave
 Array = NDArray[Any]
 
 
-@kernel(cache=True)
+@kernel(cache=True, allocates=True)
 def backpropagate(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     background: Array, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
@@ -35,4 +35,4 @@ def backpropagate(
         splats, per_splat, sums, wanted, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors,
         grad_camera, seat, claims, 1,
     )  # fmt: skip
-    leave(claims)
+    leave(seat, claims)

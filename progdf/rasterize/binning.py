@@ -123,7 +123,7 @@ def _list_spans(spans: Array, lanes: int, grid: Array, at: int, tiles: Array, co
             base += grid[2]
 
 
-@kernel()
+@kernel(allocates=True)
 def _find_tiles(
     splats: Array, begin: int, stop: int, window: Array, grid: Array, most: int, counts: Array,
     per_splat: Array, tiles: Array,
@@ -143,7 +143,7 @@ def _find_tiles(
         at += here
 
 
-@kernel()
+@kernel(allocates=True)
 def find_tiles(
     splats: Array, window: Array, grid: Array, most: int, counts: Array, per_splat: Array, tiles: Array,
     tile_starts: Array, found: Array, seat: int, claims: Array, step: int,
@@ -193,7 +193,7 @@ def _place_tiles(counts: Array, tile_starts: Array, per_splat: Array) -> None:
         per_splat[s + 1] += per_splat[s]
 
 
-@kernel()
+@kernel(allocates=True)
 def fill_tiles(
     splats: Array, window: Array, grid: Array, places: Array, per_splat: Array, tiles: Array,
     members: Array, slots: Array, seat: int, claims: Array, step: int,

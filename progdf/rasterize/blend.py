@@ -108,7 +108,7 @@ def blend_tile(
             break
 
 
-@kernel()
+@kernel(allocates=True)
 def blend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array,
     background: Array, image: Array, transmittance: Array, last: Array, seat: int,

@@ -135,13 +135,13 @@ def unblend_tile(
         make_cards(members, begin, end, splats, rgb, x, y, bounds, cards)
         for place in range(end - 1, begin - 1, -1):
             card = np.uint64(place - begin) * CARD
-            if wanted[members[place]]:
+            if wanted.size == 0 or wanted[members[place]]:
                 unblend_splat(state, cards, card, np.float32(place), sums, slots[place])
             else:
                 pass_splat(state, cards, card, np.float32(place))
 
 
-@kernel()
+@kernel(allocates=True)
 def unblend(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     background: Array, transmittance: Array, last: Array, grad_image: Array, grad_transmittance: Array,
@@ -153,7 +153,7 @@ def unblend(
         slots: row of `sums` that belongs to each entry of `members`. [I] int64
         grad_image, grad_transmittance: [h,w,3], [h,w] float32
         sums: out, one row per intersection; not set where nobody wants it. [I,9] float32
-        wanted: splats whose gradients are wanted. [V] bool
+        wanted: splats whose gradients are wanted; [0]: all. [V] bool
         seat, claims, step: see `shares.pieces`
     """
     tiles = tile_starts.size - 1

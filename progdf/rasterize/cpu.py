@@ -6,8 +6,7 @@ The picture and the gradients are the same bits in every run and for every numbe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,12 +32,12 @@ MOST_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 
+_ALL = np.empty(0, np.bool_)
 _TILES_WORTH_A_THREAD = 16
 _ROOM = 8  # tiles of a splat that there is room for at once; a scene with more is gone through twice
 
 
-@dataclass(frozen=True)
-class _View:
+class _View(NamedTuple):
     """The camera as the kernels want it."""
 
     viewmat: Array
@@ -46,13 +45,13 @@ class _View:
     size: Array
     window: Array
     grid: Array
+    tiles: int
     near: float
     degree: int
     antialiased: bool
 
 
-@dataclass(frozen=True)
-class _Lists:
+class _Lists(NamedTuple):
     """What a forward pass found out and the backward pass needs; layouts: `projection` and `binning`."""
 
     ids: Array
@@ -65,8 +64,7 @@ class _Lists:
     per_splat: Array
 
 
-@dataclass(frozen=True)
-class _Unplaced:
+class _Unplaced(NamedTuple):
     """Tiles splat by splat, see `binning.find_tiles`; of no use once the lists are filled."""
 
     places: Array
@@ -93,9 +91,10 @@ def rasterize(
     """See `progdf.rasterize.rasterize`."""
     view = _view(viewmat, K, width, height, near, sh_degree, antialiased, crop)
     inputs = [_float32(t) for t in (means, quats, scales, opacities, colors, background)]
-    drawn = _Rasterize.apply(view, grad_rows, *inputs, viewmat, K)  # type: ignore[no-untyped-call]
-    image, transmittance, centres, depths, visible = drawn
-    return image, transmittance, RasterInfo(centres, depths, visible)
+    found: list[Array] = []
+    drawn = _Rasterize.apply(view, grad_rows, found, *inputs, viewmat, K)  # type: ignore[no-untyped-call]
+    image, transmittance = drawn
+    return image, transmittance, RasterInfo(*map(torch.from_numpy, found))
 
 
 def alpha_weights(
@@ -115,7 +114,7 @@ def alpha_weights(
     gaussians.append(np.zeros((len(means), 1, 3), np.float32))
     totals = np.zeros((len(means), weights.SUMS))
     with running("weights", 2) as workers:
-        team = _team(view, workers)
+        team = _team(view, workers, 2)
         lists, unplaced, _ = _list_splats(view, gaussians, team, for_gradients=True)
         team.share(
             list_tiles,
@@ -144,9 +143,8 @@ def _keep_freed_memory() -> None:
 _keep_freed_memory()
 
 
-def _team(view: _View, workers: int) -> Team:
-    tiles = int(view.grid[2] * view.grid[3])
-    return Team(min(workers, 1 + tiles // _TILES_WORTH_A_THREAD))
+def _team(view: _View, workers: int, launches: int) -> Team:
+    return Team(min(workers, 1 + view.tiles // _TILES_WORTH_A_THREAD), launches)
 
 
 def _view(
@@ -162,12 +160,15 @@ def _view(
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     x0, y0, x1, y1 = crop
     column, row = x0 // TILE_W, y0 // TILE_H
+    columns, rows = -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row
+    whole = np.array([width, height, *crop, column, row, columns, rows], np.int64)
     return _View(
         viewmat=np.array(viewmat.tolist()),
         intrinsics=np.array([fx, fy, cx, cy]),
-        size=np.array([width, height], np.int64),
-        window=np.array(crop, np.int64),
-        grid=np.array([column, row, -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row], np.int64),
+        size=whole[:2],
+        window=whole[2:6],
+        grid=whole[6:],
+        tiles=columns * rows,
         near=float(near),
         degree=-1 if sh_degree is None else sh_degree,
         antialiased=antialiased,
@@ -175,6 +176,8 @@ def _view(
 
 
 def _float32(tensor: Tensor) -> Tensor:
+    if tensor.dtype is torch.float32 and tensor.is_cpu and tensor.is_contiguous():
+        return tensor
     return tensor.to("cpu", torch.float32).contiguous()
 
 
@@ -182,7 +185,7 @@ def _list_splats(
     view: _View, gaussians: list[Array], team: Team, for_gradients: bool
 ) -> tuple[_Lists, _Unplaced, list[Array]]:
     """Project and sort, and count the tiles; also the centres, depths and visibility of all Gaussians."""
-    n, tiles = len(gaussians[0]), int(view.grid[2] * view.grid[3])
+    n, tiles = len(gaussians[0]), view.tiles
     centres, depths, candidates = np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_)
     visible = np.zeros(n, np.bool_)
     ids, ranks, per_splat = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n + 1, np.int64)
@@ -210,68 +213,61 @@ def _list_splats(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, view: _View, grad_rows: Tensor | None, *tensors: Tensor) -> tuple[Tensor, ...]:
-        arrays = [tensor.detach().numpy() for tensor in tensors[:6]]
-        *gaussians, background = arrays
+    def forward(
+        ctx: Any, view: _View, grad_rows: Tensor | None, found: list[Array], *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        *gaussians, background = (tensor.numpy(force=True) for tensor in tensors[:6])
         if view.degree < 0:
             gaussians[4] = gaussians[4].reshape(-1, 1, 3)
         x0, y0, x1, y1 = view.window.tolist()
         image = np.empty((y1 - y0, x1 - x0, 3), np.float32)
         transmittance, last = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
         with running("forward", 12) as workers:
-            team = _team(view, workers)
-            team.call(2)
-            lists, unplaced, found = _list_splats(view, gaussians, team, any(ctx.needs_input_grad))
+            team = _team(view, workers, 2)
+            lists, unplaced, found[:] = _list_splats(view, gaussians, team, any(ctx.needs_input_grad))
             team.share(
                 draw,
                 lists.splats, lists.rgb, view.window, view.grid, unplaced.places, lists.per_splat,
                 unplaced.tiles, lists.tile_starts, lists.members, lists.slots, background, image,
                 transmittance, last,
             )  # fmt: skip
-        results = tuple(torch.from_numpy(array) for array in (image, transmittance, *found))
-        ctx.mark_non_differentiable(*results[2:])
         ctx.set_materialize_grads(False)
-        ctx.view, ctx.grad_rows, ctx.lists, ctx.last = view, grad_rows, lists, last
+        ctx.kept = view, grad_rows, gaussians, background, lists, transmittance, last
+        results = torch.from_numpy(image), torch.from_numpy(transmittance)
         ctx.save_for_backward(*tensors, results[1])
         return results
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        view, lists = ctx.view, ctx.lists
-        team = _team(view, threads())
-        team.call()
-        *tensors, saved_transmittance = ctx.saved_tensors
-        *gaussians, background = [tensor.detach().numpy() for tensor in tensors[:6]]
-        shapes = [array.shape for array in gaussians]
-        if view.degree < 0:
-            gaussians[4] = gaussians[4].reshape(-1, 1, 3)
-        transmittance = saved_transmittance.numpy()
+        view, grad_rows, gaussians, background, lists, transmittance, last = ctx.kept
+        team = _team(view, threads(), 1)
+        viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
         grad_image = _array(grads[0], (*transmittance.shape, 3))
         grad_transmittance = _array(grads[1], transmittance.shape)
         sums = np.empty((len(lists.members), SUMS), np.float32)
-        gradients = [np.zeros(array.shape, np.float32) for array in gaussians]
+        gradients = [np.empty(array.shape, np.float32) for array in gaussians]
         means, quats, scales, opacities, colors = gaussians
         by_means, by_quats, by_scales, by_opacities, by_colors = gradients
         grad_camera = np.zeros((PARTS, CAMERA))
-        wanted = _wanted_splats(lists, len(means), ctx.grad_rows)
+        wanted = _wanted_splats(lists, len(means), grad_rows)
         with running("backward", 5):
             team.share(
                 backpropagate,
                 lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members,
-                lists.slots, background, transmittance, ctx.last, grad_image, grad_transmittance,
+                lists.slots, background, transmittance, last, grad_image, grad_transmittance,
                 sums, wanted,
                 lists.ids, lists.ranks, means, quats, scales, opacities, colors, view.degree,
                 view.viewmat, view.intrinsics, view.size, view.antialiased, lists.per_splat,
                 by_means, by_quats, by_scales, by_opacities, by_colors, grad_camera,
             )  # fmt: skip
-        results: list[Tensor | None] = [
-            torch.from_numpy(array.reshape(shape)) for array, shape in zip(gradients, shapes, strict=True)
-        ]
-        needs = ctx.needs_input_grad[7:]
-        results.append(_background_gradient(transmittance, grad_image) if needs[0] else None)
-        results += _camera_gradients(grad_camera, *tensors[6:]) if any(needs[1:]) else (None, None)
-        return None, None, *results
+        if view.degree < 0:
+            gradients[4] = by_colors.reshape(-1, 3)
+        results: list[Tensor | None] = [torch.from_numpy(array) for array in gradients]
+        by_background, by_viewmat, by_K = ctx.needs_input_grad[8:]
+        results.append(_background_gradient(transmittance, grad_image) if by_background else None)
+        results += _camera_gradients(grad_camera, viewmat, K) if by_viewmat or by_K else (None, None)
+        return None, None, None, *results
 
 
 def _array(grad: Tensor | None, shape: tuple[int, ...]) -> Array:
@@ -288,12 +284,12 @@ def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor,
 
 
 def _wanted_splats(lists: _Lists, count: int, grad_rows: Tensor | None) -> Array:
-    """Which splats belong to the rows that want gradients. [V] bool"""
-    wanted = np.ones(len(lists.ids), np.bool_)
-    if grad_rows is not None:
-        rows = np.zeros(count, np.bool_)
-        rows[grad_rows.detach().cpu().numpy()] = True
-        wanted[lists.ranks] = rows[lists.ids]
+    """Which splats belong to the rows that want gradients; [0] where all do. [V] bool"""
+    if grad_rows is None:
+        return _ALL
+    rows, wanted = np.zeros(count, np.bool_), np.empty(len(lists.ids), np.bool_)
+    rows[grad_rows.numpy(force=True)] = True
+    wanted[lists.ranks] = rows[lists.ids]
     return wanted
 
 

@@ -16,7 +16,7 @@ from progdf.rasterize.shares import enter, leave
 Array = NDArray[Any]
 
 
-@kernel(cache=True)
+@kernel(cache=True, allocates=True)
 def list_splats(
     means: Array, quats: Array, scales: Array, opacities: Array, colors: Array, degree: int, viewmat: Array,
     intrinsics: Array, size: Array, window: Array, near: float, antialiased: bool, grid: Array, most: int,
@@ -49,10 +49,10 @@ def list_splats(
         splats[:count], window, grid, most, counts, per_splat[: count + 1], tiles, tile_starts, found, seat,
         claims, step,
     )  # fmt: skip
-    leave(claims)
+    leave(seat, claims)
 
 
-@kernel(cache=True)
+@kernel(cache=True, allocates=True)
 def list_tiles(
     splats: Array, window: Array, grid: Array, places: Array, per_splat: Array, tiles: Array, members: Array,
     slots: Array, claims: Array,
@@ -60,10 +60,10 @@ def list_tiles(
     """`fill_tiles` by itself; claims: as `shares.Team` gives them."""
     seat = enter(claims)
     fill_tiles(splats, window, grid, places, per_splat, tiles, members, slots, seat, claims, 0)
-    leave(claims)
+    leave(seat, claims)
 
 
-@kernel(cache=True)
+@kernel(cache=True, allocates=True)
 def draw(
     splats: Array, rgb: Array, window: Array, grid: Array, places: Array, per_splat: Array, tiles: Array,
     tile_starts: Array, members: Array, slots: Array, background: Array, image: Array, transmittance: Array,
@@ -76,4 +76,4 @@ def draw(
         splats, rgb, window, grid, tile_starts, members, background, image, transmittance, last, seat, claims,
         1,
     )  # fmt: skip
-    leave(claims)
+    leave(seat, claims)

@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -68,6 +68,7 @@ def kernel(
     contract: bool = False,
     cache: bool = False,
     inline: bool = False,
+    allocates: bool = False,
 ) -> Callable[[_F], _F]:
     """Compile a function with numba.
 
@@ -76,6 +77,8 @@ def kernel(
         contract: strict but for fused multiply-adds
         cache: keep the machine code on disk; for functions that Python calls
         inline: always inline into the calling kernel
+        allocates: may make arrays; one that may not leaves out to count who uses the arrays that it gets, for
+            which threads that share them would wait at each call
     """
     flags = FAST if fast else {"contract"} if contract else False
 
@@ -91,6 +94,7 @@ def kernel(
                 nogil=True,
                 error_model="numpy",
                 forceinline=inline,
+                _nrt=allocates,
             )(function)
         finally:
             config.CACHE_DIR = before
@@ -99,17 +103,18 @@ def kernel(
     return decorate
 
 
-@contextmanager
-def running(stage: str, seconds: int) -> Iterator[int]:
+def running(stage: str, seconds: int) -> AbstractContextManager[int]:
     """Tell of kernels that have yet to be compiled, and give the number of threads to use.
 
     Args:
         stage: names the kernels that will run, to tell a cold start from a warm one
         seconds: about how long these take to compile
     """
-    if stage in _ready:
-        yield threads()
-        return
+    return nullcontext(threads()) if stage in _ready else _compiling(stage, seconds)
+
+
+@contextmanager
+def _compiling(stage: str, seconds: int) -> Iterator[int]:
     marker = CACHE / f"{stage}.ready"
     with _lock:
         cold = not marker.exists()

@@ -52,7 +52,7 @@ compiler, they would be at a dozen far addresses, built anew for every row."""
 _VALUES = np.array([ALPHA_MAX, TRANSMITTANCE_MIN, 1.0, WIDTH, *_POLYNOMIAL], np.float32)
 
 
-@kernel(inline=True)
+@kernel(inline=True, allocates=True)
 def new_cards() -> Array:
     """An empty batch of cards, with the constants. float32"""
     cards = np.empty(_CONSTANTS + _VALUES.size, np.float32)

@@ -169,10 +169,18 @@ def _project_backward_range(
 ) -> None:  # fmt: skip
     lens = make_lens(viewmat, intrinsics, size)
     scratch.camera[:] = 0.0
+    # up to the next part's first, with what is not among the candidates
+    first_row = ids[begin] if begin > 0 else 0
+    end_row = ids[end] if end < ids.size else means.shape[0]
+    grad_means[first_row:end_row] = 0.0
+    grad_quats[first_row:end_row] = 0.0
+    grad_scales[first_row:end_row] = 0.0
+    grad_opacities[first_row:end_row] = 0.0
+    grad_colors[first_row:end_row] = 0.0
     count = 0
     for n in range(begin, end):
         s = ranks[n]
-        if wanted[s] and splats[s, R2] >= 0.0 and per_splat[s] < per_splat[s + 1]:
+        if (wanted.size == 0 or wanted[s]) and splats[s, R2] >= 0.0 and per_splat[s] < per_splat[s + 1]:
             scratch.rows[count], scratch.places[count] = ids[n], s
             count += 1
     for k in range(0, count, WIDTH):
@@ -237,7 +245,7 @@ def _project_backward_range(
         camera[k] = total(load(scratch.camera, np.uint64(k * WIDTH)))
 
 
-@kernel()
+@kernel(allocates=True)
 def project_backward(
     ids: Array, ranks: Array, means: Array, quats: Array, scales: Array, opacities: Array, colors: Array,
     degree: int, viewmat: Array, intrinsics: Array, size: Array, antialiased: bool,
@@ -251,18 +259,17 @@ def project_backward(
         splats: nearest first. [V,8] float64
         per_splat: first row of `sums` of each splat. [V+1] int64
         sums: see `blend_backward`. [I,9] float32
-        wanted: splats whose gradients are filled in. [V] bool
-        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32, zero on entry; shapes
-            of inputs
+        wanted: splats whose gradients are filled in; [0]: all. [V] bool
+        grad_means, grad_quats, grad_scales, grad_opacities, grad_colors: out, float32; shapes of inputs
         grad_camera: out, zero on entry. [PARTS, CAMERA] float64
         seat, claims, step: see `shares.pieces`
     """
-    most = (ids.size + PARTS - 1) // PARTS
+    most = max(1, (ids.size + PARTS - 1) // PARTS)
     scratch = _Scratch(
         np.empty(most, np.int64), np.empty(most, np.int64), np.zeros((WIDTH, SUMS + 3)), np.arange(WIDTH),
         np.empty(16), np.zeros((16, 3)), np.empty(CAMERA * WIDTH),
     )  # fmt: skip
-    for part in pieces(claims, step, seat, PARTS):
+    for part in pieces(claims, step, seat, max(1, (ids.size + most - 1) // most)):
         _project_backward_range(
             part * most, min(ids.size, (part + 1) * most), ids, ranks, means, quats, scales, opacities,
             colors, degree, viewmat, intrinsics, size, antialiased, splats, per_splat, sums, wanted,

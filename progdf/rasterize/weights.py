@@ -77,7 +77,7 @@ def add_weights(state: Array, cards: Array, card: Number, out: Array) -> None:
     out[3] += total(pixels)
 
 
-@kernel(cache=True)
+@kernel(cache=True, allocates=True)
 def weigh(
     splats: Array, rgb: Array, window: Array, grid: Array, tile_starts: Array, members: Array, slots: Array,
     mask: Array, sums: Array, claims: Array,
@@ -107,7 +107,7 @@ def weigh(
             for place in range(begin, end):
                 card = np.uint64(place - begin) * CARD
                 add_weights(state, cards, card, sums[slots[place]])
-    leave(claims)
+    leave(seat, claims)
 
 
 @kernel(cache=True)
