@@ -37,7 +37,7 @@ COLUMN = ("line", "width", "out", "gain", "centres")
 number in `out`, the column of `numbers` with its gain, and 1 for the centres."""
 
 
-@kernel(cache=True)
+@kernel(cache=True, allocates=True)
 def compose_rows(
     base: NDArray[np.float32],
     out: NDArray[np.float32],
