@@ -18,7 +18,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 from numpy.typing import NDArray
 
@@ -72,10 +72,14 @@ def _function(
 ) -> None:  # fmt: skip
     """Teach numba a function or an operator for arguments of exactly these types."""
 
-    @infer_global(name)
     class _Template(AbstractTemplate):  # type: ignore[misc]
+        key = name
+
         def generic(self, args: Any, kws: Any) -> Any:
             return signature(result, *args) if args == arguments else None
+
+    # not `infer_global`: it asks functions for their module, which numpy's older ones cannot tell
+    builtin_registry.register_global(name, types.Function(_Template))
 
     @lower_builtin(name, *arguments)  # type: ignore[untyped-decorator]
     def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
