@@ -19,7 +19,7 @@ from progdf.rasterize.shares import pieces
 
 Array = NDArray[Any]
 
-TILE_W, TILE_H = 32, 8
+TILE_W, TILE_H = 64, 8
 """Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorise over."""
 
 _TILE_W, _TILE_H = float(TILE_W), float(TILE_H)

@@ -33,7 +33,7 @@ MOST_INTERSECTIONS = 100_000_000
 
 
 _ALL = np.empty(0, np.bool_)
-_TILES_WORTH_A_THREAD = 16
+_TILES_WORTH_A_THREAD = 8
 _ROOM = 8  # tiles of a splat that there is room for at once; a scene with more is gone through twice
 
 

@@ -30,7 +30,7 @@ _POLYNOMIAL = (
     0.00010902322854050052,
 )  # fmt: skip
 
-BATCH = 16
+BATCH = 32
 """Splats whose cards are made out at once: the pixel loops then branch on numbers that are long known."""
 
 BEGIN, START, STOP, U_PEAK, V, TOP = (np.uint64(TILE_H * plane) for plane in range(6))
