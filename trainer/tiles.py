@@ -8,16 +8,16 @@ are blended in the same order, so picture and gradients are the same bits (tests
 Measured, render + L1 + backward at 256 px, one thread, median over views; error 0 throughout:
 
     region (views)               share of the picture: region, box, tiles   ms: full, box, tiles   full/tiles
-    bear's ears (whole scene)                          .003  .062  .024     19.5   6.8   5.0       3.9
-    robot's hand (whole scene)                         .006  .062  .020     21.0   5.9   5.2       4.0
-    robot's hands (aimed)                              .011  .079  .033     22.7   9.0   6.6       3.5
-    room: lamp (inside)                                .015  .117  .064     20.0   6.3   6.2       3.2
-    room: stool, ball, picture                         .068  .305  .155     21.6  10.5   9.6       2.3
-    bear's scarf (aimed)                               .067  .233  .181     21.8  11.7  11.8       1.8
-    robot (aimed)                                      .125  .254  .194     22.1  12.2  11.9       1.9
-    room: walls (inside)                               .472  .737  .591     25.7  21.8  19.2       1.3
+    bear's ears (whole scene)                          .002  .062  .020      7.3   3.5   1.6       4.5
+    robot's hand (whole scene)                         .003  .062  .019      8.3   3.7   1.9       4.5
+    robot's hands (aimed)                              .009  .078  .031      9.4   3.6   2.7       3.5
+    room: lamp (inside)                                .001  .178  .021      9.2   2.7   2.5       3.8
+    room: stool, ball, picture                         .070  .293  .154      9.6   4.2   3.9       2.5
+    bear's scarf (aimed)                               .102  .176  .162     10.0   4.6   4.9       2.1
+    robot (aimed)                                      .122  .221  .200      9.8   5.0   5.2       1.9
+    room: walls (inside)                               .534  .724  .634     11.5   9.1   8.5       1.3
 
-The box brings most of it; tiles help where a region is small or scattered, and never cost.
+The box brings most of it; tiles help where a region is small or scattered, and cost a twentieth elsewhere.
 """
 
 from __future__ import annotations
