@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -16,8 +16,11 @@ from progdf.region import Region
 from progdf.scenes import DemoScene, bear
 from progdf.sh import rgb_to_sh0
 from progdf.trajectory import FILE_NAME, Trajectory, save_trajectory
+from viewer.state import LayerState, ViewState
+from viewer.turntable import first_camera
 
 NODES = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
+SCARF, EARS = 0, 1  # a change of colour, and one of geometry and colour
 GREEN, GOLD = (0.10, 0.62, 0.24), (0.90, 0.66, 0.15)
 
 
@@ -107,3 +110,10 @@ def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets
     }
     field = BakedField("separable", NODES, attributes, 14, recorded=(0.0, 0.12, 0.31, 0.5, 0.74, 1.0))
     return Gdf(name, Region(name, members, score), field, fingerprint(scene), instruction)
+
+
+def view_of(stack: Stack, scarf: float = 0.0, ears: float = 0.0) -> ViewState:
+    """The bear's head and scarf from the front, its edits at these strengths."""
+    layers = (LayerState(SCARF, "scarf", scarf), LayerState(EARS, "ears", ears))
+    camera = replace(first_camera(stack.scene, stack.demo.cameras), pivot=(0.0, 0.75, 0.2), distance=5.5)
+    return ViewState(camera=camera, layers=layers)

@@ -17,7 +17,7 @@ from progdf.compose import BLENDS, Gains, Layer, compose
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import render
-from tests.stacks import Stack, bear_stack
+from tests.stacks import EARS, SCARF, Stack, bear_stack, view_of
 from viewer import engine as engine_module
 from viewer.editing import GpuEditing
 from viewer.engine import Engine, FrameTimings
@@ -26,10 +26,9 @@ from viewer.gl.screen import read_rgb
 from viewer.headless import headless_context, is_software
 from viewer.paint import encoded
 from viewer.state import LayerState, ViewState
-from viewer.turntable import first_camera, to_camera
+from viewer.turntable import to_camera
 
 SIZE = (96, 72)
-SCARF, EARS = 0, 1  # a change of colour, and one of geometry and colour
 Compare = Callable[[str, np.ndarray], None]
 
 
@@ -59,12 +58,6 @@ def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stac
     made = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
     yield made
     made.release()
-
-
-def view_of(stack: Stack, scarf: float = 0.0, ears: float = 0.0) -> ViewState:
-    layers = (LayerState(SCARF, "scarf", scarf), LayerState(EARS, "ears", ears))
-    camera = replace(first_camera(stack.scene, stack.demo.cameras), pivot=(0.0, 0.75, 0.2), distance=5.5)
-    return ViewState(camera=camera, layers=layers)
 
 
 class Count:
@@ -363,43 +356,6 @@ def test_engines_that_come_and_go_leave_no_gl_error(ctx: moderngl.Context, stack
 
 def test_timings_add_up() -> None:
     assert FrameTimings(1.0, 2.0, 3.0, 4.0).total_ms == 10.0
-
-
-@pytest.fixture(scope="module")
-def software_gpu(ctx: moderngl.Context) -> None:
-    """Goldens hold for one renderer; another differs in the last bits."""
-    if not is_software(ctx):
-        pytest.skip(f"goldens were drawn by llvmpipe, here is {ctx.info['GL_RENDERER']}")
-
-
-@pytest.mark.gl
-@pytest.mark.usefixtures("software_gpu")
-def test_the_goldens_are_compared_on_a_software_renderer(ctx: moderngl.Context) -> None:
-    assert "llvmpipe" in str(ctx.info["GL_RENDERER"])
-
-
-@pytest.mark.gl
-@pytest.mark.usefixtures("software_gpu")
-@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0])
-def test_the_bear_looks_as_it_did(
-    gl_engine: Engine, stack: Stack, screenshot: Compare, strength: float
-) -> None:
-    screenshot(f"scene_bear_{strength:g}", gl_engine.image(view_of(stack, strength, strength), (240, 180)))
-
-
-@pytest.mark.gl
-@pytest.mark.usefixtures("software_gpu")
-def test_a_wrong_golden_is_noticed(
-    gl_engine: Engine, stack: Stack, screenshot: Compare, request: pytest.FixtureRequest
-) -> None:
-    """scene_wrong.png is scene_bear_1.png with one square 4/255 too bright."""
-    if request.config.getoption("--regenerate-screenshots"):
-        image = gl_engine.image(view_of(stack, 1.0, 1.0), (240, 180)).copy()
-        image[60:70, 110:120] = np.clip(image[60:70, 110:120], 0.0, 0.9) + 4.0 / 255.0
-        screenshot("scene_wrong", image)
-        return
-    with pytest.raises(pytest.fail.Exception, match="100 pixels differ by more than 2/255"):
-        screenshot("scene_wrong", gl_engine.image(view_of(stack, 1.0, 1.0), (240, 180)))
 
 
 def test_the_early_stop_is_the_only_rule_that_gl_leaves_out() -> None:

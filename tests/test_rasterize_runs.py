@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -85,6 +86,39 @@ def test_wrong_shapes_and_windows_are_refused_by_name() -> None:
             scene.means, scene.quats[:, :3], scene.scales, scene.opacities, torch.ones(1, 3),
             camera.viewmat, camera.K, 40, 24,
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("shown", [0, 5, 400])
+def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
+    shown: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = random_gaussians(900, seed=3, sh_degree=1)
+    scene.means[:, 2] -= 50.0
+    rows = torch.randperm(900, generator=torch.Generator().manual_seed(1))[:shown]
+    scene.means[rows, 2] += 54.0
+    inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    camera = front_camera()
+    monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, 77, dtype))
+    image, _, info = rasterize(*leaves, camera.viewmat, camera.K, 40, 24, sh_degree=1)
+    image.square().sum().backward()  # type: ignore[no-untyped-call]
+    assert int(info.visible.sum()) <= shown
+    for leaf in leaves:
+        assert leaf.grad is not None
+        assert not leaf.grad[~info.visible].any()
+        assert bool(leaf.grad[info.visible].any()) == (shown > 0)
+
+
+def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
+    one, camera = one_gaussian(), front_camera()
+    means = one.means.clone().requires_grad_()
+    image, _, _ = rasterize(
+        means, one.quats, one.scales, one.opacities, one.sh, camera.viewmat, camera.K, 40, 24, sh_degree=0
+    )
+    with torch.no_grad():
+        means += 1.0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        image.sum().backward()  # type: ignore[no-untyped-call]
 
 
 def test_importing_progdf_does_not_load_the_compiler() -> None:

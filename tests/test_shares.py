@@ -174,11 +174,19 @@ def _order(
     leave(seat, claims)
 
 
-@pytest.mark.parametrize("count", [0, 1000, 200_000])
+@pytest.mark.parametrize("values", ["equal", "many", "of all sizes"])
+@pytest.mark.parametrize("count", [0, 1, 1000, 200_000])
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_depth_order_is_numpys_stable_sort_for_every_number_of_threads(workers: int, count: int) -> None:
+def test_depth_order_is_numpys_stable_sort_for_every_number_of_threads(
+    workers: int, count: int, values: str
+) -> None:
     rng = np.random.default_rng(0)
-    depths = rng.choice(np.linspace(0.02, 90.0, 5000).astype(np.float32), count)
+    kinds = {
+        "equal": [3.0],
+        "many": np.linspace(0.02, 90.0, 5000),
+        "of all sizes": np.geomspace(1e-38, 3e38, 999),
+    }
+    depths = rng.choice(np.asarray(kinds[values], np.float32), count)
     candidates = rng.random(count) < 0.9
     ids, ranks, found = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(1, np.int64)
     Team(workers).share(_order, depths, candidates, new_sorting(count, workers), ids, ranks, found)

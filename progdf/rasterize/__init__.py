@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
+from functools import cache
 from types import ModuleType
 
 import torch
@@ -31,9 +32,6 @@ Crop = tuple[int, int, int, int]
 
 ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu"}
 """Engine name -> module with `rasterize` and `alpha_weights`, imported when first used."""
-
-
-_engines: dict[str, ModuleType] = {}
 
 
 def rasterize(
@@ -168,12 +166,11 @@ def alpha_weights(
     return weights
 
 
+@cache
 def _engine(name: str) -> ModuleType:
     if name not in ENGINES:
         raise ValueError(f"there is no rasteriser '{name}', expected one of {', '.join(ENGINES)}")
-    if name not in _engines:
-        _engines[name] = importlib.import_module(ENGINES[name])
-    return _engines[name]
+    return importlib.import_module(ENGINES[name])
 
 
 def _check_shapes(
@@ -187,16 +184,19 @@ def _check_shapes(
     sh_degree: int | None,
 ) -> None:
     n = means.shape[0] if means.ndim else 0
-    tensors = {
-        "means": means, "quats": quats, "scales": scales, "opacities": opacities, "viewmat": viewmat, "K": K
-    }  # fmt: skip
-    shapes = ((n, 3), (n, 4), (n, 3), (n,), (4, 4), (3, 3))
-    if tuple(tensor.shape for tensor in tensors.values()) != shapes:
-        for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
-            if tensor.shape != shape:
-                raise ValueError(
-                    f"{name} has shape {list(tensor.shape)}, expected {list(shape)} (N={n} from means)"
-                )
+    expected = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "viewmat": (viewmat, (4, 4)),
+        "K": (K, (3, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tensor.shape != shape:
+            raise ValueError(
+                f"{name} has shape {list(tensor.shape)}, expected {list(shape)} (N={n} from means)"
+            )
     if sh_degree is None:
         if colors.shape != (n, 3):
             raise ValueError(f"colors has shape {list(colors.shape)}, expected [{n}, 3] (rgb)")
