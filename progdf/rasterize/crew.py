@@ -38,7 +38,9 @@ _RECORD = 16  # int64 numbers from one record to the next: two cache lines
 _IDLE, _READY, _LOADING, _CALLED, _BUSY, _STARTING = range(6)
 _PHASES = 8  # a state is a phase + _PHASES · engagements
 
-_LOOKS = 64  # at a number, before a thread lets others have its processor for a moment
+LOOKS = 64
+"""At a number that another thread will change, before one lets others have its processor for a moment."""
+
 _PATIENCE = 2000  # such moments until a helper that is not called goes to sleep: a millisecond or so
 
 
@@ -86,9 +88,9 @@ def _help(record: int) -> None:
                 put(record + _STATE, engaged + _READY)
                 looks = 0
             looks += 1
-            if looks % _LOOKS == 0:
+            if looks % LOOKS == 0:
                 make_way()
-            if looks > _LOOKS * _PATIENCE:
+            if looks > LOOKS * _PATIENCE:
                 change(record + _STATE, engaged + _READY, engaged + _IDLE)
 
 
@@ -131,7 +133,7 @@ def call_back(record: int, ready: int, dismissed: bool) -> None:
     looks = 0
     while seen(record + _STATE) == engaged + _BUSY:
         looks += 1
-        if looks % _LOOKS == 0:
+        if looks % LOOKS == 0:
             make_way()
     if dismissed:
         change(record + _STATE, ready, engaged + _IDLE)

@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from progdf.rasterize.atomics import add, put, seen
-from progdf.rasterize.crew import ENTRY, HELPERS, call, call_back, engage, make_way
+from progdf.rasterize.crew import ENTRY, HELPERS, LOOKS, call, call_back, engage, make_way
 from progdf.rasterize.jit import Number, kernel
 
 Array = NDArray[Any]
@@ -31,7 +31,6 @@ _COUNTERS = 2  # of a step
 _CONTEXT = 4 + _COUNTERS * _STEPS  # what the kernel's arguments are to the machine
 _ENGAGED = _CONTEXT + 1024  # the helpers, as `crew.engage` gives them
 _FROM_THE_BACK = 1 << 32  # what a piece from the back adds to those taken; one from the front adds 1
-_LOOKS = 64  # at a counter, before a thread lets others have its processor for a moment
 
 
 class Team:
@@ -163,7 +162,7 @@ def pieces(claims: Array, step: int, seat: int, count: int) -> Iterator[Number]:
     looks = 0
     while seen(done) < count:
         looks += 1
-        if looks % _LOOKS == 0:
+        if looks % LOOKS == 0:
             make_way()
             if seen(failed):
                 raise MemoryError("another thread of the rasteriser found no memory")
