@@ -129,7 +129,8 @@ def _header_lines(name: str, file: BinaryIO) -> list[str]:
 
 def _parse(name: str, lines: list[str], length: int, size: int) -> PlyHeader:
     form = ""
-    elements: list[Element] = []
+    tables: dict[str, tuple[int, dict[str, Property]]] = {}
+    columns: dict[str, Property] = {}
     for line in lines[1:]:
         words = line.split()
         match words:
@@ -138,32 +139,32 @@ def _parse(name: str, lines: list[str], length: int, size: int) -> PlyHeader:
             case ["format", kind, "1.0"] if kind in BYTE_ORDERS and not form:
                 form = kind
             case ["element", table, count] if count.isascii() and count.isdigit() and len(count) < 20:
-                elements.append(Element(table, int(count), ()))
-            case ["property", "list", counts, kind, column] if elements and counts in TYPES and kind in TYPES:
-                _add(name, elements, Property(column, TYPES[kind], TYPES[counts]))
-            case ["property", kind, column] if elements and kind in TYPES:
-                _add(name, elements, Property(column, TYPES[kind]))
+                if table in tables:
+                    raise ProgdfError(f"{name} has the element '{table}' twice; export it again")
+                columns = {}
+                tables[table] = int(count), columns
+            case ["property", "list", counts, kind, column] if tables and counts in TYPES and kind in TYPES:
+                _add(name, columns, Property(column, TYPES[kind], TYPES[counts]))
+            case ["property", kind, column] if tables and kind in TYPES:
+                _add(name, columns, Property(column, TYPES[kind]))
             case _:
                 raise ProgdfError(
                     f"{name} has a header line no .ply may have: {line[:60]!r}; export it again"
                 )
     if not form:
         raise ProgdfError(f"{name} does not name its format; its second line should be 'format … 1.0'")
-    twice = next((e.name for i, e in enumerate(elements) if e.name in [o.name for o in elements[:i]]), None)
-    if twice:
-        raise ProgdfError(f"{name} has the element '{twice}' twice; export it again")
-    header = PlyHeader(form, tuple(elements), length, size)
+    elements = tuple(Element(table, count, tuple(found.values())) for table, (count, found) in tables.items())
+    header = PlyHeader(form, elements, length, size)
     _check_counts(name, header)
     return header
 
 
-def _add(name: str, elements: list[Element], column: Property) -> None:
-    last = elements[-1]
-    if column.name in last.names:
+def _add(name: str, columns: dict[str, Property], column: Property) -> None:
+    if column.name in columns:
         raise ProgdfError(f"{name} has the property '{column.name}' twice; export it again")
     if column.count_type and column.count_type[0] == "f":
         raise ProgdfError(f"{name} counts the list '{column.name}' in fractions; export it again")
-    elements[-1] = Element(last.name, last.count, (*last.properties, column))
+    columns[column.name] = column
 
 
 def _check_counts(name: str, header: PlyHeader) -> None:

@@ -22,6 +22,12 @@ Store = Callable[[int, Floats, dict[str, int]], None]
 BLOCK_ROWS = 4096
 """1 MB of SH3 rows: read, cast and taken apart while it is in the second-level cache."""
 
+_LONGEST_NUMBER = 400
+"""Characters of an ascii number: %f writes the largest double in 309 digits and a few decimals."""
+
+_MOST_LISTS = 1_000_000
+"""Values of list rows before the vertices that are stepped over, one by one, in about a second."""
+
 
 def read_blocks(
     path: str | os.PathLike[str],
@@ -74,6 +80,11 @@ def _skip(name: str, file: BinaryIO, header: PlyHeader, element: Element) -> Non
             raise _cut_short(name, element)
     elif not element.has_lists:
         file.seek(element.count * element.least_row_bytes, os.SEEK_CUR)
+    elif element.count * len(element.properties) > _MOST_LISTS:
+        raise ProgdfError(
+            f"{name} has {element.count} rows of lists, '{element.name}', before its vertices; "
+            "export it with the vertices first"
+        )
     else:
         lists = [(np.dtype(header.byte_order + (c.count_type or c.type)), c) for c in element.properties]
         for _ in range(element.count):
@@ -151,11 +162,12 @@ def _cast(rows: npt.NDArray[np.void], block: Floats, wanted: tuple[str, ...]) ->
 def _read_ascii(name: str, file: BinaryIO, element: Element, wanted: tuple[str, ...], store: Store) -> None:
     where = {column: i for i, column in enumerate(wanted)}
     places = [element.names.index(column) for column in wanted]
+    longest = (_LONGEST_NUMBER + 2) * len(element.properties)
     for first in range(0, element.count, BLOCK_ROWS):
         rows = min(BLOCK_ROWS, element.count - first)
-        words = [line.split() for line in itertools.islice(file, rows)]
+        words = [file.readline(longest).split() for _ in range(rows)]
         for i in range(rows):
-            found = len(words[i]) if i < len(words) else 0
+            found = len(words[i])
             if found != len(element.properties):
                 raise ProgdfError(
                     f"{name} has {found} numbers in row {first + i}, its header names "

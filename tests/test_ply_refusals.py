@@ -150,6 +150,35 @@ def test_words_between_the_numbers_are_refused(tmp_path: Path) -> None:
     assert "no number" in refusal(load_ply, path)
 
 
+def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of(0)), text=True)
+    lines = path.read_bytes().split(b"\n")
+    lines[-3] = lines[-3].replace(b" ", b" " + b"1" * 400_000, 1)
+    path.write_bytes(b"\n".join(lines))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "numbers in row" in refusal(load_ply, path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_millions_of_lists_before_the_vertices_are_refused_and_not_stepped_over(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(path, scene_of())
+    head, body = path.read_bytes().split(b"element vertex", 1)
+    columns, rows = body.split(b"end_header\n", 1)
+    face = b"element face 2000000\nproperty list uchar uchar corners\nelement vertex"
+    path.write_bytes(head + face + columns + b"end_header\n" + b"\0" * 2_000_000 + rows)
+    assert "vertices first" in refusal(load_ply, path)
+
+
+def test_a_header_is_looked_through_once(tmp_path: Path) -> None:
+    """A million bytes of elements or properties: compared with one another, they would take minutes."""
+    path = tmp_path / "scene.ply"
+    for what in (b"element a%d 0\n", b"property float a%d\n"):
+        lines = b"".join(what % i for i in range(20_000))
+        path.write_bytes(b"ply\nformat ascii 1.0\nelement b 0\n" + lines + b"end_header\n")
+        assert "no element 'vertex'" in refusal(load_ply, path)
+
+
 def base_bytes() -> bytes:
     buffer = io.BytesIO()
     columns = with_extra("label", "u1", 5)(table_of(scene_of(1, count=8)))
