@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 import re
-import tokenize
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -23,8 +22,8 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.files import open_failure
 from progdf.gaussians import Gaussians
+from progdf.npy import open_npy
 from progdf.region import (
     Region,
     everything,
@@ -38,9 +37,6 @@ from progdf.region import (
 
 Kind = Callable[[str, Gaussians], Region]
 """Makes a region from what stands behind `KIND:`."""
-
-_DAMAGED = (ValueError, EOFError, TypeError, OverflowError, SyntaxError, tokenize.TokenError)
-"""What numpy raises for a .npy file with a damaged header, which it reads as a Python literal."""
 
 _NOTHING: Mapping[str, Kind] = {}
 
@@ -89,15 +85,7 @@ def read_labels(path: str, count: int) -> Tensor:
     Raises:
         ProgdfError: no such file, no .npy, not integers, or not one per Gaussian.
     """
-    try:
-        # mapped, not read: a header that claims more than the file holds allocates nothing
-        labels = np.lib.format.open_memmap(path, mode="r")
-    except OSError as error:
-        raise open_failure(path, error) from None
-    except _DAMAGED:
-        raise ProgdfError(
-            f"{path} is not a readable .npy file of labels; save them with numpy.save as integers"
-        ) from None
+    labels = open_npy(path, "labels, which are integers")
     if labels.dtype.kind not in "iub":
         raise ProgdfError(f"{path} holds {labels.dtype} numbers; integer labels would be right")
     if labels.shape not in ((count,), (count, 1)):

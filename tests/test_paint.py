@@ -14,6 +14,7 @@ from imgui_bundle import imgui
 from progdf.camera import Camera
 from progdf.compose import Layer, compose
 from progdf.errors import ProgdfError
+from tests.hostile import NPY_HEADERS, npy
 from tests.ui_rig import Rig, bear, first_view, rig
 from viewer import paint
 from viewer.layer_arguments import stack_of
@@ -260,9 +261,15 @@ def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) 
     for text, told in (
         ("scarf", "NAME=WEIGHTS.npy"),
         (f"hat={tmp_path / 'scene.npy'}", "no edit of that name"),
-        (f"scarf={tmp_path / 'none.npy'}", "save weights with numpy.save"),
+        (f"scarf={tmp_path / 'none.npy'}", "none.npy does not exist"),
         (f"scarf={tmp_path / 'long.npy'}", "would be right"),
         (f"scarf={tmp_path / 'large.npy'}", "outside 0 to 1"),
     ):
         with pytest.raises(ProgdfError, match=told):
             stack_of(bear().gdfs, [], paint=[text])
+
+
+def test_a_hostile_header_of_weights_is_one_line(tmp_path: Path) -> None:
+    npy(tmp_path / "deep.npy", NPY_HEADERS["a deep literal"])
+    with pytest.raises(ProgdfError, match=r"--paint: .* is not a readable \.npy file of weights"):
+        stack_of(bear().gdfs, [], paint=[f"scarf={tmp_path / 'deep.npy'}"])

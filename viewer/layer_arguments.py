@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from progdf.checkpoint import Gdf
 from progdf.errors import ProgdfError
+from progdf.npy import open_npy
 
 from . import stack
 from .arguments import known_edit, layers_of
@@ -60,18 +61,15 @@ def stack_of(
 def _weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
     """Weights of the members, from a file that has them or those of the whole scene. [M]"""
     try:
-        found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError):
-        raise ProgdfError(
-            f"--paint: {path} is no .npy file of numbers; save weights with numpy.save"
-        ) from None
+        found = open_npy(path, "weights")
+    except ProgdfError as error:
+        raise ProgdfError(f"--paint: {error}") from None
     members, count = gdf.region.members.numpy(), gdf.scene.count
-    if not isinstance(found, np.ndarray) or found.shape not in ((len(members),), (count,)):
-        shape = list(getattr(found, "shape", ()))
+    if found.shape not in ((len(members),), (count,)):
         raise ProgdfError(
-            f"--paint: {path} has the shape {shape}; [{len(members)}] or [{count}] would be right"
+            f"--paint: {path} has the shape {list(found.shape)}; [{len(members)}] or [{count}] would be right"
         )
-    if found.dtype.kind not in "fiub" or not ((found >= 0) & (found <= 1)).all():
+    if not ((found >= 0) & (found <= 1)).all():
         raise ProgdfError(f"--paint: {path} has a number outside 0 to 1")
     weights: NDArray[np.float32] = (found if len(found) == len(members) else found[members]).astype(
         np.float32

@@ -1,0 +1,26 @@
+"""Files that somebody made to do harm, or that a disk has damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def npy(path: Path, header: bytes, magic: bytes = b"\x93NUMPY\x01\x00") -> Path:
+    """A .npy file with this header, and 64 bytes of numbers."""
+    path.write_bytes(magic + len(header).to_bytes(2, "little") + header + b"\0" * 64)
+    return path
+
+
+NPY_HEADERS = {
+    "pickled objects": b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n",
+    "more than the file has": b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000,), }\n",
+    "more than memory has": b"{'descr': '<f8', 'fortran_order': False, 'shape': (%d,), }\n" % 10**30,
+    "a negative side": b"{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }\n",
+    "an unfinished literal": b"{'descr': '<f8', 'fortran_order': (\n",
+    "no literal": b"\xff\xfe = 3 ?\n",
+    "a deep literal": b"(" * 9000 + b"\n",
+    "deep signs": b"-" * 9000 + b"1\n",
+    "another type": b"{'descr': {}, 'fortran_order': False, 'shape': (1,), }\n",
+    "text": b"{'descr': '<U4', 'fortran_order': False, 'shape': (1,), }\n",
+    "a shape of text": b"{'descr': '<f8', 'fortran_order': False, 'shape': ('a',), }\n",
+}
