@@ -167,7 +167,7 @@ assert memory.peak() == memory.by_stage["large"], memory.by_stage
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a peak cannot be forgotten")
 def test_every_stage_has_its_own_peak_of_memory() -> None:
     # a process of its own: what other tests have freed may stay with this one and be used again
-    subprocess.run([sys.executable, "-c", OWN_PEAKS], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", OWN_PEAKS], check=True, timeout=600)
 
 
 def test_a_resumed_run_remembers_the_peaks_of_its_first_session() -> None:

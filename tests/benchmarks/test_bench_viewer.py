@@ -170,7 +170,7 @@ def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path
         pytest.skip("Xvfb and xdotool are not installed")
     save_ply(tmp_path / "bear.ply", bear(600).gaussians)
     start = bench_frames.started(tmp_path / "bear.ply", "gl", times=1, size=SIZE)
-    assert 0.0 < start.imports_s < start.first_s < 300.0
+    assert 0.0 < start.imports_s < start.first_s
     assert start.memory_mb > 50.0
 
 
