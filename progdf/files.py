@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
+import re
+import shutil
+import sys
 import tempfile
+import time
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from progdf.errors import ProgdfError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
+_TEMPORARY = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9})-\w{8}(\..*)?", re.DOTALL)
+_A_DAY = 86400.0
 
 
 @contextmanager
@@ -21,6 +31,9 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         with written_whole("scene.ply") as beside:
             beside.write_bytes(…)
 
+    A link stays and the file it leads to is replaced. A pipe or a device gets the bytes when all are there.
+    What processes that were killed have left in the folder goes too.
+
     Raises:
         ProgdfError: the folder does not exist or cannot be written to, the disk is full, or `path` is a
             folder.
@@ -28,11 +41,20 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     if target.is_dir():
         raise ProgdfError(f"{target} is a folder; give the name of a file in it")
+    if target.exists() and not target.is_file():
+        with _copied_into(target) as beside:
+            yield beside
+        return
+    if target.is_symlink():
+        target = Path(os.path.realpath(target))
     if not target.parent.is_dir():
         raise ProgdfError(f"the folder {target.parent} does not exist; make it first")
+    remove_abandoned(target.parent)
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
     try:
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
+        handle, name = tempfile.mkstemp(
+            dir=target.parent, prefix=f".progdf-{_HOST}-{os.getpid()}-", suffix=target.suffix
+        )
     except OSError as error:
         raise unwritable(target, error) from error
     os.close(handle)
@@ -48,6 +70,48 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise unwritable(target, full) from full
     finally:
         beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def _copied_into(target: Path) -> Iterator[Path]:
+    """A temporary file whose bytes go into a pipe or a device in the end."""
+    with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
+        whole = Path(folder) / f"whole{target.suffix}"
+        whole.touch()
+        yield whole
+        with whole.open("rb") as source, target.open("wb") as sink:
+            shutil.copyfileobj(source, sink)
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file's name is one that `written_whole` gives while it writes."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove the temporary files in a folder whose process was killed; of other machines, those a day old."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            found = _TEMPORARY.fullmatch(entry.name)
+            if found is None or not entry.is_file(follow_symlinks=False):
+                continue
+            with suppress(OSError):
+                if found["host"] == _HOST and sys.platform != "win32":
+                    abandoned = not _is_running(int(found["process"]))
+                else:
+                    abandoned = time.time() - entry.stat(follow_symlinks=False).st_mtime > _A_DAY
+                if abandoned:
+                    os.unlink(entry.path)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        pass
+    return True
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from progdf.errors import ProgdfError
-from progdf.files import written_whole
+from progdf.files import is_temporary, written_whole
 from tests.full_disk import files_up_to
 
 
@@ -95,3 +98,71 @@ def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
     with pytest.raises(ProgdfError) as told, written_whole(path):
         pass
     assert str(told.value).startswith(f"{path} cannot be written (Permission denied); ")
+
+
+def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for name in ("old", "new"):  # the second leads to nothing yet
+        real, link = tmp_path / "there" / f"{name}.txt", tmp_path / f"{name}.txt"
+        link.symlink_to(Path("there") / real.name)
+        if name == "old":
+            real.write_text("old")
+        with written_whole(link) as beside:
+            beside.write_text("whole")
+        assert link.is_symlink()
+        assert real.read_text() == "whole"
+    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["new.txt", "old.txt"]
+
+
+def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.png"
+    os.mkfifo(pipe)
+    handle = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with written_whole(pipe) as beside:
+            beside.write_text("half")
+            beside.write_text("whole")
+        assert os.read(handle, 100) == b"whole"
+    finally:
+        os.close(handle)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+KILLED = """
+import os, signal, sys
+from progdf.files import is_temporary, written_whole
+with written_whole(sys.argv[1]) as beside:
+    beside.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
+    left = list(tmp_path.iterdir())
+    assert len(left) == 1
+    assert is_temporary(left[0].name)
+    own = [tmp_path / name for name in (".out.abcdefgh.txt", ".progdf", ".progdf-notes.txt", "x.progdf-1")]
+    for mine in own:
+        mine.write_text("mine")
+    elsewhere = tmp_path / ".progdf-00000000-1-abcdefgh.txt"  # another machine's, which may be at work
+    elsewhere.write_text("half")
+    with written_whole(tmp_path / "a.txt") as running:
+        with written_whole(path) as beside:
+            beside.write_text("whole")
+        assert running.exists(), "a process that runs keeps what it writes"
+        running.write_text("whole")
+    os.utime(elsewhere, (0, 0))
+    assert sorted(tmp_path.iterdir()) == sorted([*own, elsewhere, path, tmp_path / "a.txt"])
+    with written_whole(path) as beside:
+        beside.write_text("whole")
+    assert not elsewhere.exists(), "it has not been written to for a day"
+
+
+def test_a_name_as_long_as_names_can_be_is_written(tmp_path: Path) -> None:
+    path = tmp_path / ("n" * 251 + ".txt")
+    with written_whole(path) as beside:
+        beside.write_text("whole")
+    assert path.read_text() == "whole"

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from progdf.errors import ProgdfError
 from tests.trained import course, small
 from trainer.descent import PgsState
 from trainer.pgs import optimise
@@ -71,3 +72,16 @@ def test_saving_waits_until_it_is_a_hundredth_of_the_time(
         now += 0.1
         kept.step_done()
     assert 0.5 * 0.01 < kept.seconds / now < 1.01 * 0.01
+
+
+def test_a_state_folder_that_is_a_link_is_refused_and_nothing_behind_it_is_touched(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    (own / "run.json").parent.mkdir()
+    (own / "run.json").write_text("mine")
+    (own / "pictures").mkdir()
+    folder = StateFolder(tmp_path / "state")
+    folder.path.symlink_to(own)
+    with pytest.raises(ProgdfError, match="is a link"):
+        folder.begin({})
+    folder.end()
+    assert sorted(path.name for path in own.iterdir()) == ["pictures", "run.json"]

@@ -49,6 +49,13 @@ def test_view_names_are_distinct_and_can_be_file_names() -> None:
     assert not any("/" in name or name.startswith(".") for name in found)
 
 
+def test_a_name_too_long_for_a_file_is_cut() -> None:
+    camera = small().views[0].camera
+    first, second = (c.name for c in named([replace(camera, name="\U00020000" * 300)] * 2))
+    assert len(f"{first}.png".encode()) < 250
+    assert second == "view_001"
+
+
 def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: Path) -> None:
     case = small()
     lens = Lens(k1=2.5)

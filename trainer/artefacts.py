@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,14 +22,14 @@ from typing import Any
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.files import written_whole
+from progdf.files import is_temporary, remove_abandoned, written_whole
 from progdf.pictures import write_image
 from progdf.trajectory import FILE_NAME
+from trainer.picture_list import add_pictures, remove_pictures_but_of
 from trainer.pictures import read_picture
 from trainer.state import StateFolder
 
 _SIGNATURE = "progdf train"
-_LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}\.(gdf|json|png|safetensors|txt)")  # of `written_whole`, killed
 
 
 @dataclass(frozen=True)
@@ -78,9 +77,19 @@ class RunFolder:
         """The edit."""
         return self.root / f"{name}.gdf"
 
+    @property
+    def views(self) -> Path:
+        """Pictures of the views, a folder a kind, and the list of those that the run has written."""
+        return self.root / "views"
+
+    @property
+    def painted(self) -> Path:
+        """What a learned editor painted, with a list of its own."""
+        return self.views / "painted"
+
     def view(self, kind: str, name: str, strength: float = 1.0) -> Path:
         """A view's picture; `kind` is original, edited, mask or final."""
-        folder = self.root / "views" / kind
+        folder = self.views / kind
         return (folder if strength == 1.0 else folder / f"{strength:g}") / f"{name}.png"
 
 
@@ -98,7 +107,7 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
         raise ProgdfError(f"{root} is a file; give --out a folder")
     folder = RunFolder(root)
     if root.is_dir() and not all(
-        _LEFTOVER.fullmatch(entry.name) or entry == folder.segmented for entry in root.iterdir()
+        is_temporary(entry.name) or entry == folder.segmented for entry in root.iterdir()
     ):
         first = (
             folder.log.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0]
@@ -157,15 +166,16 @@ def locked(folder: RunFolder) -> Iterator[None]:
 
 def remove_leftovers(folder: RunFolder) -> None:
     """Delete what a run that was killed was just about to write."""
-    for path in folder.root.rglob(".*"):
-        if _LEFTOVER.fullmatch(path.name):
-            path.unlink(missing_ok=True)
+    for place, _, _ in os.walk(folder.root):
+        remove_abandoned(Path(place))
 
 
 def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
     """One PNG per view. Pictures by view name, [H,W,3] or [H,W]."""
-    for name, image in pictures.items():
-        write_image(folder.view(kind, name, strength), image)
+    paths = [folder.view(kind, name, strength) for name in pictures]
+    for path, image in zip(paths, pictures.values(), strict=True):
+        write_image(path, image)
+    add_pictures(folder.views, paths)
 
 
 def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: float = 1.0) -> list[Tensor]:
@@ -187,11 +197,8 @@ def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: flo
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
     """Delete pictures of views that an earlier run of the same edit had and this one has not."""
-    kept = set(names)
-    for path in (folder.root / "views").glob("*/**/*.png"):
-        if path.stem not in kept:
-            path.unlink()
-            path.with_suffix(".json").unlink(missing_ok=True)
+    for place in (folder.views, folder.painted):
+        remove_pictures_but_of(place, set(names))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -86,7 +86,7 @@ def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
         options.edit_size,
         options.stages > 1,
         options.confine,
-        folder.root / "views" / "painted",
+        folder.painted,
     )
 
 

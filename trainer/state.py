@@ -92,7 +92,13 @@ class StateFolder:
         return content
 
     def begin(self, identity: Mapping[str, Any]) -> None:
-        """Drop what is saved and start anew as the run that `identity`, JSON values, describes."""
+        """Drop what is saved and start anew as the run that `identity`, JSON values, describes.
+
+        Raises:
+            ProgdfError: the folder is a link, behind which nothing of the run's can be.
+        """
+        if self.path.is_symlink():
+            raise ProgdfError(f"{self.path} is a link, and nothing behind it is touched; remove the link")
         self.clear()
         self.path.mkdir(exist_ok=True)
         with written_whole(self._run) as beside:
@@ -132,10 +138,12 @@ class StateFolder:
             raise self._damaged(path, error) from error
 
     def clear(self) -> None:
-        """Remove everything, run.json first: a rest of it is no run."""
+        """Remove everything, run.json first: a rest of it is no run. Nothing behind a link is touched."""
+        if self.path.is_symlink():
+            return
         self._run.unlink(missing_ok=True)
         for entry in self.path.iterdir() if self.path.is_dir() else ():
-            if entry.is_dir():
+            if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry, ignore_errors=True)
             else:
                 entry.unlink(missing_ok=True)
@@ -143,7 +151,7 @@ class StateFolder:
     def end(self) -> None:
         """The run is finished: remove the folder."""
         self.clear()
-        shutil.rmtree(self.path, ignore_errors=True)
+        shutil.rmtree(self.path, ignore_errors=True)  # not if it is a link
 
     def _damaged(self, path: Path, reason: object) -> ProgdfError:
         return ProgdfError(f"{path} is damaged ({reason}); delete {self.path} and train again")

@@ -18,6 +18,7 @@ from progdf.sh import shade
 
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
+_LONGEST_NAME = 60  # characters, of four bytes at most: file systems take 255 bytes with what comes after
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
 
 
@@ -176,6 +177,7 @@ def named(cameras: Sequence[Camera]) -> list[Camera]:
     for i, camera in enumerate(cameras):
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name.rsplit("/", 1)[-1])
         name = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg")) else name
+        name = name[:_LONGEST_NAME]
         if not name.strip("._") or name in taken:
             name = f"view_{i:03d}"
         taken.add(name)

@@ -22,6 +22,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.pictures import to_picture, write_image
+from trainer.picture_list import add_pictures
 from trainer.pictures import read_picture
 
 Recipe = Mapping[str, str | int | float | None]
@@ -73,6 +74,8 @@ class KeptPictures:
         write_image(path, painted)
         with written_whole(note) as beside:
             beside.write_text(json.dumps(wanted, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        assert self.folder is not None
+        add_pictures(self.folder, [path, note])
         return _eight_bits(painted)
 
 
