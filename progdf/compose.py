@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -63,7 +64,7 @@ def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised"
         index, selected = _places(rows, layer.gdf.region.members, m)
         crowd[index] += m[selected] * layer.cover
 
-    changed: dict[str, Tensor] = {}
+    changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
         movers = [name in layer.gdf.field.attributes and layer.gain(name) != 0 for layer in active]
         if not any(movers):

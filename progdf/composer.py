@@ -11,6 +11,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,7 +77,7 @@ class Composer:
         self._moving = [frozenset(gdf.field.attributes) for gdf in gdfs]
         self._edits = flat_edits(gdfs, self._names)
         self._base, self._out, self._columns = flat_scene(scene, self._names, self._reach)
-        tensors = {}
+        tensors: dict[str, Any] = {}
         for name, (_, _, at) in zip(self._names, self._columns[:, :3].tolist(), strict=True):
             shape = getattr(scene, name).shape
             tensors[name] = torch.from_numpy(self._out[at : at + shape.numel()]).view(shape)

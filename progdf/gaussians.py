@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,6 +29,7 @@ class Gaussians:
         logit_opacities: opacities before the sigmoid. [N]
         sh0: colour, band 0 of the spherical harmonics. [N,3]
         shN: colour, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
+        antialiased: trained with Mip-Splatting's 2D filter and to be drawn with it, see `rasterize`
 
     Raises:
         ValueError: a shape does not fit the others.
@@ -39,6 +41,7 @@ class Gaussians:
     logit_opacities: Tensor
     sh0: Tensor
     shN: Tensor
+    antialiased: bool = False
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -64,7 +67,7 @@ class Gaussians:
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """The selected rows. `index`: int64 indices [M], a bool mask [N] or a slice."""
-        return Gaussians(**{name: getattr(self, name)[index] for name in ATTRIBUTES})
+        return replace(self, **{name: getattr(self, name)[index] for name in ATTRIBUTES})
 
     @property
     def sh_degree(self) -> int:
@@ -93,7 +96,9 @@ class Gaussians:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
         """The same Gaussians on another device or in another floating type."""
-        return Gaussians(**{name: getattr(self, name).to(device=device, dtype=dtype) for name in ATTRIBUTES})
+        return replace(
+            self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in ATTRIBUTES}
+        )
 
     def replace_rows(self, rows: Tensor, packed: Tensor) -> Gaussians:
         """A copy with the given rows set from packed values; every other row keeps its bytes.
@@ -102,7 +107,7 @@ class Gaussians:
             rows: row indices, unique. [M] int64
             packed: new raw values, as `pack` gives them. [M,C]. With C = 14 shN is left alone.
         """
-        changed: dict[str, Tensor] = {}
+        changed: dict[str, Any] = {}
         for name, channels in attribute_slices(packed.shape[1]).items():
             old: Tensor = getattr(self, name)
             new = packed[:, channels].reshape(-1, *old.shape[1:])
@@ -155,7 +160,9 @@ def pack(gaussians: Gaussians, with_shN: bool = False) -> Tensor:
 
 def unpack(packed: Tensor, shN: Tensor) -> Gaussians:
     """The inverse of `pack`; `shN` [N,K,3] is used where the packed rows hold no higher bands."""
-    parts = {name: packed[:, channels] for name, channels in attribute_slices(packed.shape[1]).items()}
+    parts: dict[str, Any] = {
+        name: packed[:, channels] for name, channels in attribute_slices(packed.shape[1]).items()
+    }
     parts["logit_opacities"] = parts["logit_opacities"][:, 0]
     higher = parts.pop("shN", None)
     return Gaussians(**parts, shN=shN if higher is None else higher.reshape(len(packed), -1, 3))

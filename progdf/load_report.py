@@ -19,6 +19,7 @@ class LoadReport:
         format: "binary little-endian", "binary big-endian" or "ascii"
         count: Gaussians N; loading never drops or adds a row
         sh_degree: 0..4
+        antialiased: it says that it was trained with Mip-Splatting's 2D filter
         hidden: rows made invisible because a number was unusable; the next five say which number
         bad_means: NaN, infinite or beyond ±1e18
         bad_scales: NaN, infinite or beyond e^40
@@ -41,6 +42,7 @@ class LoadReport:
     format: str
     count: int
     sh_degree: int
+    antialiased: bool = False
     hidden: int = 0
     bad_means: int = 0
     bad_scales: int = 0
@@ -98,6 +100,8 @@ class LoadReport:
             f"{self.file}: {counted(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
             *(f"ignored: {phrase}" for phrase in self.ignored),
         ]
+        if self.antialiased:
+            lines.append("trained anti-aliased (mip), and drawn so")
         if self.scaled_quats:
             lines.append(f"normalised: {counted(self.scaled_quats, 'quaternion')} of another length than 1")
         return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]

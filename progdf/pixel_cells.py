@@ -43,7 +43,7 @@ def mark_cells(
         cells: from `no_cells`; marks are added
         means, quats, scales, opacities: activated. [N,3], [N,4], [N,3], [N]
         rows: which Gaussians. [M]
-        camera: the view, without antialiasing
+        camera: the view; antialiasing only makes what is touched smaller
         near: least camera z, world units
     """
     k = camera.K.double().numpy()

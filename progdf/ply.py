@@ -10,7 +10,9 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +22,7 @@ from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.load_report import LoadReport
-from progdf.ply_header import Element, PlyHeader, read_header
+from progdf.ply_header import ANTIALIASED_COMMENT, Element, PlyHeader, read_header
 from progdf.ply_rows import BLOCK_ROWS, read_blocks
 from progdf.repair import repair
 
@@ -70,13 +72,14 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
         trailing = read_blocks(path, header, vertex, used, store, _threads(vertex.count))
     except OSError as error:
         raise open_failure(path, error) from None
-    scene, counts = repair(_gaussians(attributes))
+    scene, counts = repair(replace(_gaussians(attributes), antialiased=header.antialiased))
     return scene, LoadReport(
         file=Path(path).name,
         file_bytes=header.file_size,
         format=header.format.replace("_", " ").replace(" endian", "-endian"),
         count=vertex.count,
         sh_degree=_SH_REST[rest],
+        antialiased=header.antialiased,
         ignored_properties=tuple(p for p in vertex.names if p not in used and p not in _NORMALS),
         ignored_elements=tuple((e.name, e.count) for e in header.elements if e is not vertex),
         trailing_bytes=trailing,
@@ -87,7 +90,8 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
 def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     """Write a 3DGS .ply: binary little-endian float32, properties in the order of the original 3DGS code.
 
-    The file appears whole or not at all. If the quaternions have unit length it loads to the same bits.
+    The file appears whole or not at all, and says if the scene is anti-aliased. If the quaternions have unit
+    length it loads to the same bits.
 
     Raises:
         ProgdfError: the scene is empty or holds a NaN or an infinity, or the folder does not exist.
@@ -110,7 +114,9 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
         *(f"f_rest_{i}" for i in range(3 * higher)),
     )
     names += ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
+    head = ["ply", "format binary_little_endian 1.0"]
+    head += [f"comment {ANTIALIASED_COMMENT}"] if scene.antialiased else []
+    head += [f"element vertex {len(scene)}"]
     head += [f"property float {name}" for name in names]
     with written_whole(path) as beside, beside.open("wb") as file:
         file.write(("\n".join([*head, "end_header"]) + "\n").encode("ascii"))
@@ -192,7 +198,7 @@ def _store_into(
 
 
 def _gaussians(attributes: dict[str, Floats]) -> Gaussians:
-    tensors = {key: torch.from_numpy(array) for key, array in attributes.items()}
+    tensors: dict[str, Any] = {key: torch.from_numpy(array) for key, array in attributes.items()}
     tensors["logit_opacities"] = tensors["logit_opacities"][:, 0]
     count, rest = tensors["shN"].shape
     tensors["shN"] = tensors["shN"].reshape(count, rest // 3, 3)

@@ -25,6 +25,17 @@ TYPES = {
 }
 """The .ply type names, old and new, and numpy's codes for them."""
 
+ANTIALIASED_COMMENT = "SplatRenderMode: mip"
+"""What the header of a scene says that was trained with Mip-Splatting's 2D filter (Brush's words)."""
+
+_RENDERING = {
+    "splatrendermode: mip": True,
+    "splatrendermode: default": False,
+    "antialiased 1": True,
+    "antialiased 0": False,
+}
+"""The comments that tell it, Brush's and Postshot's, in lower case; the last one counts."""
+
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 _FOREIGN = (
@@ -75,12 +86,14 @@ class PlyHeader:
         elements: the tables in file order
         length: bytes up to and with the line break after end_header, where the first row starts
         file_size: bytes of the whole file
+        antialiased: a comment says that the scene was trained with Mip-Splatting's 2D filter
     """
 
     format: str
     elements: tuple[Element, ...]
     length: int
     file_size: int
+    antialiased: bool = False
 
     @property
     def byte_order(self) -> str:
@@ -131,10 +144,13 @@ def _parse(name: str, lines: list[str], length: int, size: int) -> PlyHeader:
     form = ""
     tables: dict[str, tuple[int, dict[str, Property]]] = {}
     columns: dict[str, Property] = {}
+    antialiased = False
     for line in lines[1:]:
         words = line.split()
         match words:
-            case [] | ["comment" | "obj_info", *_]:
+            case ["comment", *said]:  # never shown: whoever made the file may have written anything there
+                antialiased = _RENDERING.get(" ".join(said).lower(), antialiased)
+            case [] | ["obj_info", *_]:
                 continue
             case ["format", kind, "1.0"] if kind in BYTE_ORDERS and not form:
                 form = kind
@@ -154,7 +170,7 @@ def _parse(name: str, lines: list[str], length: int, size: int) -> PlyHeader:
     if not form:
         raise ProgdfError(f"{name} does not name its format; its second line should be 'format … 1.0'")
     elements = tuple(Element(table, count, tuple(found.values())) for table, (count, found) in tables.items())
-    header = PlyHeader(form, elements, length, size)
+    header = PlyHeader(form, elements, length, size, antialiased)
     _check_counts(name, header)
     return header
 

@@ -72,7 +72,8 @@ def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
     row = hidden[:, None]
     logits = scene.logit_opacities.clamp(INVISIBLE_LOGIT, OPAQUE_LOGIT)
     logits = torch.where(opaque | transparent, logits, scene.logit_opacities)
-    repaired = Gaussians(
+    repaired = replace(
+        scene,
         means=torch.where(row, middle, scene.means),
         quats=torch.where(row | zero_quats[:, None], identity, quats),
         log_scales=torch.where(row | flat, FLAT_LOG_SCALE, scene.log_scales),

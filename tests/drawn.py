@@ -31,7 +31,6 @@ def draw(
     gaussians: Gaussians,
     camera: Camera,
     engine: str,
-    antialiased: bool = False,
     crop: tuple[int, int, int, int] | None = None,
 ) -> Drawn:
     dtype = torch.float64 if engine == "reference" else torch.float32
@@ -53,7 +52,7 @@ def draw(
         width=camera.width,
         height=camera.height,
         sh_degree=gaussians.sh_degree,
-        antialiased=antialiased,
+        antialiased=gaussians.antialiased,
         engine=engine,
         crop=crop,
     )
@@ -69,7 +68,7 @@ def draw(
 @functools.cache
 def drawn_case(name: str, engine: str) -> Drawn:
     case = CASES[name]
-    return draw(case.gaussians, case.camera, engine, case.antialiased)
+    return draw(case.gaussians, case.camera, engine)
 
 
 def relative_errors(found: Drawn, expected: Drawn) -> dict[str, float]:

@@ -108,13 +108,11 @@ class HardCase:
     Args:
         gaussians: raw parameters
         camera: the view
-        antialiased: render it with the antialias option
         poisoned: rows that hold something not finite; all other rows must render as if these were absent
     """
 
     gaussians: Gaussians
     camera: Camera
-    antialiased: bool = False
     poisoned: tuple[int, ...] = ()
 
 
@@ -200,9 +198,9 @@ def hard_cases() -> dict[str, HardCase]:
     for width, height in ((1, 1), (17, 5), (33, 9), (64, 16)):
         add(f"image {width}x{height}", plain, front_camera(width, height, focal=0.75 * width))
     tiny = replace(plain, log_scales=plain.log_scales - 3.0)
-    add("antialias with tiny splats", tiny, antialiased=True)
-    add("antialias with points", one_gaussian(scales=(0.0, 0.0, 0.0)), antialiased=True)
-    add("antialias with large splats", plain, antialiased=True)
+    add("antialias with tiny splats", replace(tiny, antialiased=True))
+    add("antialias with points", replace(one_gaussian(scales=(0.0, 0.0, 0.0)), antialiased=True))
+    add("antialias with large splats", replace(plain, antialiased=True))
     return cases
 
 

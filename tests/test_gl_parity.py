@@ -48,10 +48,10 @@ def renderer(ctx: moderngl.Context) -> Iterator[SplatRenderer]:
 
 @pytest.fixture(scope="module")
 def draw(renderer: SplatRenderer) -> Draw:
-    def drawn(scene: Gaussians, camera: Camera, antialiased: bool = False) -> Image:
+    def drawn(scene: Gaussians, camera: Camera) -> Image:
         renderer.upload(scene)
         renderer.set_order(back_to_front(scene.means.numpy(), camera))
-        return read(renderer.draw(camera, WHITE, antialiased))
+        return read(renderer.draw(camera, WHITE))
 
     return drawn
 
@@ -76,10 +76,8 @@ def psnr(image: Image, target: Image) -> float:
 @pytest.mark.usefixtures("without_early_stop")
 def test_hard_cases_look_the_same(draw: Draw, name: str) -> None:
     case = CASES[name]
-    image = draw(case.gaussians, case.camera, case.antialiased)
-    expected = render(
-        case.gaussians, case.camera, WHITE, engine="reference", antialiased=case.antialiased
-    ).numpy()
+    image = draw(case.gaussians, case.camera)
+    expected = render(case.gaussians, case.camera, WHITE, engine="reference").numpy()
     # float32 against float64: 120 dB and more is usual, 0.5/255 of one pixel where a rim is at stake
     assert psnr(image, expected) >= 100.0
     assert float(np.abs(image - expected).max(initial=0.0)) <= 1.0 / 255.0

@@ -107,6 +107,7 @@ class _Sight:
             camera.height,
             background=torch.zeros(3),
             near=camera.near,
+            antialiased=scene.antialiased,
             crop=scene.box,
             grad_rows=scene.rows,
         )[0]

@@ -34,6 +34,7 @@ class CropScene:
         rows: where the members are among them, in the region's order. [M] int64
         member_shN: higher SH bands of the members in the original. [M,K,3]
         background: what shows through. [3]
+        antialiased: see `Gaussians`
         cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
             None where all are drawn
     """
@@ -48,6 +49,7 @@ class CropScene:
     rows: Tensor
     member_shN: Tensor
     background: Tensor
+    antialiased: bool = False
     cached: tuple[Tensor, Tensor] | None = None
 
     @property
@@ -103,6 +105,7 @@ class CropScene:
             camera.height,
             background=self.background,
             near=camera.near,
+            antialiased=self.antialiased,
             crop=self.box,
             grad_rows=self.rows,
         )
@@ -157,6 +160,7 @@ def crop_scene(
         camera.height,
         background=background,
         near=camera.near,
+        antialiased=scene.antialiased,
         crop=box,
     )
     kept = seen.visible.clone()
@@ -173,6 +177,7 @@ def crop_scene(
         torch.searchsorted(index, members),
         scene.shN[members],
         background,
+        scene.antialiased,
     )
     return _live(whole) if still else whole
 

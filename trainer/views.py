@@ -102,6 +102,7 @@ def drawn(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) 
             camera.height,
             background=background,
             near=camera.near,
+            antialiased=scene.antialiased,
         )[0]
     return image
 

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.bench import Table
-from progdf.gaussians import Gaussians
 from progdf.ply import save_ply
 
 from . import bench_display, draft
@@ -119,7 +118,7 @@ def turned(
     """A scene's file opened and turned with the mouse, by every way in turns; then again, coarse."""
     results = []
     with ExitStack() as held:
-        nothing = Gaussians(*(values[:0] for values in vars(documents.load(path).scene).values()))
+        nothing = documents.load(path).scene[:0]
         mice: dict[str, Mouse] = {}
         opened_s: dict[str, float] = {}
         for way in WAYS:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from progdf.checkpoint import Gdf, fingerprint
 from progdf.field.baked import AttributeBases, BakedField
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.ply import load_ply
 from progdf.region import Region
 from progdf.scenes import bear
@@ -43,7 +44,8 @@ def copies(scene: Gaussians, times: int = COPIES) -> Gaussians:
     """The scene laid over itself, every copy's centres off by a normal 0.2 % of the radius: as dense as a
     scene that was trained with `times` as many Gaussians."""
     rng = torch.Generator().manual_seed(0)
-    many = Gaussians(**{f.name: torch.cat([getattr(scene, f.name)] * times) for f in fields(scene)})
+    repeated: dict[str, Any] = {name: torch.cat([getattr(scene, name)] * times) for name in ATTRIBUTES}
+    many = replace(scene, **repeated)
     off = torch.randn(many.means.shape, generator=rng)
     off[: len(scene)] = 0.0
     return replace(many, means=many.means + _JITTER * bounds_of(scene).radius * off)

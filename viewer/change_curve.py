@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -70,7 +70,7 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
     cameras = [to_camera(frame(ViewCamera(azimuth=azimuth), bounds), SIDE_PX, SIDE_PX) for azimuth in _FROM]
 
     def pictures(strength: float) -> list[Tensor]:
-        moved = {}
+        moved: dict[str, Any] = {}
         for name in gdf.field.attributes:
             old: Tensor = getattr(region, name)
             moved[name] = old + gdf.field.attribute_offsets(name, strength)[::every].reshape(old.shape)

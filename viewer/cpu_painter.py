@@ -196,6 +196,7 @@ class CpuPainter:
                 background,
                 self._near,
                 sh_degree=self._degree,
+                antialiased=self._scene.antialiased,
                 crop=crop,
             )
         pixels: Image = image.numpy()

@@ -218,6 +218,7 @@ def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -
             width,
             height,
             (0.0, 0.0, 0.0),
+            antialiased=scene.antialiased,
         )
     covered = 1.0 - clear.reshape(height, width).numpy()
     depth = np.where(covered > 0.05, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)

@@ -124,7 +124,7 @@ def _alphas(
     pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
     splats, _ = reference.project(
         some.means.double(), some.quats, some.scales, some.opacities, torch.zeros(len(rows), 3),
-        camera.viewmat, camera.K, camera.width, camera.height, near, None, False, pixel,
+        camera.viewmat, camera.K, camera.width, camera.height, near, None, scene.antialiased, pixel,
     )  # fmt: skip
     l11, l21, l22 = splats.whitening.unbind(1)
     dx, dy = (torch.tensor([x, y], dtype=torch.float64) - splats.means2d).unbind(1)

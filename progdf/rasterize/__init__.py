@@ -106,10 +106,11 @@ def render(
     camera: Camera,
     background: Tensor | Sequence[float] = (1.0, 1.0, 1.0),
     engine: str = "cpu",
-    antialiased: bool = False,
     crop: Crop | None = None,
 ) -> Tensor:
     """Draw a scene of raw Gaussians; bands of spherical harmonics above 3 are not shown.
+
+    A scene that was trained anti-aliased is drawn so (`Gaussians.antialiased`).
 
     Returns:
         image [H,W,3] float32 in 0..1 as far as the colours are (of the window where there is a `crop`)
@@ -128,7 +129,7 @@ def render(
         background,
         camera.near,
         sh_degree=degree,
-        antialiased=antialiased,
+        antialiased=gaussians.antialiased,
         engine=engine,
         crop=crop,
     )
@@ -162,6 +163,7 @@ def alpha_weights(
             camera.K,
             mask,
             near,
+            gaussians.antialiased,
         )
     return weights
 

@@ -106,10 +106,11 @@ def alpha_weights(
     K: Tensor,
     mask: Tensor,
     near: float,
+    antialiased: bool,
 ) -> Tensor:
     """See `progdf.rasterize.alpha_weights`; activated units."""
     height, width = mask.shape
-    view = _view(viewmat, K, width, height, near, None, False, (0, 0, width, height))
+    view = _view(viewmat, K, width, height, near, None, antialiased, (0, 0, width, height))
     gaussians = [_float32(tensor).detach().numpy() for tensor in (means, quats, scales, opacities)]
     gaussians.append(np.zeros((len(means), 1, 3), np.float32))
     totals = np.zeros((len(means), weights.SUMS))

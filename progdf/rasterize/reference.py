@@ -213,13 +213,14 @@ def alpha_weights(
     K: Tensor,
     mask: Tensor,
     near: float,
+    antialiased: bool,
 ) -> Tensor:
     """See `progdf.rasterize.alpha_weights`; activated units."""
     height, width = mask.shape
     window = (0, 0, width, height)
     splats, _ = project(
         means, quats, scales, opacities, means.new_zeros(len(means), 3), viewmat, K, width, height,
-        near, None, False, window,
+        near, None, antialiased, window,
     )  # fmt: skip
     # two channels, zero beyond the image's edge: the mask, and what is image at all
     inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -189,4 +190,5 @@ def _quats(frames: Tensor) -> Tensor:
 
 
 def _joined(pieces: Sequence[Gaussians]) -> Gaussians:
-    return Gaussians(**{name: torch.cat([getattr(piece, name) for piece in pieces]) for name in ATTRIBUTES})
+    joined: dict[str, Any] = {name: torch.cat([getattr(p, name) for p in pieces]) for name in ATTRIBUTES}
+    return Gaussians(**joined)

@@ -47,11 +47,12 @@ class AnalyticEdit:
         if strength == 0:
             return scene
         edited = self.change(scene[members], strength)
-        return Gaussians(
+        return replace(
+            scene,
             **{
                 name: getattr(scene, name).index_copy(0, members, getattr(edited, name))
                 for name in ATTRIBUTES
-            }
+            },
         )
 
 

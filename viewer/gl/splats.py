@@ -64,6 +64,7 @@ class SplatRenderer:
         self._buffers: _Buffers | None = None
         self._target: _Target | None = None
         self._drawn = 0
+        self._antialiased = False  # whether the scene is drawn so
 
     @property
     def textures(self) -> SplatTextures:
@@ -86,6 +87,7 @@ class SplatRenderer:
             self._scene = SplatTextures(self.ctx, count, coefficients, editable)
             self._buffers = self._make_buffers(max(count, 1))
         self._drawn = 0
+        self._antialiased = scene.antialiased
         return self.textures.write(scene)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> int:
@@ -107,13 +109,12 @@ class SplatRenderer:
         if self._drawn:
             self._buffers.order.write(np.ascontiguousarray(order, ORDER))
 
-    def draw(self, camera: Camera, background: Rgb, antialiased: bool = False) -> moderngl.Texture:
+    def draw(self, camera: Camera, background: Rgb) -> moderngl.Texture:
         """Draw with the uploaded scene and order.
 
         Args:
             camera: its size is the picture's
             background: rgb behind everything
-            antialiased: as in `progdf.rasterize`
 
         Returns:
             rgb over the background, and 1 − transmittance. RGBA32F, overwritten by the next draw
@@ -128,7 +129,7 @@ class SplatRenderer:
         if self._drawn and self._scene is not None and self._buffers is not None:
             self._scene.bind(self._project)
             _set_camera(self._project, camera)
-            self._project["antialiased"] = antialiased
+            self._project["antialiased"] = self._antialiased
             self._project["tinted"] = self._tints is not None
             if self._tints is not None:
                 self._tints.bind(self._project, len(self._scene.textures))
