@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -10,19 +9,24 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 
-from progdf import colour
 from progdf.errors import ProgdfError
 from progdf.pictures import write_image
 from progdf.rasterize import render
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from tests.trained import WHITE, small
 from trainer.editors import EDITORS, check_editor, make_editor
-from trainer.editors.procedural import StripesEditor, palette_of, recolored
+from trainer.editors.procedural import StripesEditor
 from trainer.views import make_view
 
-PROCEDURAL = ("recolor:#3060d0", "tint:#d4af37", "stripes:#20a040", "darken:0.7", "night")
+PROCEDURAL = (
+    "recolor:#3060d0",
+    "recolor:#3060d0,path=hue",
+    "tint:#d4af37",
+    "stripes:#20a040",
+    "darken:0.7",
+    "night",
+)
 
 
 @pytest.mark.parametrize("spec", PROCEDURAL)
@@ -50,60 +54,6 @@ def test_the_edit_grows_continuously_with_the_strength(spec: str) -> None:
     pictures = [editor.edit(view, s / 50) for s in range(51)]
     steps = [float((b - a).abs().max()) for a, b in pairwise(pictures)]
     assert max(steps) < 0.25
-
-
-BLUE, ORANGE = torch.tensor([0.19, 0.38, 0.82]), torch.tensor([0.85, 0.45, 0.10])
-ORANGE_ONE = palette_of(ORANGE[None], torch.ones(1))
-
-
-def test_a_region_that_is_pale_all_over_goes_straight_and_not_through_other_hues() -> None:
-    wallpaper = torch.tensor([[0.56, 0.65, 0.66], [0.60, 0.63, 0.61], [0.59, 0.62, 0.64]])
-    target = colour.parse_color("#e0a458")
-    palette = palette_of(wallpaper, torch.ones(3))
-    for s in (0.25, 0.5):
-        lab = colour.srgb_to_oklab(recolored(wallpaper, target, s, palette))
-        ends = [colour.srgb_to_oklab(recolored(wallpaper, target, end, palette)) for end in (0.0, 1.0)]
-        torch.testing.assert_close(lab, torch.lerp(*ends, s), atol=2e-3, rtol=0.0)
-
-
-def test_the_greys_of_a_thing_do_not_turn_through_the_rainbow_when_its_colour_does() -> None:
-    for s in (0.2, 0.4, 0.6, 0.8):
-        warm, cool = recolored(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE_ONE)
-        assert float((warm - cool).abs().max()) < 0.06, "they were neighbours and stay so"
-        assert float(warm[2]) > float(warm[1]), "towards blue, not by way of green"
-    green = recolored(ORANGE, BLUE, 0.5, ORANGE_ONE)
-    assert float(green[1]) > max(float(green[0]), float(green[2])), "the colour itself turns by way of green"
-
-
-def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
-    """sRGB colours all around the hue circle. [count,3]"""
-    angle = torch.linspace(0, 2 * math.pi, count + 1)[:-1]
-    lab = torch.stack([torch.full_like(angle, lightness), chroma * angle.cos(), chroma * angle.sin()], dim=1)
-    return colour.oklab_to_srgb(lab).clamp(0, 1)
-
-
-@pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
-def test_hues_on_the_far_side_of_the_wheel_take_their_own_short_way(s: float) -> None:
-    eyes = torch.tensor([[0.10, 0.70, 0.85], [0.15, 0.60, 0.95], [0.25, 0.45, 0.95]])  # cyan to blue
-    between = recolored(eyes, BLUE, s, ORANGE_ONE)
-    assert bool((between[:, 2] > between[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
-    assert bool((between[:, 2] > between[:, 1]).all())
-
-
-@pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
-def test_neighbouring_hues_stay_neighbours_on_the_way(s: float) -> None:
-    circle = hues(0.65, 0.11)
-    between = recolored(circle, BLUE, s, ORANGE_ONE)
-    apart = (between - between.roll(1, dims=0)).abs().amax(dim=1)
-    assert float(apart.max()) < 0.06
-
-
-def test_white_beside_a_colour_does_not_make_tinted_whites_turn() -> None:
-    weights = torch.tensor([3.0, 1.0])
-    palette = palette_of(torch.stack([torch.full((3,), 0.75), ORANGE]), weights)
-    pinkish = torch.tensor([0.84, 0.73, 0.65])
-    between = recolored(pinkish, BLUE, 0.5, palette)
-    assert float(between[2]) >= float(between[1]), "straight towards blue, not green"
 
 
 def test_what_shares_a_pixel_with_the_region_is_not_edited() -> None:
@@ -148,7 +98,17 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
 
 
 @pytest.mark.parametrize(
-    "spec", ["recolor:blue", "darken:2", "darken:much", "night:0", "paint:#fff", "folder:"]
+    "spec",
+    [
+        "recolor:blue",
+        "recolor:#3060d0,path=green",
+        "tint:#3060d0,hue",
+        "darken:2",
+        "darken:much",
+        "night:0",
+        "paint:#fff",
+        "folder:",
+    ],
 )
 def test_an_editor_that_makes_no_sense_is_one_line_that_says_what_would(spec: str) -> None:
     case = small()

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from progdf.colour import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.editors.base import EditorSettings, ImageEditor, Painter
 from trainer.editors.folder import folder, folder_of, photographs
 from trainer.editors.instruct import instruct
-from trainer.editors.procedural import darken, night, recolor, stops_of, stripes, tint
+from trainer.editors.procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
 from trainer.editors.style import style, style_number
 from trainer.views import View
 
@@ -54,9 +53,9 @@ EXAMPLES = (
 
 
 CHECKS: dict[str, Callable[[str], object]] = {
-    "recolor": parse_color,
-    "tint": parse_color,
-    "stripes": parse_color,
+    "recolor": paint_of,
+    "tint": paint_of,
+    "stripes": paint_of,
     "darken": partial(stops_of, editor="darken"),
     "night": partial(stops_of, editor="night"),
     "folder": folder_of,
