@@ -26,7 +26,7 @@ from progdf.ply import save_ply
 from . import bench_display, draft
 from . import document as documents
 from .bench_mouse import SIZE, Mouse
-from .bench_scenes import copies, scenes_of
+from .bench_scenes import COPIES, copies, scenes_of
 from .engine import Engine
 from .headless import headless_context
 from .panel import WIDTH_PX
@@ -35,6 +35,12 @@ from .threads import one_thread
 from .turntable import first_camera
 
 WARM_UP, STEPS, STARTS, KEPT = 2, 20, 3, 4
+LEAST, TURN_S, STARTS_S = 3, 20.0, 30.0
+"""Where frames or starts take long, they are as many as fit into so many seconds, and at least so many frames."""
+
+MOST_COPIED = 1_000_000
+"""Gaussians beyond which the largest scene is not laid over itself."""
+
 TURN_PX = 10.0
 """How far the mouse goes from one frame to the next: three degrees."""
 
@@ -89,12 +95,14 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is also laid over itself four times
+            unless that makes more than `MOST_COPIED` Gaussians
 
     Raises:
         ProgdfError: there is no OpenGL here, or a file is broken.
     """
     opened = scenes_of(scenes)
-    opened.append(copies(opened[-1]))
+    if COPIES * len(opened[-1]) <= MOST_COPIED:
+        opened.append(copies(opened[-1]))
     ctx = headless_context()
     try:
         renderer = str(ctx.info["GL_RENDERER"])
@@ -155,7 +163,7 @@ def turned(
 
 
 def started(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
-    """`progdf view --draw` of a scene's file, so many times, after one more that fills the caches.
+    """`progdf view --draw` of a scene's file, up to so many times, after one more that fills the caches.
 
     Raises:
         ProgdfError: Xvfb or xdotool is not installed, or the window does not open.
@@ -163,7 +171,8 @@ def started(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = S
     figures: list[dict[str, float]] = []
     wide = (size[0] + round(WIDTH_PX), size[1])
     with bench_display.display() as screen, tempfile.TemporaryDirectory() as folder:
-        for _ in range(1 + times):
+        began = time.monotonic()
+        while len(figures) < 2 or (len(figures) <= times and time.monotonic() - began < STARTS_S):
             arguments = [path, "--draw", way]
             with bench_display.window(screen, arguments, wide, Path(folder), leave=True) as opened:
                 figures.append(opened.figures)
@@ -264,21 +273,31 @@ def _open(mouse: Mouse, path: Path, way: str) -> float:
 
 
 def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
-    """Turn every mouse's picture, a frame each in turns."""
+    """Turn every mouse's picture, a frame each in turns, up to `steps` of them (see `TURN_S`)."""
     turns = {way: _Turned() for way in mice}
     for mouse in mice.values():
         mouse.settle()
         mouse.grip_picture()
-    for step in range(WARM_UP + steps):
+    for step in range(-WARM_UP, steps):
+        if step == 0:
+            one_s = sum(turned.frames_ms[-1] for turned in turns.values()) / 1e3
+            steps = affordable(steps, one_s)
+        elif step >= steps:
+            break
         for way, mouse in mice.items():
             turns[way].frames_ms.append(mouse.turn(TURN_PX))
             turns[way].draws_ms.append(mouse.stage.canvas.timings.total_ms)
-            if (WARM_UP + steps - 1 - step) % max(steps // KEPT, 1) == 0:
+            if step >= 0 and (steps - 1 - step) % -(-steps // KEPT) == 0:
                 turns[way].kept.append((mouse.stage.work.view, mouse.picture()))
     for mouse in mice.values():
         mouse.release()
         mouse.settle()
     return turns
+
+
+def affordable(steps: int, one_s: float) -> int:
+    """How many of `steps` fit into `TURN_S` if one takes so many seconds; at least `LEAST` of them."""
+    return min(steps, max(LEAST, int(TURN_S / max(one_s, 1e-9))))
 
 
 def _afresh(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:

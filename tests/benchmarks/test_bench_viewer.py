@@ -70,6 +70,28 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
     assert all(len(row) == len(table.columns) for table in (frames, coarse) for row in table.rows)
 
 
+def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:
+    assert bench_frames.affordable(20, 0.05) == 20
+    assert bench_frames.affordable(20, bench_frames.TURN_S / 7.5) == 7
+    assert bench_frames.affordable(20, 1e4) == bench_frames.LEAST
+    assert bench_frames.affordable(2, 1e4) == 2
+
+
+@pytest.mark.gl
+def test_slow_turns_end_early_and_still_have_their_pictures(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "bear.ply"
+    save_ply(path, bear(600).gaussians)
+    monkeypatch.setattr(bench_frames, "TURN_S", 0.0)
+    ctx = headless_context()
+    turnings = bench_frames.turned(ctx, path, steps=20, size=SIZE)
+    ctx.release()
+    for turning in turnings:
+        assert len(turning.frames_ms) == len(turning.coarse_ms) == bench_frames.LEAST
+        assert turning.checked >= 1
+
+
 @pytest.mark.gl
 def test_a_frame_in_the_order_of_the_last_one_is_found(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
