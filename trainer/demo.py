@@ -129,7 +129,7 @@ class DemoOptions:
     seed: int = 0
     """Of the scene and of the training."""
     threads: int = 0
-    """CPU threads; 0 takes all cores but one, at least one."""
+    """CPU threads; 0 takes all cores."""
     window: bool = True
     """Open the window at the end, where there is a display."""
 

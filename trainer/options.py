@@ -183,7 +183,7 @@ class TrainOptions:
     seed: int = 0
     """Order of the views; the same seed gives the same files."""
     threads: int = 0
-    """CPU threads; 0 takes all cores but one, at least one. More than there are idle cores is slower."""
+    """CPU threads; 0 takes all cores. More than there are idle cores is slower."""
     text_before: str = ""
     """What the views show before the edit, as "a bear"; with --text-after, CLIP directional similarity is
     measured (ViT-L/14; pip install progdf-studio[clip])."""
@@ -236,7 +236,7 @@ class FitOptions:
     clip_model: str = ""
     """As for progdf train; the run's own, if nothing is given."""
     threads: int = 0
-    """CPU threads; 0 takes all cores but one, at least one."""
+    """CPU threads; 0 takes all cores."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class AblateOptions:
     scene: Path | None = None
     """Where the scene is now, if it has moved since the run."""
     threads: int = 0
-    """CPU threads; 0 takes all cores but one, at least one."""
+    """CPU threads; 0 takes all cores."""
 
 
 def settled(options: TrainOptions) -> TrainOptions:

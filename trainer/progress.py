@@ -27,8 +27,8 @@ _EVERY_S = 5.0
 
 
 class RunLog:
-    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds
-    and peak memory.
+    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds, and
+    the peak memory at its end.
 
     The seconds are part of a run's saved state (`state.Resumable`): those of all its sessions add up.
 
@@ -87,7 +87,6 @@ class RunLog:
     def stage(self, name: str) -> Iterator[None]:
         """Measure a part of the run under `name`; a name that comes again adds up."""
         begun = self._running[name] = time.perf_counter()
-        self.memory.begin(name)
         try:
             yield
         finally:

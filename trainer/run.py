@@ -290,7 +290,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
 
 
 def use_threads(wanted: int) -> None:
-    """Give torch and the rasteriser `wanted` threads; 0 is all cores but one, at least one."""
+    """Give torch and the rasteriser `wanted` threads; 0 is all cores."""
     count = wanted_threads(wanted)
     torch.set_num_threads(count)
     set_threads(count)
@@ -305,4 +305,4 @@ def wanted_threads(wanted: int) -> int:
     if not 0 <= wanted <= MOST_THREADS:
         raise ProgdfError(f"--threads is {wanted}; 0 to {MOST_THREADS} would be right")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return wanted or max(1, cores - 1)
+    return wanted or cores
