@@ -26,7 +26,7 @@ class PeakMemory:
             self.by_stage[stage] = max(peak, self.by_stage.get(stage, 0))
 
     def peak(self) -> int | None:
-        """Of the process so far, and of the earlier sessions of the same run; None where it cannot be told."""
+        """Of the process and of earlier sessions of the same run; None where it cannot be told."""
         return max(round(_peak_mb()), self._earlier) or None
 
     def restore(self, by_stage: Mapping[str, int], peak: int | None) -> None:

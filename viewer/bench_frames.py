@@ -36,7 +36,7 @@ from .turntable import first_camera
 
 WARM_UP, STEPS, STARTS, KEPT = 2, 20, 3, 4
 LEAST, TURN_S, STARTS_S = 3, 20.0, 30.0
-"""Where frames or starts take long, they are as many as fit into so many seconds, and at least so many frames."""
+"""Slow frames and starts are as many as fit into so many seconds, and at least so many frames."""
 
 MOST_COPIED = 1_000_000
 """Gaussians beyond which the largest scene is not laid over itself."""
