@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.framing import NEAR, front, guess_up, is_surrounding, scene_sphere
+from progdf.framing import NEAR, front, is_surrounding, scene_sphere
 from progdf.gaussians import Gaussians
 from progdf.lens import Lens
+from progdf.up_axis import guess_up
 
 _log = logging.getLogger(__name__)
 

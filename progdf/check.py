@@ -9,9 +9,11 @@ from typing import Annotated
 
 import tyro
 
+from progdf.camera_files import load_cameras
 from progdf.command_line import parsed
 from progdf.ply import load_ply_with_report
 from progdf.survey import survey
+from progdf.up_axis import UpChoice, convention_of, find_up
 
 
 @dataclass(frozen=True)
@@ -20,15 +22,21 @@ class Options:
 
     Args:
         scene: the .ply file
+        cameras: its cameras, which tell the up axis
+        up: the axis that is up
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
+    cameras: Path | None = None
+    up: UpChoice = "auto"
 
 
 def main(argv: Sequence[str]) -> int:
     """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
     options = parsed(Options, argv, "progdf check")
     scene, report = load_ply_with_report(options.scene)
-    for line in report.lines() + survey(scene).lines():
+    cameras = [] if options.cameras is None else load_cameras(options.cameras)
+    up = find_up(scene, cameras, options.up, convention_of(options.scene))
+    for line in report.lines() + survey(scene, up).lines():
         print(line)
     return 0

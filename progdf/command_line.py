@@ -30,15 +30,27 @@ def parsed(
         ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
     """
     said = io.StringIO()
+    argv = _with_axes_joined(argv)
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
-                return tyro.cli(kind, args=list(argv), prog=command)
-            return tyro.cli(kind, args=list(argv), prog=command, default=default)
+                return tyro.cli(kind, args=argv, prog=command)
+            return tyro.cli(kind, args=argv, prog=command, default=default)
     except SystemExit as leaving:
         if not leaving.code:
             raise
         raise ProgdfError(f"{_first_words(said.getvalue())}; see {command} --help") from None
+
+
+def _with_axes_joined(argv: Sequence[str]) -> list[str]:
+    """`--up -y` as `--up=-y`: what begins with a minus would be taken for an option."""
+    found: list[str] = []
+    for argument in argv:
+        if found and found[-1] == "--up":
+            found[-1] = f"--up={argument}"
+        else:
+            found.append(argument)
+    return found
 
 
 def _first_words(box: str) -> str:

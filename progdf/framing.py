@@ -1,18 +1,13 @@
-"""How a scene lies in space: where its bulk is, which way is up, whether it can be seen from outside."""
+"""How a scene lies in space: where its bulk and its front are, whether it can be seen from outside."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from progdf.camera import Camera
 
 _SAMPLE = 100_000
 """Rows that are looked at; a scene with more is sampled evenly."""
@@ -25,6 +20,9 @@ _CEILING_COVER = 0.8
 _LEAST_CELLS = 16
 _ENOUGH = 64
 """Fewer Gaussians tell nothing about the shape of a scene."""
+
+_SOLID, _CORE = 0.1, 2.5
+"""Haze is less opaque; background lies farther, in median distances from the middle."""
 
 
 def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
@@ -48,35 +46,6 @@ def near_plane(radius: float) -> float:
     `NEAR` down to a radius of 1, as trainings draw; smaller scenes would vanish before it.
     """
     return NEAR * min(1.0, radius)
-
-
-def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
-    """The world direction that is up. [3] float32, unit length
-
-    With cameras: the mean of their up directions, as people hold cameras level; if these agree.
-    Without: the axis along which the flat Gaussians face most (floors, tables and the tops of things make the
-    largest part of flat surfaces in a real scene), pointing from the densest plane across it to the side on
-    which the rest stands. Where nothing decides: −y, the convention of COLMAP and so of most trained scenes.
-    """
-    if cameras:
-        mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
-        if float(mean.norm()) > 0.5:
-            return torch.nn.functional.normalize(mean, dim=0)
-    sample = _sample(scene)
-    centre, radius = scene_sphere(sample)
-    facing = _flatness(sample)[:, None] * normals_of(sample).abs() ** 4
-    axis = int(facing.sum(dim=0).argmax())
-    across = ((sample.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5)
-    counts, edges = torch.histogram(across, bins=60, range=(-1.5, 1.5), weight=facing[:, axis])
-    ground = float(edges[int(counts.argmax())]) + 0.025
-    # by number, not by area: what stands on a ground is made of many small Gaussians, a lawn of few large
-    lean = float((sample.opacities * (across - ground)).sum())
-    up = torch.zeros(3)
-    if len(sample) < _ENOUGH or lean == 0:
-        up[1] = -1.0
-    else:
-        up[axis] = math.copysign(1.0, lean)
-    return up
 
 
 def front(up: Tensor) -> Tensor:
@@ -111,21 +80,43 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
     sample = _sample(scene)
     if len(sample) < _ENOUGH:
         return False
-    ahead = front(up)
-    plan = sample.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     height = sample.means @ up
     low, high = (_quantile(height, q) for q in (0.02, 0.98))
-    cells = _cells(plan)
+    cells = plan_cells(sample, up)
     covered = len(torch.unique(cells))
     ceiling = len(torch.unique(cells[height > high - 0.06 * (high - low)]))
     return covered >= _LEAST_CELLS and ceiling >= _CEILING_COVER * covered
 
 
-def _cells(plan: Tensor, per_side: int = 8) -> Tensor:
-    """The cell of an 8 × 8 grid over the ground plan that each row falls in. [N,2] -> [N] int64"""
+def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
+    """The cell of a square grid over the ground plan that each Gaussian's mean falls in. [N] int64"""
+    ahead = front(up)
+    plan = scene.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
     place = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
     return place[:, 0] * per_side + place[:, 1]
+
+
+def without_background(scene: Gaussians) -> Gaussians | None:
+    """An even sample of what is visible and near the middle; None where that tells nothing of a shape."""
+    sample = _sample(scene)
+    sample = sample[(sample.opacities > _SOLID).nonzero()[:, 0]]
+    if len(sample) < _ENOUGH:
+        return None
+    distances = (sample.means - sample.means.median(dim=0).values).norm(dim=1)
+    return sample[(distances <= _CORE * distances.median()).nonzero()[:, 0]]
+
+
+def plane_facing(scene: Gaussians, axis: int) -> tuple[Tensor, Tensor]:
+    """How high each Gaussian lies along a world axis, and how much flat area it turns that way.
+
+    Returns:
+        height over the centre, in radii of the bulk, −1.5..1.5 [N]; share of the scene's flat area [N]
+    """
+    centre, radius = scene_sphere(scene)
+    flat = _flatness(scene)
+    facing = flat * normals_of(scene)[:, axis].abs() ** 4 / flat.sum().clamp_min(1e-30)
+    return ((scene.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5), facing
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from progdf.camera import orbit_rig
-from progdf.framing import front, guess_up, is_surrounding, normals_of
+from progdf.framing import front, is_surrounding, normals_of
 from progdf.gaussians import Gaussians, normalize_quats
 from progdf.rasterize.reference import rotation_matrices
 from progdf.scenes import bear
+from progdf.up_axis import guess_up
 from tests.scenes import ball, random_gaussians
 
 Y_UP = torch.tensor([0.0, 1.0, 0.0])

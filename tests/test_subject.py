@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.framing import guess_up
 from progdf.gaussians import Gaussians
 from progdf.ply import load_ply
 from progdf.scenes import DemoScene, bear, room
 from progdf.subject import fitted_eye, is_room, standpoint, subject_rows
+from progdf.up_axis import guess_up
 from tests.scenes import random_gaussians
 from viewer.turntable import FILL, first_camera, fit, to_camera
 

@@ -134,6 +134,7 @@ def finished(
         "losses": about["losses"],
         "agreement": about.get("agreement"),
         "followed": about.get("followed", 0),
+        "up": about.get("up"),
         "time": {**(_earlier(folder, "time") if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.memory.peak(),
         "memory_by_stage_mb": {

@@ -14,6 +14,7 @@ from progdf.errors import ProgdfError
 from progdf.field.neural import Bins, Inputs, Size
 from progdf.field.ranks import NO_DIFFERENCE
 from progdf.lpips import Net
+from progdf.up_axis import UpChoice
 from trainer.objective import Progressive
 from trainer.pgs import Rates
 from trainer.trajectory import Slider
@@ -103,6 +104,8 @@ class TrainOptions:
     cameras: Path | None = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at
     the region."""
+    up: UpChoice = "auto"
+    """The axis of the scene that is up. auto: as the cameras are held, or as a ground lies, or −y."""
     views: int = 30
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with."""
     image_size: int = 256

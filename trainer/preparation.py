@@ -10,9 +10,10 @@ from torch import Tensor
 
 from progdf.camera_files import load_cameras
 from progdf.errors import ProgdfError
-from progdf.framing import guess_up, is_surrounding
+from progdf.framing import is_surrounding
 from progdf.gaussians import Gaussians
 from progdf.region import Region
+from progdf.up_axis import UpAxis, convention_of, find_up
 from trainer.artefacts import RunFolder, write_views
 from trainer.crops import CropScene, crop_scene
 from trainer.editors import EditorSettings, ImageEditor
@@ -39,6 +40,7 @@ class Stand:
     held_out: Sequence[View]
     background: Tensor
     notes: Sequence[str] = ()
+    up: UpAxis | None = None
 
 
 def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand:
@@ -48,26 +50,30 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
     """
     background = torch.tensor(BACKGROUND)
+    given = [] if options.cameras is None else load_cameras(options.cameras)
+    up = find_up(scene, given, options.up, convention_of(options.scene))
     if options.cameras is not None:
-        cameras = [fit_size(camera, options.image_size) for camera in load_cameras(options.cameras)]
-    elif is_surrounding(scene, guess_up(scene)):
+        cameras = [fit_size(camera, options.image_size) for camera in given]
+    elif is_surrounding(scene, up.direction):
         raise ProgdfError(
             f"{options.scene} looks like a scene to stand inside, which cameras around it cannot show; "
             "give its own with --cameras (cameras.json, transforms.json or a COLMAP folder)"
         )
     else:
         # half as many again, as some will find the region hidden
-        cameras = region_rig(scene, region, options.views + options.views // 2, options.image_size)
+        count = options.views + options.views // 2
+        cameras = region_rig(scene, region, count, options.image_size, up.direction)
     cameras = near_enough(named(cameras), scene)
     choice = choose_views(scene, region, cameras, options.views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
-    notes = [choice.line()] if len(choice.views) < choice.offered else []
+    notes = [f"up is {up.name}, {up.reason}"]
+    notes += [choice.line()] if len(choice.views) < choice.offered else []
     if any(view.camera.lens for view in choice.views):
         notes.append(
             "the cameras have lenses that bend photographs, the views here are straight: "
             "edited copies of photographs go in with --editor photographs:DIR"
         )
-    return Stand(scene, region, train, held_out, background, notes)
+    return Stand(scene, region, train, held_out, background, notes, up)
 
 
 def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:

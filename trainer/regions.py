@@ -15,10 +15,11 @@ from torch import Tensor
 from progdf.camera import Camera, orbit_rig
 from progdf.camera_files import load_cameras, save_cameras
 from progdf.errors import ProgdfError
-from progdf.framing import guess_up, is_surrounding
+from progdf.framing import is_surrounding
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from progdf.region_spec import Kind
+from progdf.up_axis import UpChoice, convention_of, find_up
 from trainer.artefacts import claim
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.lift import Rule, lift_masks
@@ -44,6 +45,8 @@ class RegionSettings:
         segmenter: which networks, how sure
         kept: makes, and names, the folder in which segmented pictures are kept
         quiet: no progress on the screen
+        up: as --up
+        scene: the scene's file, whose format may say which way is up
     """
 
     cameras: Path | None
@@ -53,6 +56,12 @@ class RegionSettings:
     threshold: float | None = None
     segmenter: SegmenterSettings = SegmenterSettings()
     quiet: bool = False
+    up: UpChoice = "auto"
+    scene: Path | None = None
+
+    def up_of(self, scene: Gaussians) -> Tensor:
+        """The direction that is up in a scene without cameras. [3]"""
+        return find_up(scene, (), self.up, convention_of(self.scene)).direction
 
 
 def region_settings(options: TrainOptions, edit: Mapping[str, str], quiet: bool) -> RegionSettings:
@@ -75,6 +84,8 @@ def region_settings(options: TrainOptions, edit: Mapping[str, str], quiet: bool)
         options.lift_threshold,
         SegmenterSettings(options.detector, options.outliner, options.detect_least),
         quiet,
+        options.up,
+        options.scene,
     )
 
 
@@ -110,7 +121,7 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         if settings.cameras is None:
             # Around the scene a thing may be a few pixels wide: look again from where it fills the picture;
             # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
-            nearer = _near_cameras(scene, _lifted(scene, cameras, found, prompt, settings), settings.views)
+            nearer = _near_cameras(scene, _lifted(scene, cameras, found, prompt, settings), settings)
             masks = [*masks, *_segmented(scene, nearer, prompt, folder, settings)]
             cameras, found = [*cameras, *nearer], _told(masks, prompt, settings)
         # with these the folder is one for masks:DIR, of the same region
@@ -198,17 +209,18 @@ def _segmented_cameras(scene: Gaussians, settings: RegionSettings) -> list[Camer
         count = min(settings.views, len(offered))
         taken = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
         return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
-    if is_surrounding(scene, guess_up(scene)):
+    up = settings.up_of(scene)
+    if is_surrounding(scene, up):
         raise ProgdfError(
             "the scene looks like one to stand inside, which cameras around it cannot show; "
             "give its own with --cameras"
         )
-    return named(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT))
+    return named(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT, up=up))
 
 
-def _near_cameras(scene: Gaussians, region: Region, count: int) -> list[Camera]:
+def _near_cameras(scene: Gaussians, region: Region, settings: RegionSettings) -> list[Camera]:
     """A rig that looks at what was found."""
-    rig = region_rig(scene, region, count, LIFTED_AT)
+    rig = region_rig(scene, region, settings.views, LIFTED_AT, settings.up_of(scene))
     return [replace(camera, name=f"near_{i:03d}") for i, camera in enumerate(rig)]
 
 

@@ -247,6 +247,7 @@ def _record(
         "attribute_worth_db": costs,
         "agreement": agreement.figures() if agreement is not None else None,
         "followed": len(followers.places),
+        "up": stand.up.saved() if stand.up is not None else None,
     }
     scene, region = stand.scene, stand.region
     save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at, orbit_rig
-from progdf.framing import guess_up, near_plane, scene_sphere
+from progdf.framing import near_plane, scene_sphere
 from progdf.gaussians import Gaussians
 from progdf.rasterize import Crop, rasterize
 from progdf.region import Region
 from progdf.sh import shade
+from progdf.up_axis import guess_up
 
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
@@ -131,7 +132,9 @@ def region_box(mask: Tensor, margin: int = 6) -> Crop:
     return (x0, y0, x1, y1)
 
 
-def region_rig(scene: Gaussians, region: Region, count: int, image_size: int) -> list[Camera]:
+def region_rig(
+    scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None
+) -> list[Camera]:
     """The orbit rig of the scene, aimed at the region and zoomed in on it.
 
     The cameras stand where those of the whole scene would, so nothing new comes between them and the region;
@@ -143,8 +146,9 @@ def region_rig(scene: Gaussians, region: Region, count: int, image_size: int) ->
         region: what they look at
         count: how many, ≥ 1
         image_size: both sides in pixels
+        up: world direction that is up, [3]; None guesses it
     """
-    up = guess_up(scene)
+    up = guess_up(scene) if up is None else up
     centre, radius = scene_sphere(scene[region.members])
     radius += float(scene.scales[region.members].amax(dim=1).median())
     cameras = []

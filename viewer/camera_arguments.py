@@ -11,7 +11,7 @@ from progdf.gaussians import Gaussians
 
 from . import arguments
 from .options import RenderOptions
-from .state import ViewCamera
+from .state import Vec3, ViewCamera
 from .turntable import bounds_of, first_camera, fit, fit_subject, frame, to_camera
 
 DEFAULT_SIZE = (640, 480)
@@ -23,6 +23,7 @@ def asked_camera(
     gdfs: Sequence[Gdf],
     size: tuple[int, int] | None,
     saved: ViewCamera | None,
+    up: Vec3 | None = None,
 ) -> Camera:
     """The camera that was asked for; that of the session (`saved`); or one that frames the scene.
 
@@ -32,6 +33,7 @@ def asked_camera(
         gdfs: its edits, which --frame may name
         size: (width, height) in pixels; None: the camera's own, or `DEFAULT_SIZE`
         saved: of a session
+        up: unit vector that is up in the scene; None finds it
 
     Raises:
         ProgdfError: options that contradict each other or name nothing.
@@ -45,7 +47,7 @@ def asked_camera(
         return camera if size is None else arguments.fitted(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height
-    view = saved or first_camera(scene, aspect=aspect)
+    view = saved or first_camera(scene, aspect=aspect, up=up)
     if options.orbit is not None:
         view = arguments.parse_orbit(options.orbit, view)
     if options.frame is not None or (options.orbit is not None and saved is None):

@@ -35,7 +35,7 @@ def view(argv: Sequence[str]) -> int:
 
     state = found.view
     if found.session is None:
-        state = replace(state, camera=first_camera(found.document.scene))
+        state = replace(state, camera=first_camera(found.document.scene, up=found.up))
     return run(
         found.document,
         state,

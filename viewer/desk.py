@@ -26,6 +26,7 @@ from .stage import Stage
 from .state import LayerState, Timeline
 from .threads import all_threads
 from .turntable import first_camera, from_camera
+from .upright import up_of
 from .workspace import Dialog
 
 AUTOSAVE_S = 20.0
@@ -213,9 +214,8 @@ class Desk:
         self._app.show(opened)
         self.path = None
         stage = self._app.stage
-        stage.restart(
-            replace(stage.work.view, camera=first_camera(opened.scene), layers=(), timeline=Timeline())
-        )
+        camera = first_camera(opened.scene, up=up_of(opened.scene, path=path))
+        stage.restart(replace(stage.work.view, camera=camera, layers=(), timeline=Timeline()))
 
     def _add_edit(self, path: Path) -> None:
         """On top, at full strength, so that one sees what came; undo takes it off again."""

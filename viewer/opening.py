@@ -15,7 +15,9 @@ from .document import Document
 from .layer_arguments import stack_of
 from .options import PictureOptions, StackOptions
 from .snapshots import Snapshot
-from .state import ViewState
+from .state import Vec3, ViewState
+from .turntable import with_up
+from .upright import up_of
 
 NAME = "--session"
 _SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "blend", "background")
@@ -30,12 +32,20 @@ class Opened:
         view: of a scene without the camera, which is for the command to choose
         session: the file that holds all this; None for a scene
         snapshots: those of the session
+        asked_up: an axis, or "auto"
     """
 
     document: Document
     view: ViewState
     session: Path | None = None
     snapshots: tuple[Snapshot, ...] = ()
+    asked_up: str = "auto"
+
+    @property
+    def up(self) -> Vec3:
+        """The direction that is up in the scene."""
+        opened = self.document
+        return up_of(opened.scene, opened.gdfs, opened.path, self.asked_up)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -64,7 +74,7 @@ def opened(options: StackOptions) -> Opened:
         view = replace(view, background=arguments.parse_background(options.background))
     found = document.load(options.scene, options.gdfs)
     layers = stack_of(found.gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint)
-    return Opened(found, replace(view, layers=layers))
+    return Opened(found, replace(view, layers=layers), asked_up=_asked_up(options))
 
 
 def is_session(path: Path) -> bool:
@@ -110,10 +120,17 @@ def _session(options: StackOptions) -> Opened:
                 f"{what} with the session {options.scene.name}, which says it too; leave it out"
             )
     kept = session.open_session(options.scene)
-    found = Opened(kept.document, kept.view, options.scene, kept.snapshots)
+    found = Opened(kept.document, kept.view, options.scene, kept.snapshots, _asked_up(options))
     settings = [
         f"{found.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in options.set)
     ]
     strengths = arguments.strengths_of(kept.view.layers, settings, stack.most(kept.view))
     layers = (replace(l, strength=strengths.get(l.name, l.strength)) for l in kept.view.layers)
-    return replace(found, view=replace(kept.view, layers=tuple(layers)))
+    view = replace(kept.view, layers=tuple(layers))
+    if _asked_up(options) != "auto":  # else the session's own
+        view = replace(view, camera=with_up(view.camera, found.up))
+    return replace(found, view=view)
+
+
+def _asked_up(options: StackOptions) -> str:
+    return options.up if isinstance(options, PictureOptions) else "auto"

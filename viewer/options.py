@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from progdf.up_axis import UpChoice
+
 Blend = Literal["normalised", "sum", "over"]
 Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
 Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
@@ -44,6 +46,8 @@ class StackOptions:
 class PictureOptions(StackOptions):
     """The stack as a picture shows it."""
 
+    up: UpChoice = "auto"
+    """The axis of the scene that is up; auto: as the edits were trained, or as a ground lies, or −y."""
     background: str = "white"
     """#rrggbb, white or black."""
     engine: Annotated[Literal["auto", "gl", "cpu"], tyro.conf.arg(aliases=["--draw"])] = "auto"

@@ -40,7 +40,8 @@ def render(argv: Sequence[str]) -> int:
     arguments.check_not_an_input(options.out, found.files)
     scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
     view = replace(view, compare=_comparison(options, view.compare))
-    camera = asked_camera(options, scene, gdfs, size, None if found.session is None else view.camera)
+    saved = None if found.session is None else view.camera
+    camera = asked_camera(options, scene, gdfs, size, saved, found.up)
     if options.timeline is not None:
         keys, count = _keys(options, found), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 
 from progdf.camera import Camera, intrinsics
-from progdf.framing import guess_up, scene_sphere
+from progdf.framing import scene_sphere
 from progdf.gaussians import Gaussians
 from progdf.subject import fitted_eye, is_room, standpoint, subject_rows
 
 from .state import Vec3, ViewCamera
+from .upright import up_of
 
 FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
 
@@ -224,22 +225,29 @@ def fit_all(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCa
 
 
 def first_camera(
-    scene: Gaussians, cameras: Sequence[Camera] = (), aspect: float = 1.5, fov_y: float = 45.0
+    scene: Gaussians,
+    cameras: Sequence[Camera] = (),
+    aspect: float = 1.5,
+    fov_y: float = 45.0,
+    up: Vec3 | None = None,
 ) -> ViewCamera:
     """What one sees first: what the scene is about, upright, from the front and a little above.
 
-    A room is met inside, from a wall or a corner, with at least `INSIDE_FOV` degrees. An up
-    axis within two degrees of a world axis is that axis: nobody holds a camera straighter.
+    A room is met inside, from a wall or a corner, with at least `INSIDE_FOV` degrees.
+
+    Args:
+        scene: the original
+        cameras: given with it
+        aspect: width / height of the picture
+        fov_y: vertical field of view, degrees
+        up: unit vector; None asks the cameras and the scene
     """
-    x, y, z = (float(c) for c in guess_up(scene, cameras)) if len(scene) else (0.0, 1.0, 0.0)
-    for i, c in enumerate((x, y, z)):
-        if abs(c) > math.cos(math.radians(2.0)):
-            x, y, z = (math.copysign(1.0, c) if j == i else 0.0 for j in range(3))
-    camera, up = ViewCamera(up=(x, y, z), azimuth=20.0, fov_y=fov_y), torch.tensor([x, y, z])
+    up = up_of(scene, cameras=cameras) if up is None else up
+    camera, axis = ViewCamera(up=up, azimuth=20.0, fov_y=fov_y), torch.tensor(up)
     if not len(scene):
         return frame(camera, Bounds(), aspect)
-    if is_room(scene, up):
-        eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, up))
+    if is_room(scene, axis):
+        eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, axis))
         return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
     return fit_subject(camera, scene, aspect)
 
