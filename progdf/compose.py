@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from progdf.checkpoint import verify
+from progdf.coverage import coverage
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.layers import BLENDS, Gains, Layer, check_layers
+from progdf.layers import BLENDS, KINDS, Gains, Layer, check_layers
 
 __all__ = ["BLENDS", "Gains", "Layer", "compose"]
 
@@ -31,9 +32,11 @@ def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised"
     - "normalised": Σ m g Δ(s) / max(1, Σ m s). One layer alone is untouched, order does not matter, and it
       is the plain sum while the strengths on a Gaussian add up to no more than 1.
     - "sum": Σ m g Δ(s).
-    - "over": in the order given, Δ ← Δ · (1 − m s) + m g Δ(s); the last layer lies on top.
+    - "over": in the order given, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s), where c is how much the layer
+      itself changes of that kind, see `progdf.coverage`; the last layer lies on top, and what it leaves alone
+      shows the layers below.
 
-    In Σ m s and 1 − m s, s is held to 0..1: an overshoot exaggerates its own edit and does not dim the
+    In Σ m s and 1 − m s c, s is held to 0..1: an overshoot exaggerates its own edit and does not dim the
     others.
 
     Args:
@@ -64,6 +67,7 @@ def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised"
         index, selected = _places(rows, layer.gdf.region.members, m)
         crowd[index] += m[selected] * layer.cover
 
+    hides = [coverage(scene, layer.gdf) if blend == "over" else {} for layer in active]
     changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
         movers = [name in layer.gdf.field.attributes and layer.gain(name) != 0 for layer in active]
@@ -71,16 +75,17 @@ def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised"
             continue
         old: Tensor = getattr(scene, name)
         total = torch.full((len(rows), old[0].numel()), NOTHING)
-        for layer, m, moves in zip(active, weights, movers, strict=True):
+        for layer, m, moves, covers in zip(active, weights, movers, hides, strict=True):
+            if not moves:
+                continue
             index, selected = _places(rows, layer.gdf.region.members, m)
             share = m[selected, None]
             below = total[index]
             if blend == "over":
-                below = below * (1 - share * layer.cover)
-            if moves:
-                offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[selected]
-                below = below + share * layer.gain(name) * offsets
-            total[index] = below
+                hidden = torch.tensor(layer.cover) * torch.tensor(min(abs(layer.gain(name)), 1.0))
+                below = below * (1 - share * hidden * covers[KINDS[name]][selected, None])
+            offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[selected]
+            total[index] = below + share * layer.gain(name) * offsets
         if blend == "normalised":
             total = total / crowd.clamp(min=1.0)[:, None]
         new = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)

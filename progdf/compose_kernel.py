@@ -16,10 +16,10 @@ from progdf.rasterize.jit import Number, kernel
 BLOCK = 256
 """Rows worked on at once: the sums of a channel stay in the first cache. The kernels spell it out."""
 
-PART = ("full", "rest", "rest_is_float", "rank", "table", "step")
+PART = ("full", "rest", "rest_is_float", "rank", "table", "step", "covers")
 """Columns of `parts`, one line an edit and attribute: where the lines of 256 begin in an edit's block of
 `floats`, −1 where the edit does not move it; those of bases 1..R, in `bytes_` or `floats`; R; where its
-coefficients begin in `tables`, [S,1+R], and its steps, [R,c]."""
+coefficients begin in `tables`, [S,1+R], and its steps, [R,c]; the line of `progdf.coverage` in `floats`."""
 
 EDIT = ("floats", "float_lines", "bytes", "byte_lines")
 """Columns of `edits`: where its blocks begin in `floats`, the lines of 256 of each; the same in `bytes_`."""
@@ -74,7 +74,7 @@ def compose_rows(
         numbers: [L,5], see `NUMBER`
         bounds: where each block begins in each layer's list. [L,B+1]
         list_members, list_rows: a layer's members among `rows`, and where these are in it; lists back to back
-        edits, parts: [E,4], [E,A,6], see `EDIT`, `PART`
+        edits, parts: [E,4], [E,A,7], see `EDIT`, `PART`
         floats, bytes_: bases as they are stored
         tables: coefficients and steps
         weights: per member
@@ -122,15 +122,14 @@ def compose_rows(
                     start = layers[index, 1] + bounds[index, block]
                     found = bounds[index, block + 1] - bounds[index, block]
                     gain = numbers[index, columns[attribute, 3]]
-                    moves = parts[layers[index, 0], attribute, 0] >= 0 and gain != 0
-                    if found == 0 or not (moves or over):
+                    edit = layers[index, 0]
+                    if found == 0 or parts[edit, attribute, 0] < 0 or gain == 0:
                         continue
-                    whole = found == count and layers[index, 3] < 0 and not over
-                    if moves:
-                        _sum(
-                            values, total if empty and whole else offset, list_members, start, found, layers,
-                            numbers, index, attribute, c, width, edits, parts, floats, bytes_, tables,
-                        )  # fmt: skip
+                    whole = found == count and layers[index, 3] < 0 and (empty or not over)
+                    _sum(
+                        values, total if empty and whole else offset, list_members, start, found, layers,
+                        numbers, index, attribute, c, width, edits, parts, floats, bytes_, tables,
+                    )  # fmt: skip
                     if empty and whole:
                         empty = False
                         if gain != one:
@@ -145,16 +144,17 @@ def compose_rows(
                         for i in range(count):
                             values[total + np.uint64(i)] += gain * values[offset + np.uint64(i)]
                         continue
-                    cover = numbers[index, 1]
+                    hidden = numbers[index, 1] * min(abs(gain), one)
+                    full, covers = np.uint64(edits[edit, 0]), parts[edit, attribute, 6]
                     for i in range(found):
                         share = shares[index * 256 + i]
                         if share == 0.0:
                             continue
                         row = total + np.uint64(list_rows[start + i] - begin)
                         if over:
-                            values[row] *= one - share * cover
-                        if moves:
-                            values[row] += (share * gain) * values[offset + np.uint64(i)]
+                            at = full + _place(list_members[start + i], edits[edit, 1], covers)
+                            values[row] *= one - (share * hidden) * floats[at]
+                        values[row] += (share * gain) * values[offset + np.uint64(i)]
                 if empty:
                     for i in range(count):
                         values[total + np.uint64(i)] = np.float32(-0.0)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from progdf.checkpoint import Gdf
 from progdf.compose_kernel import BLOCK, COLUMN, EDIT, LAYER, NUMBER, PART
+from progdf.coverage import coverage
 from progdf.gaussians import Gaussians
 from progdf.layers import KINDS
 
@@ -116,7 +117,7 @@ class FlatEdits:
     """All edits as the kernel reads them.
 
     Args:
-        edits, parts: [E,4], [E,A,6], see `compose_kernel.EDIT`, `PART`
+        edits, parts: [E,4], [E,A,7], see `compose_kernel.EDIT`, `PART`
         floats, bytes_: lines of 256 numbers of each block of members, blocks and edits back to back
         tables: coefficients and steps of all attributes of all edits
         nodes: of each edit
@@ -130,8 +131,8 @@ class FlatEdits:
     nodes: tuple[tuple[float, ...], ...]
 
 
-def flat_edits(gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
-    """Lay out the edits' bases for these attributes."""
+def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
+    """Lay out the edits' bases for these attributes, and what they cover."""
     edits = np.zeros((len(gdfs), len(EDIT)), np.int64)
     parts = np.full((len(gdfs), len(names), len(PART)), -1, np.int64)
     floats, bytes_ = [np.zeros(0, np.float32)], [np.zeros(0, np.int8)]
@@ -140,6 +141,10 @@ def flat_edits(gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
     for i, gdf in enumerate(gdfs):
         float_lines: list[NDArray[np.float32]] = []
         byte_lines: list[NDArray[np.int8]] = []
+        covers: dict[str, int] = {}
+        for kind, covered in coverage(scene, gdf).items():
+            covers[kind] = len(float_lines)
+            float_lines.append(covered.numpy())
         for j, name in enumerate(names):
             bases = gdf.field.attributes.get(name)
             if bases is None:
@@ -156,7 +161,7 @@ def flat_edits(gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
             table, step = ends[2], ends[2] + bases.coefficients.numel()
             tables += [bases.coefficients.numpy().reshape(-1), bases.step.numpy().reshape(-1)]
             ends[2] = step + bases.step.numel()
-            parts[i, j] = full, lines, is_float, len(bases.rest), table, step
+            parts[i, j] = full, lines, is_float, len(bases.rest), table, step, covers[KINDS[name]]
         edits[i] = ends[0], len(float_lines), ends[1], len(byte_lines)
         floats.append(in_blocks(float_lines, np.float32))
         bytes_.append(in_blocks(byte_lines, np.int8))

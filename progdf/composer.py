@@ -75,7 +75,7 @@ class Composer:
         self._reach = np.unique(np.concatenate([np.zeros(0, np.int64), *self._members]))
         self._names = tuple(n for n in ATTRIBUTES if any(n in gdf.field.attributes for gdf in gdfs))
         self._moving = [frozenset(gdf.field.attributes) for gdf in gdfs]
-        self._edits = flat_edits(gdfs, self._names)
+        self._edits = flat_edits(scene, gdfs, self._names)
         self._base, self._out, self._columns = flat_scene(scene, self._names, self._reach)
         tensors: dict[str, Any] = {}
         for name, (_, _, at) in zip(self._names, self._columns[:, :3].tolist(), strict=True):

@@ -11,7 +11,9 @@ import torch
 from progdf.checkpoint import Gdf
 from progdf.compose import BLENDS, Gains, Layer, compose
 from progdf.composer import Composer
+from progdf.coverage import coverage
 from progdf.errors import ProgdfError
+from progdf.field import fit_keyframes
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
 from progdf.rasterize import set_threads
 from tests.edits import bits, curved_field, edit_of, some_rows
@@ -134,11 +136,73 @@ def test_normalised_shares_where_strengths_add_up_to_more(scene: Gaussians, shir
     assert torch.allclose(shared, summed / 1.5, atol=1e-6)
 
 
-def test_over_puts_the_last_layer_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+def test_over_puts_what_the_last_layer_changes_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
+    hidden = both[coverage(scene, hat)["colour"][torch.searchsorted(hat.region.members, both)] == 1]
+    assert len(hidden) > 10
     stacked = compose(scene, [Layer(shirt, 1.0), Layer(hat, 1.0)], "over")
     alone = compose(scene, [Layer(hat, 1.0)])
-    assert torch.allclose(pack(stacked, True)[both], pack(alone, True)[both], atol=1e-6)
+    assert torch.allclose(stacked.sh0[hidden], alone.sh0[hidden], atol=1e-6)
+
+
+def test_over_shows_the_layers_below_where_the_last_one_changes_nothing(scene: Gaussians, shirt: Gdf) -> None:
+    gold = compose(scene, [Layer(shirt, 0.8)])
+    for s in (0.3, 1.0):
+        stacked = compose(scene, [Layer(shirt, 0.8), Layer(striped(scene, shirt), s)], "over")
+        between = shirt.region.members[::2]
+        assert bits(stacked[between]) == bits(gold[between]), "between the stripes"
+        for name in ATTRIBUTES:
+            if name != "sh0":
+                assert torch.equal(getattr(stacked, name), getattr(gold, name)), "what stripes do not move"
+    stripe = shirt.region.members[1::2]
+    assert torch.allclose(stacked.sh0[stripe], scene.sh0[stripe] + 1.0, atol=1e-6)
+
+
+def striped(scene: Gaussians, below: Gdf) -> Gdf:
+    """Every other member of the edit below brighter by 1, the others as they are."""
+    changes = torch.zeros(3, len(below.region), 14)
+    changes[1:, 1::2, 11:14] = torch.tensor([0.5, 1.0])[:, None, None]
+    field = fit_keyframes(torch.tensor([0.0, 0.5, 1.0]), changes, 2)
+    return edit_of(scene, below.region.members, field, "stripes")
+
+
+@pytest.mark.parametrize("dragged", [0, 1])
+def test_over_moves_continuously_with_either_slider(scene: Gaussians, shirt: Gdf, dragged: int) -> None:
+    stripes = striped(scene, shirt)
+
+    def at(s: float) -> torch.Tensor:
+        strengths = [0.7, 0.7]
+        strengths[dragged] = s
+        layers = [Layer(gdf, own) for gdf, own in zip((shirt, stripes), strengths, strict=True)]
+        return pack(compose(scene, layers, "over"))
+
+    largest = float((at(1.0) - at(0.0)).abs().max())
+    steps = [float((at(s) - at(s - 0.01)).abs().max()) for s in (0.01, 0.02, 0.35, 0.7, 0.71, 1.0)]
+    # a bent course is up to a few times as fast as a straight one
+    assert max(steps) < 0.05 * largest
+
+
+def test_over_hides_as_much_of_a_kind_as_its_gain_lets_through(scene: Gaussians, shirt: Gdf) -> None:
+    top = striped(scene, shirt)
+    below = compose(scene, [Layer(shirt, 1.0)])
+    for gain in (0.0, 0.5):
+        stacked = compose(scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(colour=gain))], "over")
+        stripe = shirt.region.members[1::2]
+        expected = torch.lerp(below.sh0[stripe], scene.sh0[stripe] + 1.0, gain)
+        assert torch.allclose(stacked.sh0[stripe], expected, atol=1e-6)
+
+
+def test_coverage_rises_with_the_change_of_each_kind_and_ends_at_one(scene: Gaussians) -> None:
+    changes = torch.zeros(2, 40, 14)
+    changes[1, :, 0] = 0.001  # of a region some units wide: nobody sees it
+    changes[1, :, 11] = torch.linspace(0, 2, 40)
+    edit = edit_of(scene, torch.arange(40), fit_keyframes(torch.tensor([0.0, 1.0]), changes, 2))
+    covered = coverage(scene, edit)
+    assert set(covered) == {"geometry", "colour"}
+    assert float(covered["geometry"].max()) < 1e-3
+    assert float(covered["colour"][0]) == 0.0
+    assert bool((covered["colour"].diff() >= 0).all())
+    assert bool((covered["colour"][20:] == 1.0).all()), "half of the largest changes, and more"
 
 
 def test_an_overshooting_layer_alone_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:

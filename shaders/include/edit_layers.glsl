@@ -8,11 +8,11 @@
 //
 // A slot counts the Gaussians that are a member of any edit; a target is one of the textures that are written.
 
-uniform sampler2D edit_floats;    // original attributes; full offsets; bases that are kept as floats
+uniform sampler2D edit_floats;    // original attributes; full offsets; what is covered; bases that are kept as floats
 uniform isampler2D edit_levels;   // bases that are kept as int8
 uniform isampler2D edit_places;   // which member of an edit a slot is, −1 where it is none
 uniform sampler2D edit_weights;   // painted strength of a layer's members, 0..1
-uniform isampler2D edit_layers;   // LAYER_TEXELS a layer: places, weights, numbers, –; then full, rest, rank, numbers
+uniform isampler2D edit_layers;   // LAYER_TEXELS a layer: places, weights, numbers, covers; then full, rest, rank, numbers
                                   // for every target. Indices of texels. weights −1: all are 1; rest −1: bases 1 to
                                   // rank follow the full offset; numbers −1: the layer does not move this target
 uniform sampler2D edit_numbers;   // of a layer: cover, –, –, –; of its targets: gain, then factor₀ … factor_rank
@@ -27,6 +27,7 @@ struct Part {
     int member;    // −1: none
     float share;   // painted strength, 0..1
     float cover;   // strength without its overshoot, 0..1
+    vec4 hides;    // of geometry, opacity and colour (progdf/coverage.py), 0..1; only where blend is OVER
 };
 
 ivec2 texel_at(int index) {
@@ -40,7 +41,9 @@ Part part_of(int layer, int slot) {
     float share = 1.0;
     if (member >= 0 && begins.y >= 0) share = texelFetch(edit_weights, texel_at(begins.y + member), 0).x;
     if (share == 0.0) member = -1;
-    return Part(member, share, texelFetch(edit_numbers, texel_at(begins.z), 0).x);
+    vec4 hides = vec4(0.0);
+    if (member >= 0 && blend == OVER) hides = texelFetch(edit_floats, texel_at(begins.w + member), 0);
+    return Part(member, share, texelFetch(edit_numbers, texel_at(begins.z), 0).x, hides);
 }
 
 // Lays one layer on top of `total`.
@@ -48,7 +51,6 @@ Part part_of(int layer, int slot) {
 // target: which of the textures; width: texels a Gaussian in it; column: which of them.
 // moved: components that have an offset so far; the others keep the bits of the original.
 void add(inout vec4 total, inout bvec4 moved, Part part, int layer, int target, int width, int column) {
-    if (blend == OVER) total *= 1.0 - part.share * part.cover;
     ivec4 bases = texelFetch(edit_layers, texel_at(LAYER_TEXELS * layer + 1 + target), 0);
     if (bases.w < 0) return;
     bool as_floats = bases.y < 0;
@@ -66,6 +68,10 @@ void add(inout vec4 total, inout bvec4 moved, Part part, int layer, int target, 
         }
     }
     vec4 gain = texelFetch(edit_numbers, texel_at(bases.w), 0);
+    if (blend == OVER) {
+        vec4 hides = target == 0 ? part.hides.xxxy : target < 3 ? part.hides.xxxx : part.hides.zzzz;
+        total *= 1.0 - part.share * part.cover * min(abs(gain), 1.0) * hides;
+    }
     bvec4 moves = notEqual(gain, vec4(0.0));   // a gain of 0 leaves every bit; 0 · offset might not
     total = mix(total, total + (part.share * gain) * offset, moves);
     moved = bvec4(moved.x || moves.x, moved.y || moves.y, moved.z || moves.z, moved.w || moves.w);

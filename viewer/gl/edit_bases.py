@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from progdf.checkpoint import Gdf
+from progdf.coverage import coverage
 from progdf.field.baked import AttributeBases
 from progdf.gaussians import Gaussians
 
@@ -61,6 +62,8 @@ class PackedEdits:
         levels: [·,4] int8
         places: for each edit in turn, which member each slot is, −1 where none. [E·U] int32
         edits: by target, what each edit does to it
+        covers: where each edit's texels of geometry, opacity and colour begin in `floats`, see
+            `progdf.coverage`; one a member
         nodes: strengths of each edit's coefficients. [S] each
         sh_coefficients: K of shN that are shown
     """
@@ -71,6 +74,7 @@ class PackedEdits:
     levels: NDArray[np.int8]
     places: NDArray[np.int32]
     edits: tuple[Mapping[int, TargetBases], ...]
+    covers: tuple[int, ...]
     nodes: tuple[NDArray[np.float64], ...]
     sh_coefficients: int
 
@@ -110,6 +114,7 @@ def pack_edits(scene: Gaussians, gdfs: Sequence[Gdf]) -> PackedEdits:
         places[edit, np.searchsorted(slots, own)] = np.arange(len(own))
     floats, levels = _List(), _List()
     edits = [_edit(gdf, shown, floats, levels) for gdf in gdfs]
+    covers = [floats.put(_covers(scene, gdf)) for gdf in gdfs]
     moved = {target for edit in edits for target in edit}
     originals = [-1] * len(TARGETS)
     for target in sorted(moved):
@@ -121,6 +126,7 @@ def pack_edits(scene: Gaussians, gdfs: Sequence[Gdf]) -> PackedEdits:
         levels.joined(np.int8),
         places.reshape(-1),
         tuple(edits),
+        tuple(covers),
         tuple(gdf.field.nodes.double().numpy() for gdf in gdfs),
         shown,
     )
@@ -135,6 +141,14 @@ def _edit(gdf: Gdf, shown: int, floats: _List, levels: _List) -> dict[int, Targe
         if attributes and not (texture == "shN" and shown == 0):
             found[target] = _target(attributes, shown, floats, levels)
     return found
+
+
+def _covers(scene: Gaussians, gdf: Gdf) -> Floats:
+    """What a member covers of geometry, opacity and colour. [M,4]"""
+    texels = np.zeros((len(gdf.region), 4), np.float32)
+    for kind, covered in coverage(scene, gdf).items():
+        texels[:, ("geometry", "opacity", "colour").index(kind)] = covered.numpy()
+    return texels
 
 
 def _target(

@@ -66,7 +66,7 @@ EDIT_LAYER = np.dtype(
         ("places", "<i4"),
         ("weights", "<i4"),
         ("numbers", "<i4"),
-        ("unused", "<i4"),
+        ("covers", "<i4"),
         ("targets", EDIT_TARGET, len(TARGETS)),
     ]
 )
