@@ -18,7 +18,7 @@ from .widgets import elided, grouped, icon_button, let_go, right_edge, section, 
 BLEND_HELP = {
     "normalised": "Overlapping edits share a Gaussian by their weights; never more than a full edit.",
     "sum": "Overlapping edits add up.",
-    "over": "A later edit covers the ones above it in the list, as far as its strength goes.",
+    "over": "An edit covers the lower ones where it changes something itself, as far as its strength goes.",
 }
 TOGGLE_PX, GRIP_PX = 24.0, 4.0
 
