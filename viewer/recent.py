@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from progdf.files import written_whole
+from progdf.user_folders import state_folder
 
 MOST = 8
-
-
-def state_folder() -> Path:
-    """Where programs keep what they remember: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "progdf"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Application Support" / "progdf"
-    return Path(os.environ.get("XDG_STATE_HOME", Path.home() / ".local" / "state")) / "progdf"
 
 
 def read(folder: Path | None = None) -> tuple[Path, ...]:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import json
 import logging
 import os
-import sys
+import shutil
 import tempfile
 import threading
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from numba import config
 
+from progdf.errors import ProgdfError
+from progdf.files import written_whole
 from progdf.rasterize.threads import threads
+from progdf.user_folders import cache_folder, is_private, temporary_folder
 
 log = logging.getLogger("progdf")
 
@@ -43,23 +49,71 @@ def _cache_folder() -> Path:
     """A folder that this user may write, for this version of the kernels; never in the source tree."""
     if "NUMBA_CACHE_DIR" in os.environ:
         root = Path(os.environ["NUMBA_CACHE_DIR"])
-    elif sys.platform == "win32":
-        root = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "progdf" / "kernels"
-    elif sys.platform == "darwin":
-        root = Path.home() / "Library" / "Caches" / "progdf" / "kernels"
     else:
-        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "progdf" / "kernels"
-    folder = root / _source_version()
+        root = cache_folder() / "kernels"
+    temporary = temporary_folder()
+    for place in (root, temporary / "kernels"):
+        folder = place / _source_version()
+        try:
+            if place.parent == temporary:
+                temporary.mkdir(mode=0o700, exist_ok=True)
+                if not is_private(temporary):  # machine code of somebody else's is not run
+                    continue
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    log.warning("%s cannot be written; the kernels are compiled anew in every process", root)
+    folder = Path(tempfile.mkdtemp(prefix="progdf-kernels-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+_SUMS = "checksums.json"
+
+
+def record_cache(folder: Path) -> None:
+    """Write down what the cache holds, for `drop_damaged`; where that cannot be written nothing happens."""
+    with suppress(OSError, ProgdfError):
+        sums = _checksums(folder)
+        if sums != _recorded(folder):
+            with written_whole(folder / _SUMS) as beside:
+                beside.write_text(json.dumps(sums, indent=0), encoding="utf-8")
+
+
+def drop_damaged(folder: Path) -> bool:
+    """Remove the files of the cache that are not as they were recorded; whether any had been recorded.
+
+    numba would fail over them at every call, or run what is in them. Files that were never recorded go too:
+    their process was killed, and nobody knows whether they are whole.
+    """
+    recorded, changed = _recorded(folder), set[str]()
+    with suppress(OSError):
+        changed = {name for name, sum_ in _checksums(folder).items() if recorded.get(name) != sum_}
+        for path in [folder / name for name in changed] + (list(folder.glob("*.ready")) if changed else []):
+            path.unlink(missing_ok=True)
+    return not changed.isdisjoint(recorded)
+
+
+def _checksums(folder: Path) -> dict[str, int]:
+    """CRC-32 of the files of machine code, and of the indices that list them."""
+    files = [path for path in folder.rglob("*.nb[ic]") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
+
+
+def _recorded(folder: Path) -> dict[str, int]:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        log.warning("%s cannot be written; the kernels are compiled anew in every process", folder)
-        return Path(tempfile.mkdtemp(prefix="progdf-kernels-"))
+        found = json.loads((folder / _SUMS).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 CACHE = _cache_folder()
+if drop_damaged(CACHE):
+    log.warning("kernels kept in %s were damaged and are compiled anew", CACHE)
+atexit.register(record_cache, CACHE)
 
 
 def kernel(
@@ -124,5 +178,7 @@ def _compiling(stage: str, seconds: int) -> Iterator[int]:
             )
         yield threads()
         if cold:
-            marker.touch()
+            record_cache(CACHE)
+            with suppress(OSError):
+                marker.touch()
         _ready.add(stage)

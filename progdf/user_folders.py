@@ -1,0 +1,45 @@
+"""Where programs keep what is the user's own: caches, and what they remember. Never raises, makes nothing."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+
+def cache_folder() -> Path:
+    """For what can be made again: %LOCALAPPDATA%, ~/Library/Caches or $XDG_CACHE_HOME."""
+    return _folder("XDG_CACHE_HOME", ".cache", "Caches")
+
+
+def state_folder() -> Path:
+    """For what is remembered from one time to the next: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
+    return _folder("XDG_STATE_HOME", ".local/state", "Application Support")
+
+
+def temporary_folder() -> Path:
+    """One of the user's own where temporary files are, for who has no home or may not write there."""
+    who = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
+    return Path(tempfile.gettempdir()) / f"progdf-{who}"
+
+
+def is_private(folder: Path) -> bool:
+    """Whether nobody but the user could have put something into a folder."""
+    if sys.platform == "win32":
+        return True
+    found = folder.lstat()
+    return found.st_uid == os.getuid() and not folder.is_symlink() and not found.st_mode & 0o022
+
+
+def _folder(variable: str, unix: str, mac: str) -> Path:
+    try:
+        home = Path.home()
+    except RuntimeError:  # no HOME, and the system does not know the user
+        return temporary_folder()
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local") / "progdf"
+    if sys.platform == "darwin":
+        return home / "Library" / mac / "progdf"
+    return Path(os.environ.get(variable) or home / unix) / "progdf"
