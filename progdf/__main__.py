@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import importlib
+import io
+import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
 
 from progdf.errors import ProgdfError
-from progdf.files import disk_full
+from progdf.files import disk_full, written_whole
+from progdf.terminal import PrintableFormatter, printable
+from progdf.user_folders import state_folder
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.demo:main", "make a scene, train its region edits, write previews, open the window"),
@@ -42,8 +54,41 @@ def _usage() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status: 0 done, 2 the user can mend it, 130 interrupted."""
+    """Run one command and return its exit status.
+
+    0 done; 2 the user can mend it; 70 it is a mistake of ours, kept in a file; 130 interrupted.
+    """
+    _open_standard_streams()
+    if logging.lastResort is not None:  # prints warnings where no program has said otherwise
+        logging.lastResort.setFormatter(PrintableFormatter())
     arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with _signals_end(arguments[:1] != ["view"]):
+            status = _run(arguments)
+            if sys.stdout is not None:
+                sys.stdout.flush()  # here, where a full disk or a closed pipe can still be told
+            return status
+    except ProgdfError as error:
+        return _failed(str(error))
+    except BrokenPipeError:  # `progdf info … | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        right = "; the disk takes no more, free some space" if disk_full(error) else ""
+        return _failed(f"{where}{error.strerror or error}{right}")
+    except KeyboardInterrupt as interrupt:
+        return _failed(f"interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", 130)
+    except Exception as error:
+        if _out_of_memory(error):
+            return _failed(
+                "this takes more memory than there is; close other programs, or take a smaller scene"
+            )
+        told = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        return _failed(f"a mistake in progdf itself ({told[:200]}); {_kept_details()}", 70)
+
+
+def _run(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(_usage())
         return 0
@@ -53,31 +98,76 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"progdf {__version__}")
         return 0
     if arguments[0] not in COMMANDS:
-        print(
-            f"progdf: there is no command '{arguments[0]}'; try one of {', '.join(COMMANDS)}", file=sys.stderr
-        )
-        return 2
+        raise ProgdfError(f"there is no command '{arguments[0]}'; try one of {', '.join(COMMANDS)}")
     module, function = COMMANDS[arguments[0]][0].split(":")
+    return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
+
+
+def _failed(line: str, status: int = 2) -> int:
+    print(f"progdf: {printable(' '.join(line.split()))}", file=sys.stderr)
+    return status
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """torch raises a RuntimeError of its allocator's."""
+    told = str(error) if isinstance(error, RuntimeError) else ""
+    return isinstance(error, MemoryError) or "allocate memory" in told or "not enough memory" in told
+
+
+def _kept_details() -> str:
+    """Where the traceback of the present exception was written."""
+    details = f"progdf {' '.join(map(repr, sys.argv[1:]))}\n\n{traceback.format_exc()}"
+    for folder in (state_folder(), Path(tempfile.gettempdir())):
+        path = folder / "crash.txt" if folder.name == "progdf" else folder / f"progdf-crash-{os.getpid()}.txt"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as beside:
+                beside.write_text(details, encoding="utf-8", errors="backslashreplace")
+        except (OSError, ProgdfError):
+            continue
+        return f"please report it with {path}"
+    return f"please report it; no file could be written with the details: {details}"
+
+
+@contextmanager
+def _signals_end(wanted: bool) -> Iterator[None]:
+    """SIGTERM and a closed terminal end a command as Ctrl-C does: temporary files go, a run tells the way on.
+
+    Args:
+        wanted: false for the window, whose loop has its own way
+    """
+    names = ("SIGTERM", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    if not wanted or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    earlier = {number: signal.getsignal(number) for number in numbers}
+    theirs = [number for number, was in earlier.items() if was == signal.SIG_DFL]  # nohup's stays
     try:
-        return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
-    except ProgdfError as error:
-        print(f"progdf: {_one_line(error)}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:  # `progdf info … | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        right = "; the disk takes no more, free some space" if disk_full(error) else ""
-        print(f"progdf: {where}{error.strerror or _one_line(error)}{right}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as interrupt:
-        print(f"progdf: interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", file=sys.stderr)
-        return 130
+        for number in theirs:
+            signal.signal(number, stop)
+        yield
+    finally:
+        for number in theirs:
+            signal.signal(number, signal.SIG_DFL)
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _open_standard_streams() -> None:
+    """Where 0, 1 or 2 is closed, the next file that is opened would get what is printed."""
+    for handle in range(3):
+        try:
+            os.fstat(handle)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that knows no “…” gets an escape
+            stream.reconfigure(errors="backslashreplace")
 
 
 if __name__ == "__main__":

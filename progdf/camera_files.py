@@ -20,7 +20,7 @@ from progdf.camera import Camera
 from progdf.colmap import find_model, load_model
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
-from progdf.json_values import angle_at, matrix_at, number_at, pixels_at, table_at
+from progdf.json_values import angle_at, decode_json, matrix_at, number_at, pixels_at, table_at
 from progdf.lens import Lens
 
 _log = logging.getLogger(__name__)
@@ -95,12 +95,12 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     if Path(path).name in _MODEL_FILES and (model := find_model(Path(path).parent)):
         return load_model(model)
     try:
-        content = json.loads(Path(path).read_bytes())
+        content = decode_json(Path(path).read_bytes())
     except OSError as error:
         raise open_failure(path, error) from None
-    except (ValueError, RecursionError):
+    except ValueError as error:
         raise ProgdfError(
-            f"{name} is not JSON; give a cameras.json, a transforms.json or a file of saved cameras"
+            f"{name} is not JSON ({error}); give a cameras.json, a transforms.json or a file of saved cameras"
         ) from None
     match content:
         case {"frames": list() as frames}:
@@ -212,15 +212,14 @@ def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, 
     """From the file, else from the picture it names (synthetic NeRF scenes have no w and h)."""
     if "w" in table and "h" in table:
         return pixels_at(where, table, "w"), pixels_at(where, table, "h")
-    from PIL import Image
+    from progdf.pictures import picture_size  # Pillow, which files with sizes do without
 
     for suffix in _IMAGE_SUFFIXES:
         picture = path.parent / (str(table.get("file_path", "")) + suffix)
         if picture.is_file():
             try:
-                with Image.open(picture) as image:
-                    return image.size
-            except (OSError, Image.DecompressionBombError):
+                return picture_size(picture)
+            except ProgdfError:
                 raise ProgdfError(
                     f"{picture}, which {where} names, is no image; repair or replace it"
                 ) from None

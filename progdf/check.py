@@ -13,6 +13,7 @@ from progdf.camera_files import load_cameras
 from progdf.command_line import parsed
 from progdf.ply import load_ply_with_report
 from progdf.survey import survey
+from progdf.terminal import say
 from progdf.up_axis import UpChoice, convention_of, find_up
 
 
@@ -38,5 +39,5 @@ def main(argv: Sequence[str]) -> int:
     cameras = [] if options.cameras is None else load_cameras(options.cameras)
     up = find_up(scene, cameras, options.up, convention_of(options.scene))
     for line in report.lines() + survey(scene, up).lines():
-        print(line)
+        say(line)
     return 0

@@ -41,6 +41,11 @@ from progdf.region import Region
 from progdf.region_packing import packed_region, unpacked_region
 from progdf.tensor_file import table_of, write_tensors
 
+_FAR = 1e18
+"""An offset that is larger is absurd, as a position is (see `progdf.repair`)."""
+_FARTHEST = {"log_scales": 80.0}
+"""Where it is another number: e^80 fits into float32, with a scale of any scene too."""
+
 
 @dataclass(frozen=True)
 class Gdf:
@@ -190,7 +195,9 @@ def load_gdf(
             f"{name} was made for another scene: {scene_name} has its Gaussians, but they look different"
         )
     try:
-        return replace(gdf, field=gdf.field.origin.baked(rows))
+        baked = gdf.field.origin.baked(rows)
+        _check_reach(baked)
+        return replace(gdf, field=baked)
     except (ValueError, RuntimeError) as error:
         raise contradiction(name, error) from error
 
@@ -232,7 +239,8 @@ def _assembled(head: GdfHead, tensors: dict[str, Tensor]) -> Gdf:
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} has a number that is not finite")
     field, form = unpacked_field(head.field, tensors)
-    region = unpacked_region(head.region, tensors, head.scene.count)
+    region = unpacked_region(head.region, tensors, head.scene.count, head.members)
+    _check_reach(field)
     if head.members is not None and head.members != len(region):
         raise ValueError(f"the header tells of {head.members} members, the region has {len(region)}")
     if form is not None and form.network.members != len(region):
@@ -246,6 +254,18 @@ def _assembled(head: GdfHead, tensors: dict[str, Tensor]) -> Gdf:
         options=head.options,
         report=head.report,
     )
+
+
+def _check_reach(field: BakedField) -> None:
+    """Raises ValueError where an offset, whatever the strength, is beyond any scene: sums would overflow."""
+    for name, bases in field.attributes.items():
+        most = bases.coefficients.abs().amax(0).double()
+        reach = float(most[0]) * float(bases.full.abs().max() if bases.full.numel() else 0.0)
+        if bases.rest.numel():
+            peaks = bases.rest.abs().amax(1).double() * bases.step.abs().double()
+            reach += float(most[1:] @ peaks.amax(1))
+        if not reach < _FARTHEST.get(name, _FAR):
+            raise ValueError(f"{name} moves by up to {reach:.3g}, farther than any scene reaches")
 
 
 def _checksum(header: str, tensors: Mapping[str, Tensor]) -> str:

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from progdf.field.bake import BakePlan, NeuralForm
 from progdf.field.baked import AttributeBases, BakedField
-from progdf.field.neural import NeuralField, NeuralShape
+from progdf.field.neural import NeuralField
 from progdf.gaussians import ATTRIBUTES
+from progdf.gdf_head import FieldTable, NetworkTable
 
 _PARTS = ("full", "rest", "step", "coefficients")
 _NETWORK = "network."
@@ -48,40 +49,37 @@ def packed_field(field: BakedField) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, described
 
 
-def unpacked_field(
-    described: Mapping[str, Any], tensors: Mapping[str, Tensor]
-) -> tuple[BakedField, NeuralForm | None]:
+def unpacked_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[BakedField, NeuralForm | None]:
     """The inverse of `packed_field`; of a network, a field that is not baked yet and moves nothing, and it.
 
     Raises:
         ValueError, KeyError, TypeError: the parts do not fit each other.
     """
-    recorded = tuple(float(s) for s in described["recorded"])
-    names = list(described["attributes"])
-    for name in names:
+    recorded = tuple(table.recorded)
+    for name in table.attributes:
         if name not in ATTRIBUTES:
             raise ValueError(f"there is no attribute {name}")
-    channels = int(described["channels"])
-    if "network" not in described:
+    if table.network is None:
         attributes = {
-            name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS}) for name in names
+            name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS})
+            for name in table.attributes
         }
-        return BakedField(str(described["kind"]), tensors["nodes"], attributes, channels, recorded), None
-    form = _unpacked_network(described["network"], tensors, recorded)
-    if form.network.shape.channels != channels:
-        raise ValueError(f"the network has {form.network.shape.channels} channels, the field {channels}")
-    return BakedField("neural", torch.tensor([0.0, 1.0]), {}, channels, recorded, form), form
+        return BakedField(table.kind, tensors["nodes"], attributes, table.channels, recorded), None
+    form = _unpacked_network(table.network, tensors, recorded)
+    if form.network.shape.channels != table.channels:
+        raise ValueError(
+            f"the network has {form.network.shape.channels} channels, the field {table.channels}"
+        )
+    return BakedField("neural", torch.tensor([0.0, 1.0]), {}, table.channels, recorded, form), form
 
 
 def _unpacked_network(
-    described: Mapping[str, Any], tensors: Mapping[str, Tensor], recorded: tuple[float, ...]
+    table: NetworkTable, tensors: Mapping[str, Tensor], recorded: tuple[float, ...]
 ) -> NeuralForm:
-    layout = dict(described["shape"])
-    shape = NeuralShape(**{**layout, "attributes": tuple(str(name) for name in layout["attributes"])})
     end = tensors["end"]
     codes = tensors.get("codes", torch.zeros(len(end), 0, dtype=torch.int8))
     network = NeuralField(
-        shape,
+        table.shape,
         {name.removeprefix(_NETWORK): t for name, t in tensors.items() if name.startswith(_NETWORK)},
         end,
         codes,
@@ -89,6 +87,5 @@ def _unpacked_network(
         recorded,
     )
     pull = {name.removeprefix("pull."): t for name, t in tensors.items() if name.startswith("pull.")}
-    ranks = {str(name): int(rank) for name, rank in dict(described["ranks"]).items()}
-    error = {str(name): float(value) for name, value in dict(described["bake_error"]).items()}
-    return NeuralForm(network, BakePlan(tensors["nodes"], ranks, pull), str(described["rows_sha256"]), error)
+    plan = BakePlan(tensors["nodes"], table.ranks, pull)
+    return NeuralForm(network, plan, table.rows_sha256, table.bake_error)

@@ -7,26 +7,42 @@ tensors hold is checked when they are read (`checkpoint.load_gdf`), before anyth
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import msgspec
 
 from progdf.errors import ProgdfError
+from progdf.field.neural import NeuralShape
 from progdf.files import open_failure
+from progdf.json_values import decode_json, typed
 
 FORMAT = 2
 """Newest version of the file format; those down to 1 are read. A file states the oldest that can hold it: 1,
 or 2 where it keeps a network."""
 
-MOST_GAUSSIANS = 1 << 28
+MOST_GAUSSIANS = 1 << 26
 """A header that claims a larger scene is not believed: the score would take gigabytes."""
 
-_MOST_HEADER = 100_000_000
-_BYTES = {"F64": 8, "I64": 8, "F32": 4, "I32": 4, "F16": 2, "I16": 2, "I8": 1, "U8": 1, "BOOL": 1}
+_MOST_HEADER = (
+    1 << 24
+)  # bytes; a report takes a few kilobytes, a gigabyte could be made of a hundred megabytes
+_Type = Literal["F64", "I64", "F32", "I32", "F16", "I16", "I8", "U8", "BOOL"]
+_BYTES: Mapping[_Type, int] = {
+    "F64": 8,
+    "I64": 8,
+    "F32": 4,
+    "I32": 4,
+    "F16": 2,
+    "I16": 2,
+    "I8": 1,
+    "U8": 1,
+    "BOOL": 1,
+}
 
 
 @dataclass(frozen=True)
@@ -35,6 +51,52 @@ class SceneFingerprint:
 
     count: int
     means_sha256: str
+
+
+class NetworkTable(msgspec.Struct, frozen=True):
+    """A network in a header: its layout, how many bases each attribute is baked to, and what that costs."""
+
+    shape: NeuralShape
+    ranks: dict[str, int]
+    rows_sha256: str
+    bake_error: dict[str, float]
+
+
+class FieldTable(msgspec.Struct, frozen=True):
+    """A field in a header, see `BakedField`; `network` where one is kept in its place."""
+
+    kind: str
+    channels: int
+    attributes: list[str]
+    recorded: list[float]
+    network: NetworkTable | None = None
+
+
+class _Header(msgspec.Struct, frozen=True):
+    """The JSON header."""
+
+    format: int
+    name: str
+    region: str
+    instruction: str
+    scene: SceneFingerprint
+    field: FieldTable
+    options: dict[str, Any]
+    report: dict[str, Any]
+    members: Annotated[int, msgspec.Meta(ge=0)] | None = None
+
+
+class _Tensor(msgspec.Struct, frozen=True):
+    """A tensor in the table of a safetensors file."""
+
+    dtype: _Type
+    shape: Annotated[list[Annotated[int, msgspec.Meta(ge=0)]], msgspec.Meta(max_length=8)]
+    data_offsets: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        first, last = self.data_offsets
+        if not 0 <= first <= last or last - first != math.prod(self.shape) * _BYTES[self.dtype]:
+            raise ValueError(f"{self.dtype} {self.shape} does not take the bytes {first} to {last}")
 
 
 @dataclass(frozen=True)
@@ -51,7 +113,7 @@ class GdfHead:
         name, region, instruction: the layer's, the region's, and what was asked for
         members: Gaussians of the region; None where an old file does not say
         scene: the scene it was made for
-        field: kind, channels, attributes …, as `field_packing.packed_field` describes it
+        field: kind, channels, attributes …, see `field_packing.packed_field`
         options, report: of the training, JSON values
     """
 
@@ -60,20 +122,20 @@ class GdfHead:
     verified: bool
     text: str
     sha256: str
-    tensors: Mapping[str, tuple[tuple[int, ...], str]]
+    tensors: Mapping[str, tuple[tuple[int, ...], _Type]]
     name: str
     region: str
     instruction: str
     members: int | None
     scene: SceneFingerprint
-    field: Mapping[str, Any]
+    field: FieldTable
     options: Mapping[str, Any]
     report: Mapping[str, Any]
 
     @property
     def bytes_per_member(self) -> float:
         """Bytes of the field's numbers that grow with the members, for one; of a network, its share."""
-        if "network" in self.field:
+        if self.field.network is not None:
             kept = [name for name in self.tensors if _of_network(name)]
         else:
             kept = [name for name in self.tensors if name.endswith((".full", ".rest"))]
@@ -93,9 +155,9 @@ class GdfHead:
 
     def bases(self) -> dict[str, int]:
         """How many bases each attribute has, the full offset included."""
-        if "network" in self.field:
-            return {str(name): 1 + int(rank) for name, rank in self.field["network"]["ranks"].items()}
-        return {str(name): 1 + self.tensors[f"{name}.rest"][0][0] for name in self.field["attributes"]}
+        if self.field.network is not None:
+            return {name: 1 + rank for name, rank in self.field.network.ranks.items()}
+        return {name: 1 + self.tensors[f"{name}.rest"][0][0] for name in self.field.attributes}
 
     def numbers(self, tensor: str) -> int:
         """How many numbers a tensor holds."""
@@ -135,70 +197,78 @@ def read_head(path: str | os.PathLike[str]) -> GdfHead:
 def _head(path: Path, length: int, header: bytes) -> GdfHead:
     name = path.name
     try:
-        outer = json.loads(header)
-        metadata = outer.pop("__metadata__", {})
+        outer = decode_json(header)
+        metadata = typed(outer.pop("__metadata__", {}), dict[str, str]) if isinstance(outer, dict) else {}
+        table = typed(outer, dict[str, _Tensor])
         text = metadata.get("progdf")
-        needed = 8 + len(header) + max((entry["data_offsets"][1] for entry in outer.values()), default=0)
-        tensors = {
-            str(key): (tuple(int(side) for side in entry["shape"]), str(entry["dtype"]))
-            for key, entry in outer.items()
-        }
-    except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError, OverflowError):
+    except ValueError:
         raise damaged(name) from None
-    if not isinstance(text, str):
+    if text is None:
         raise ProgdfError(
             f"{name} is a safetensors file, but not a .gdf; give one that progdf train has written"
         )
-    version = _version(text)
-    if version is None:
-        raise damaged(name)
+    try:
+        content = decode_json(text)
+        version = typed(content["format"], int)
+    except (ValueError, KeyError, TypeError):
+        raise damaged(name) from None
     if version > FORMAT:
         raise ProgdfError(f"{name} has format {version}, this progdf reads up to {FORMAT}; update progdf")
-    if isinstance(needed, int) and needed > length:
+    needed = 8 + len(header) + max((tensor.data_offsets[1] for tensor in table.values()), default=0)
+    if needed > length:
         raise ProgdfError(
             f"{name} is cut short: it has {length} of {needed} bytes; copy it again or make it again"
         )
+    tensors = {key: (tuple(tensor.shape), tensor.dtype) for key, tensor in table.items()}
     own = metadata.get("header_sha256")
-    if own is not None and own != head_checksum(text, tensors):
+    if version < 1 or (own is not None and own != head_checksum(text, tensors)):
         raise damaged(name)
     try:
-        return _described(path, length, own is not None, text, str(metadata.get("sha256")), tensors)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        found = typed(content, _Header)
+        if found.field.network is not None:
+            strange = set(content["field"]["network"]["shape"]) - {part.name for part in fields(NeuralShape)}
+            if strange:  # of a later version, perhaps, which reads the network in another way
+                raise ValueError(f"the network has {min(strange)}, which is unknown here")
+        _check(found, tensors)
+    except ValueError as error:
         raise contradiction(name, error) from error
-
-
-def _described(
-    path: Path,
-    length: int,
-    verified: bool,
-    text: str,
-    sha256: str,
-    tensors: Mapping[str, tuple[tuple[int, ...], str]],
-) -> GdfHead:
-    header = json.loads(text)
-    scene = SceneFingerprint(int(header["scene"]["count"]), str(header["scene"]["means_sha256"]))
-    if not 0 <= scene.count <= MOST_GAUSSIANS:
-        raise ValueError(f"a scene of {scene.count} Gaussians")
-    for name, (shape, dtype) in tensors.items():
-        if dtype not in _BYTES or any(side < 0 for side in shape):
-            raise ValueError(f"{name} is {dtype} {list(shape)}")
-    members = header.get("members")
     return GdfHead(
         path=path,
         size=length,
-        verified=verified,
+        verified=own is not None,
         text=text,
-        sha256=sha256,
+        sha256=metadata.get("sha256", ""),
         tensors=tensors,
-        name=str(header["name"]),
-        region=str(header["region"]),
-        instruction=str(header["instruction"]),
-        members=None if members is None else int(members),
-        scene=scene,
-        field=dict(header["field"]),
-        options=dict(header["options"]),
-        report=dict(header["report"]),
+        name=found.name,
+        region=found.region,
+        instruction=found.instruction,
+        members=found.members,
+        scene=found.scene,
+        field=found.field,
+        options=found.options,
+        report=found.report,
     )
+
+
+def _check(header: _Header, tensors: Mapping[str, tuple[tuple[int, ...], _Type]]) -> None:
+    """Whether the header fits the table of tensors, as far as the file is told by them."""
+    if not 0 <= header.scene.count <= MOST_GAUSSIANS:
+        raise ValueError(f"a scene of {header.scene.count} Gaussians")
+    sides = {"nodes": 1}
+    if header.field.network is None:
+        for name in header.field.attributes:
+            sides |= {f"{name}.full": 2, f"{name}.rest": 3, f"{name}.step": 2, f"{name}.coefficients": 2}
+    else:
+        sides |= {"end": 2}
+    for name, count in sides.items():
+        if name not in tensors or len(tensors[name][0]) != count:
+            raise ValueError(f"it has no tensor {name} of {count} sides")
+    rows = {tensors[name][0][0] for name in sides if name.endswith((".full", "end"))}
+    members = header.members if header.members is not None else max(rows, default=0)
+    if any(count != members for count in rows) or members > header.scene.count:
+        raise ValueError(
+            f"the header tells of {members} members of {header.scene.count}, the tensors of {sorted(rows)}"
+        )
 
 
 def head_checksum(text: str, tensors: Mapping[str, tuple[tuple[int, ...], str]]) -> str:
@@ -219,12 +289,3 @@ def contradiction(name: str, error: Exception) -> ProgdfError:
     """The line for a file whose parts do not fit each other."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return ProgdfError(f"{name} does not hold together ({reason}); make it again with progdf train")
-
-
-def _version(text: str) -> int | None:
-    """The format a header states; None where it states none."""
-    try:
-        version = json.loads(text)["format"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return version if isinstance(version, int) and version >= 1 else None

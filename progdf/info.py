@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import tyro
 
 from progdf import session_file
@@ -18,9 +18,11 @@ from progdf.command_line import parsed
 from progdf.errors import ProgdfError
 from progdf.files import open_failure
 from progdf.gdf_head import GdfHead
+from progdf.json_values import decode_json, typed
 from progdf.load_report import counted, file_size, grouped
 from progdf.ply import load_ply_with_report
 from progdf.survey import survey
+from progdf.terminal import say
 
 TIMELINE_MARK = "progdf_timeline"
 """The first key of every timeline file of the window, by which its kind is told."""
@@ -41,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
     path = parsed(Options, argv, "progdf info").file
     for line in _DESCRIBE[kind_of(path)](path):
-        print(line)
+        say(line)
     return 0
 
 
@@ -86,9 +88,9 @@ def _edit_lines(path: Path) -> Iterator[str]:
         yield f"asked for: {gdf.instruction}"
     yield f"scene: {counted(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
     yield f"region: {gdf.region}, {counted(members)} ({members / max(1, count):.1%})"
-    yield f"field: {gdf.field['kind']}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf)}"
-    if gdf.field["recorded"]:
-        yield f"recorded: {len(gdf.field['recorded'])} snapshots"
+    yield f"field: {gdf.field.kind}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf)}"
+    if gdf.field.recorded:
+        yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
         given = {name: value for name, value in content.items() if head == "report" or value is not None}
         for name, value in _flat(given):
@@ -100,7 +102,7 @@ def _session_lines(path: Path) -> Iterator[str]:
     yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
     for what, ref in (("scene", session.scene), *(("edit", edit) for edit in session.edits)):
         file = ref.path(path.resolve().parent)
-        known = file.is_file() and session_file.sha256(file) == ref.sha256
+        known = file.is_file() and session_file.sha256(file) == ref.sha256.lower()
         state = "as it was saved" if known else "changed since" if file.is_file() else "missing"
         yield f"{what}: {ref.file} ({state})"
     layers = session.view.get("layers", [])
@@ -113,25 +115,32 @@ def _session_lines(path: Path) -> Iterator[str]:
 
 def _timeline_lines(path: Path) -> Iterator[str]:
     try:
-        timeline = json.loads(path.read_bytes())
-        keys = [key["frame"] for key in timeline.get("keys", [])]
-    except (ValueError, KeyError, TypeError, AttributeError):
+        keys = [key.frame for key in typed(decode_json(path.read_bytes()), _Timeline).keys]
+    except ValueError:
         raise ProgdfError(f"{path} is a damaged timeline; save it anew with Ctrl+K in the window") from None
     yield f"{path.name}: a timeline of the window, {counted(len(keys), 'key')}"
     yield f"keys at frames: {_shown(keys)}"
+
+
+class _Key(msgspec.Struct):
+    frame: int
+
+
+class _Timeline(msgspec.Struct):
+    keys: list[_Key] = []
 
 
 def _form(gdf: GdfHead) -> str:
     """What a field is made of."""
     # the first is the offset at strength 1 as it was recorded, see `AttributeBases.full`
     bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
-    if "network" not in gdf.field:
+    network = gdf.field.network
+    if network is None:
         return f"{gdf.nodes} nodes; bases: {bases or 'none, nothing moves'}"
-    network = gdf.field["network"]
-    error = ", ".join(f"{name} {value:.4g}" for name, value in network["bake_error"].items())
+    error = ", ".join(f"{name} {value:.4g}" for name, value in network.bake_error.items())
     return (
-        f"{grouped(gdf.parameters)} numbers in {network['shape']['layers']} layers of "
-        f"{network['shape']['width']}; baked at {gdf.nodes} nodes with bases: {bases}; baking costs: {error}"
+        f"{grouped(gdf.parameters)} numbers in {network.shape.layers} layers of "
+        f"{network.shape.width}; baked at {gdf.nodes} nodes with bases: {bases}; baking costs: {error}"
     )
 
 

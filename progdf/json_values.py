@@ -1,18 +1,87 @@
-"""Values in a table read from JSON, checked: what is wrong is told with its place, its name and what it is.
+"""JSON from files, checked: what is wrong is told with its place, its name and what it is.
 
 `where` is how a message begins: "camera 3 of cameras.json".
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+
+DEEPEST = 64
+"""Lists and tables in one another that a file may have: what walks through them never runs out of stack."""
+
+_LONGEST_INT = 18  # digits; what is longer is a float, as in most languages
+
+_T = TypeVar("_T")
+
+
+def decode_json(content: bytes | str) -> Any:
+    """The value that a JSON text holds: every number finite, every text encodable, nothing nested too deeply.
+
+    Raises:
+        ValueError: it is no JSON, or holds what no file of ours does; one line.
+    """
+    try:
+        value = json.loads(
+            content,
+            parse_int=lambda digits: int(digits) if len(digits) <= _LONGEST_INT else _finite(digits),
+            parse_float=_finite,
+            parse_constant=_finite,
+            object_pairs_hook=_without_repeats,
+        )
+    except RecursionError:
+        raise ValueError(f"it is nested more than {DEEPEST} deep") from None
+    _check(value, 0)
+    return value
+
+
+def typed(value: object, kind: type[_T]) -> _T:
+    """A JSON value as a dataclass, a `msgspec.Struct`, or what else declares its types.
+
+    Raises:
+        ValueError: it is of another type; the message says where.
+    """
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from None
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError(f"{digits[:12]}{'…' * (len(digits) > 12)} is no number that can be used")
+    return number
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise ValueError("a key is there twice")
+    return table
+
+
+def _check(value: object, depth: int) -> None:
+    if depth > DEEPEST:
+        raise ValueError(f"it is nested more than {DEEPEST} deep")
+    if isinstance(value, str):
+        value.encode()  # half a surrogate pair raises, a ValueError too
+    elif isinstance(value, list):
+        for entry in value:
+            _check(entry, depth + 1)
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            key.encode()
+            _check(entry, depth + 1)
 
 
 def table_at(where: str, entry: object) -> Mapping[str, Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from progdf.errors import ProgdfError
 from progdf.files import make_folder, written_whole
 
 _PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
@@ -89,6 +92,68 @@ def contact_sheet(
     if caption:
         draw.text((left, full_height - 0.9 * text), caption, _PALE_INK, small, anchor="lm")
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
+
+
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF")
+"""Pictures that are read; others of Pillow's many formats are programs, or need one."""
+
+MOST_PIXELS = 1 << 26
+"""67 million, more than cameras have: a picture of a few kilobytes can claim billions."""
+
+
+def open_picture(path: str | os.PathLike[str], proportions: tuple[int, int] | None = None) -> Image.Image:
+    """A picture from a file, as it is there: any mode, any size up to `MOST_PIXELS`.
+
+    Args:
+        path: the file
+        proportions: width and height of which it must be a multiple (to 2 %); found out before it is unpacked
+
+    Raises:
+        ProgdfError: it is missing, no picture, too large, or of other proportions.
+    """
+    with _opened(path) as picture:
+        width, height = picture.size
+        if proportions is not None and abs(width * proportions[1] / (height * proportions[0]) - 1) > 0.02:
+            raise ProgdfError(
+                f"{path} is {width}x{height} pixels, its view {proportions[0]}x{proportions[1]}; "
+                "keep the proportions of the original view"
+            )
+        picture.load()
+        return picture.copy()
+
+
+def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height of a picture. Raises ProgdfError as `open_picture` does."""
+    with _opened(path) as picture:
+        return picture.size
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is lower
+            opened = Image.open(path, formats=FORMATS)
+        with opened:
+            width, height = opened.size
+            if width * height > MOST_PIXELS:
+                raise ProgdfError(f"{path} has {width}x{height} pixels, too many; scale it down")
+            yield opened
+    except ProgdfError:
+        raise
+    except Exception as error:  # every format's reader raises its own when a file is damaged
+        reason = "it does not exist" if isinstance(error, FileNotFoundError) else type(error).__name__
+        raise ProgdfError(f"{path} cannot be read as a picture ({reason}); save it as PNG") from error
+
+
+def laid_on(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
+    """The picture without transparency, on a paper of one colour, scaled to `size`. RGB"""
+    if not picture.has_transparency_data:
+        plain = picture.convert("RGB")
+        return plain if size in (None, plain.size) else plain.resize(size, Image.Resampling.LANCZOS)
+    paper = Image.new("RGBA", picture.size, color)
+    paper.alpha_composite(picture.convert("RGBA"))
+    return laid_on(paper.convert("RGB"), color, size)
 
 
 def to_picture(image: Tensor) -> Image.Image:

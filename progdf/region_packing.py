@@ -29,18 +29,20 @@ def packed_region(region: Region) -> dict[str, Tensor]:
     return tensors
 
 
-def unpacked_region(name: str, tensors: Mapping[str, Tensor], count: int) -> Region:
-    """The inverse of `packed_region` for a scene of `count` Gaussians.
+def unpacked_region(
+    name: str, tensors: Mapping[str, Tensor], count: int, expected: int | None = None
+) -> Region:
+    """The inverse of `packed_region` for a scene of `count` Gaussians; with how many members, if it is known.
 
     Raises:
         ValueError, KeyError: the tensors do not describe rows of that scene.
     """
-    members = _unpacked_rows("members", tensors, count)
+    members = _unpacked_rows("members", tensors, count, expected)
     score = torch.zeros(count)
     score[members] = 1.0
     if "score.levels" in tensors:
-        soft = _unpacked_rows("score", tensors, count)
         levels = tensors["score.levels"]
+        soft = _unpacked_rows("score", tensors, count, levels.numel())
         if levels.dtype != torch.uint8 or levels.shape != soft.shape:
             raise ValueError(f"{len(soft)} soft scores have levels {list(levels.shape)} {levels.dtype}")
         score[soft] = levels.float() / 255
@@ -66,8 +68,9 @@ def _packed_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
     return {f"{key}.{shortest}": torch.from_numpy(stored)}
 
 
-def _unpacked_rows(key: str, tensors: Mapping[str, Tensor], count: int) -> Tensor:
-    """Sorted, unique and within the scene, or a ValueError; never more than `count`. [M] int64"""
+def _unpacked_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: int | None) -> Tensor:
+    """Sorted, unique and within the scene, or a ValueError; as many as expected, told before they are made,
+    as eight bytes of a run can name millions. [M] int64"""
     if f"{key}.bits" in tensors:
         bits = tensors[f"{key}.bits"]
         if bits.dtype != torch.uint8 or list(bits.shape) != [(count + 7) // 8]:
@@ -86,6 +89,8 @@ def _unpacked_rows(key: str, tensors: Mapping[str, Tensor], count: int) -> Tenso
             (lengths < 1).any() or starts[0] < 0 or ends[-1] > count or (starts[1:] < ends[:-1]).any()
         ):
             raise ValueError(f"{key}.runs leave the scene or overlap")
+        if expected is not None and int(lengths.sum()) != expected:
+            raise ValueError(f"{key}.runs name {int(lengths.sum())} rows of {expected}")
         before = np.repeat(np.cumsum(lengths) - lengths, lengths)
         return torch.from_numpy(np.repeat(starts, lengths) + np.arange(int(lengths.sum())) - before)
     rows = tensors[f"{key}.rows"]

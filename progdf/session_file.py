@@ -25,8 +25,11 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import msgspec
+
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
+from progdf.json_values import decode_json, typed
 
 VERSION = 1
 MARK = "progdf_session"
@@ -35,8 +38,7 @@ SUFFIX = ".session.json"
 _LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a few megabytes
 
 
-@dataclass(frozen=True)
-class FileRef:
+class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A file that a session needs.
 
     Args:
@@ -46,6 +48,10 @@ class FileRef:
 
     file: str
     sha256: str
+
+    def __post_init__(self) -> None:
+        if not self.file or "\0" in self.file:
+            raise ValueError("the name of a file is none")
 
     def path(self, folder: Path) -> Path:
         """Where it is, for a session in `folder`."""
@@ -67,6 +73,15 @@ class SessionFile:
     edits: tuple[FileRef, ...] = ()
     view: Mapping[str, Any] = field(default_factory=dict)
     snapshots: Sequence[Mapping[str, Any]] = ()
+
+
+class _Table(msgspec.Struct, forbid_unknown_fields=True):
+    """The file without its version."""
+
+    scene: FileRef
+    edits: list[FileRef] = []
+    view: dict[str, Any] = {}
+    snapshots: list[dict[str, Any]] = []
 
 
 def reference(path: Path, folder: Path) -> FileRef:
@@ -91,8 +106,8 @@ def write_session(path: Path, session: SessionFile) -> None:
     """
     table = {
         MARK: VERSION,
-        "scene": _plain(session.scene),
-        "edits": [_plain(edit) for edit in session.edits],
+        "scene": msgspec.structs.asdict(session.scene),
+        "edits": [msgspec.structs.asdict(edit) for edit in session.edits],
         "view": session.view,
         "snapshots": list(session.snapshots),
     }
@@ -111,38 +126,32 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
     """
     name = Path(path).name
     try:
-        size = Path(path).stat().st_size
-        text = "" if size > _LARGEST else Path(path).read_text(encoding="utf-8")
+        with Path(path).open("rb") as file:
+            content = file.read(_LARGEST + 1)
     except OSError as error:
         raise open_failure(path, error) from None
-    except UnicodeDecodeError:
-        raise ProgdfError(f"{name} is no session: it is not text; give a file saved with Ctrl+S") from None
-    if size > _LARGEST:
-        raise ProgdfError(f"{name} has {size >> 20} MB, too much for a session; give one saved with Ctrl+S")
+    if len(content) > _LARGEST:
+        raise ProgdfError(
+            f"{name} has more than {_LARGEST >> 20} MB, too much for a session; give one saved with Ctrl+S"
+        )
     try:
-        table = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_without_repeats)
-    except (ValueError, RecursionError) as error:
+        table = decode_json(content)
+    except ValueError as error:
         raise ProgdfError(f"{name} is not valid JSON ({error}); save the session anew") from None
     if not isinstance(table, dict) or MARK not in table:
         raise ProgdfError(f"{name} is no session; give a file that progdf view saved with Ctrl+S")
-    if not isinstance(table[MARK], int) or isinstance(table[MARK], bool) or table[MARK] < 1:
-        raise ProgdfError(f"{name} is a damaged session: its version is {table[MARK]!r}; save it anew")
-    if table[MARK] > VERSION:
+    version = table.pop(MARK)
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise ProgdfError(f"{name} is a damaged session: its version is {version!r}; save it anew")
+    if version > VERSION:
         raise ProgdfError(
-            f"{name} is a session of version {table[MARK]}; this progdf reads up to {VERSION}, update it"
+            f"{name} is a session of version {version}; this progdf reads up to {VERSION}, update it"
         )
-    unknown = set(table) - {MARK, "scene", "edits", "view", "snapshots"}
-    if unknown:
-        raise ProgdfError(f"{name} holds '{min(unknown)}', which is unknown here; remove it or update progdf")
-    edits, snapshots, view = table.get("edits", []), table.get("snapshots", []), table.get("view", {})
-    if not isinstance(view, dict) or not _all(edits, dict) or not _all(snapshots, dict):
-        raise ProgdfError(f"{name} is a damaged session: a part of it has the wrong form; save it anew")
-    return SessionFile(
-        _reference(name, "scene", table.get("scene")),
-        tuple(_reference(name, f"edit {i + 1}", edit) for i, edit in enumerate(edits)),
-        view,
-        tuple(snapshots),
-    )
+    try:
+        found = typed(table, _Table)
+    except ValueError as error:
+        raise ProgdfError(f"{name} is a damaged session ({error}); save it anew or update progdf") from None
+    return SessionFile(found.scene, tuple(found.edits), found.view, tuple(found.snapshots))
 
 
 def verified(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
@@ -156,7 +165,7 @@ def verified(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
         file = ref.path(path.resolve().parent)
         if not file.is_file():
             raise ProgdfError(f"{path.name} needs {file}, which is not there; put it back or save anew")
-        if sha256(file) != ref.sha256:
+        if sha256(file) != ref.sha256.lower():
             raise ProgdfError(
                 f"{path.name} was saved with another {file.name} than {file} holds now; "
                 "put that file back or save a new session"
@@ -182,29 +191,3 @@ def sha256(path: Path) -> str:
 def _sha256(path: str, *_: int) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _plain(ref: FileRef) -> dict[str, str]:
-    return {"file": ref.file, "sha256": ref.sha256}
-
-
-def _reference(name: str, what: str, entry: object) -> FileRef:
-    table = entry if isinstance(entry, dict) and set(entry) == {"file", "sha256"} else {}
-    if _all(list(table.values()), str) and table.get("file") and "\0" not in table["file"]:
-        return FileRef(table["file"], table["sha256"].lower())
-    raise ProgdfError(f"{name} is a damaged session: its {what} is no file with a sha256; save it anew")
-
-
-def _all(values: object, kind: type) -> bool:
-    return isinstance(values, list) and all(isinstance(value, kind) for value in values)
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number")
-
-
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        raise ValueError("a key is there twice")
-    return table

@@ -9,24 +9,33 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField
 from progdf.field.keyframes import fit_lossless
 from progdf.files import open_failure, written_whole
-from progdf.tensor_file import write_tensors
+from progdf.json_values import decode_json, typed
+from progdf.tensor_file import read_tensors, write_tensors
 
 FILE_NAME = "trajectory.safetensors"
 """Its name in a run folder, beside the .gdf."""
 
 _FORMAT = "progdf-trajectory-1"
-_NEEDED = {"s", "offsets", "end", "steps", "stage_ends", "strengths"}
+_NEEDED_FORMS = (
+    ("s", torch.float32, 1),
+    ("offsets", torch.float16, 3),
+    ("end", torch.float32, 2),
+    ("steps", torch.int64, 1),
+    ("stage_ends", torch.int64, 1),
+    ("strengths", torch.float64, 1),
+)
+_NEEDED = {name for name, _, _ in _NEEDED_FORMS}
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ def save_trajectory(
     }
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
     with written_whole(path) as beside:
-        write_tensors(beside, tensors, header)
+        write_tensors(beside, tensors, header, checksum=True)
 
 
 def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
@@ -102,6 +111,10 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
         ProgdfError: the file is absent, damaged or something else.
     """
     tensors, about = _read(path)
+    for name, dtype, sides in _NEEDED_FORMS:
+        found = tensors[name]
+        if found.dtype != dtype or found.ndim != sides:
+            raise _damaged(path, f"{name} is {list(found.shape)} {found.dtype}")
     trajectory = Trajectory(
         tensors.pop("s"),
         tensors.pop("offsets"),
@@ -133,17 +146,17 @@ def recorded_field(trajectory: Trajectory) -> BakedField:
 def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors, all of them where none are named, and what the file tells about itself."""
     try:
-        with safe_open(path, framework="pt") as opened:
-            header = opened.metadata() or {}
-            if header.get("format") != _FORMAT:
-                raise ProgdfError(f"{path} is no recorded trajectory; give a run folder of progdf train")
-            there = set(opened.keys())
-            if missing := (set(names) | _NEEDED) - there:
-                raise _damaged(path, f"it has no {min(missing)}")
-            return {n: opened.get_tensor(n) for n in names or there}, json.loads(header["about"])
+        tensors, header = read_tensors(path, names)
+        if header.get("format") != _FORMAT:
+            raise ProgdfError(f"{path} is no recorded trajectory; give a run folder of progdf train")
+        if not names and (missing := _NEEDED - set(tensors)):
+            raise _damaged(path, f"it has no {min(missing)}")
+        return tensors, typed(decode_json(header["about"]), dict[str, Any])
     except OSError as error:
         raise open_failure(path, error) from error
-    except (SafetensorError, KeyError, ValueError) as error:
+    except ProgdfError:
+        raise
+    except (KeyError, ValueError) as error:
         raise _damaged(path, error) from error
 
 
@@ -154,6 +167,12 @@ def _check(path: Path, found: Trajectory) -> None:
         raise _damaged(path, "its tensors do not fit each other")
     if float(s[0]) != 0.0 or float(s[-1]) != 1.0 or not bool((s.diff() > 0).all()):
         raise _damaged(path, "its slider values do not ascend from 0 to 1")
+    ends = found.stage_ends
+    ascend = all(before < after for before, after in pairwise((0, *ends)))
+    if not ends or len(ends) != len(found.strengths) or not ascend or ends[-1] != len(s) - 1:
+        raise _damaged(path, "its stages do not fit its recordings")
+    if len(found.steps) != len(s) or not bool(found.offsets.isfinite().all() & found.end.isfinite().all()):
+        raise _damaged(path, "it has numbers that are not finite, or not one step a recording")
 
 
 def _damaged(path: Path, reason: object) -> ProgdfError:

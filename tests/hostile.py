@@ -24,3 +24,17 @@ NPY_HEADERS = {
     "text": b"{'descr': '<U4', 'fortran_order': False, 'shape': (1,), }\n",
     "a shape of text": b"{'descr': '<f8', 'fortran_order': False, 'shape': ('a',), }\n",
 }
+
+JSON_TEXTS = {
+    "a number of 400 digits": "9" * 400,
+    "a negative one": "-" + "9" * 400,
+    "a number beyond all": "1e999",
+    "no number": "NaN",
+    "infinity": "-Infinity",
+    "deep lists": "[" * 100_000 + "]" * 100_000,
+    "lists too deep to walk through": "[" * 500 + "]" * 500,
+    "deep tables": '{"a":' * 500 + "1" + "}" * 500,
+    "half a character": '"\\ud800"',
+    "half a character as a key": '{"\\udfff": 1}',
+    "a key twice": '{"a": 1, "a": 2}',
+}

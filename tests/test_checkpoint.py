@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import resource
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +15,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from progdf.__main__ import main
 from progdf.checkpoint import (
     FORMAT,
     Gdf,
@@ -25,7 +29,9 @@ from progdf.checkpoint import (
 )
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.gdf_head import head_checksum
 from progdf.region import Region
+from progdf.tensor_file import table_of
 from tests.edits import curved_field, edit_of, some_rows
 from tests.scenes import random_gaussians
 
@@ -262,6 +268,13 @@ def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Pat
         {"field": {"kind": "separable", "channels": 1e99, "attributes": [], "recorded": []}},
         {"field": []},
         {"options": "text"},
+        {"name": ["shirt"]},
+        {"field": {"kind": "separable", "channels": 14, "attributes": ["means"], "recorded": "0.5"}},
+        {"field": {"kind": "neural", "channels": 14, "attributes": [], "recorded": [], "network": {}}},
+        {"members": -1},
+        {"members": 10**9},
+        {"means__full": torch.full((40, 3), 3e38)},
+        {"log_scales__full": torch.full((40, 3), 200.0)},
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(
@@ -349,3 +362,59 @@ def test_a_file_without_a_checksum_of_its_header_is_checked_as_a_whole(saved: Pa
 
 def test_a_header_that_tells_of_other_members_is_refused(saved: Path, tmp_path: Path) -> None:
     assert "tells of 41 members" in refusal(rewritten(saved, tmp_path, members=41))
+
+
+def resigned(path: Path, tmp_path: Path, header: object) -> Path:
+    """The file with another JSON header and checksums that fit it: what somebody would make to do harm."""
+    content = path.read_bytes()
+    text = json.dumps(header)
+    tensors = safetensors.torch.load(content)
+    metadata = {
+        "progdf": text,
+        "header_sha256": head_checksum(text, table_of(tensors)),
+        "sha256": _checksum(text, tensors),
+    }
+    return written(tmp_path, safetensors.torch.save(tensors, metadata))
+
+
+def places(value: object, at: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Where in a JSON value there are values."""
+    yield at
+    if isinstance(value, dict | list):
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from places(entry, (*at, key))
+
+
+def test_info_of_any_header_is_told_or_refused_in_one_line(
+    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = saved.read_bytes()
+    header = json.loads(json.loads(content[8 : header_size(saved)])["__metadata__"]["progdf"])
+    assert main(["info", str(resigned(saved, tmp_path, header))]) == 0
+    others: list[object] = [None, [], {}, "", "means", -1, 0, 1e300, 2**70, True, [[]], {"a": []}]
+    for place in list(places(header)):
+        for other in others:
+            changed = json.loads(json.dumps(header))
+            if place:
+                inner = changed
+                for key in place[:-1]:
+                    inner = inner[key]
+                inner[place[-1]] = other
+            else:
+                changed = other
+            assert main(["info", str(resigned(saved, tmp_path, changed))]) in (0, 2), (place, other)
+            with suppress(ProgdfError):
+                load_gdf(tmp_path / "shirt.gdf")
+    assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
+
+
+def test_a_small_file_of_a_huge_scene_costs_little(saved: Path, tmp_path: Path) -> None:
+    content = safetensors.torch.load(saved.read_bytes())
+    there: dict[str, object] = {name: None for name in content if name.startswith("members.")}
+    there["members.runs"] = torch.tensor([[0, 1 << 25]], dtype=torch.int32)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    scene = {"count": 1 << 25, "means_sha256": ""}
+    refusal(rewritten(saved, tmp_path, scene=scene, members=1 << 25, **there))
+    refusal(rewritten(saved, tmp_path, scene=scene, **there))
+    refusal(rewritten(saved, tmp_path, scene={"count": 1 << 28, "means_sha256": ""}, **there))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from progdf.__main__ import COMMANDS, main
+from progdf.files import written_whole
 from progdf.ply import save_ply
 from tests.scenes import random_gaussians
 
@@ -128,3 +132,98 @@ def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
 ) -> None:
     monkeypatch.setattr("progdf.__main__.BENCHES", {"field": "nowhere:begun"})
     assert "does not exist; " in stderr_of(capsys, "bench", "field", option, str(tmp_path / "no" / "f.x"))
+
+
+def test_a_mistake_of_ours_is_one_line_and_a_file_with_the_details(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def wrong(argv: object) -> None:
+        raise IndexError("list index\nout of range")
+
+    monkeypatch.setattr("progdf.check.main", wrong)
+    monkeypatch.setattr("progdf.__main__.state_folder", lambda: tmp_path / "progdf")
+    assert main(["check", "scene.ply"]) == 70
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert told.startswith("progdf: a mistake in progdf itself (IndexError: list index out of range); ")
+    details = (tmp_path / "progdf" / "crash.txt").read_text()
+    assert str(tmp_path / "progdf" / "crash.txt") in told
+    assert "Traceback" in details
+    assert "in wrong" in details
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError(
+            "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"
+        ),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 9 bytes."),
+    ],
+)
+def test_too_little_memory_is_one_line(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def large(argv: object) -> None:
+        raise error
+
+    monkeypatch.setattr("progdf.check.main", large)
+    assert "more memory than there is; " in stderr_of(capsys, "check", "scene.ply")
+
+
+@pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
+def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
+    number: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def writing(argv: object) -> None:
+        with written_whole(tmp_path / "a.txt") as beside:
+            beside.write_text("half")
+            os.kill(os.getpid(), getattr(signal, number))
+
+    monkeypatch.setattr("progdf.check.main", writing)
+    assert main(["check", "scene.ply"]) == 130
+    assert capsys.readouterr().err == "progdf: interrupted\n"
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(getattr(signal, number)) == signal.SIG_DFL
+
+
+def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("progdf.check.main", lambda argv: os.kill(os.getpid(), signal.SIGHUP))
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        assert main(["check", "scene.ply"]) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(
+    "name", ["a\x1b[2J", "a\nb", "a\\b", "a/b", ".a", "n" * 252, "\N{CJK UNIFIED IDEOGRAPH-4E16}" * 90]
+)
+def test_a_name_that_cannot_be_a_file_is_told_before_a_folder_is_made(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "night", "--name", name)
+    assert "--name" in stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *out)
+    assert not list(tmp_path.iterdir())
+
+
+STREAMS = "import sys; from progdf.__main__ import main; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.parametrize(
+    ("shell", "status"),
+    [
+        ('"$0" -c "$1" --help >&-', 0),
+        ('"$0" -c "$1" --help <&- >&- 2>&-', 0),
+        ('"$0" -c "$1" check nowhere.ply 2>&-', 2),
+        ('"$0" -c "$1" --help > /dev/full', 2),
+        ('LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 "$0" -c "$1" --help', 0),
+        ('LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 "$0" -c "$1" check $(printf "\\351.ply")', 2),
+    ],
+)
+def test_streams_that_are_closed_full_or_of_few_letters_end_no_command(shell: str, status: int) -> None:
+    ran = subprocess.run(["sh", "-c", shell, sys.executable, STREAMS], capture_output=True)
+    assert ran.returncode == status, ran
+    assert b"Traceback" not in ran.stderr
+    assert ran.stderr.count(b"\n") <= 1

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import resource
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +14,8 @@ from PIL import Image
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.pictures import contact_sheet, write_image
+from progdf.pictures import contact_sheet, laid_on, open_picture, picture_size, write_image
+from tests.refused import refusal
 
 
 def _plain(red: float) -> Tensor:
@@ -69,3 +73,49 @@ def test_an_image_for_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> Non
     (tmp_path / "taken").touch()
     with pytest.raises(ProgdfError, match="taken is a file; give the name of a folder"):
         write_image(tmp_path / "taken" / "a.png", torch.zeros(1, 1, 3))
+
+
+def bomb(path: Path, width: int, height: int) -> Path:
+    """A PNG of a few kilobytes that claims many pixels."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    rows = chunk(b"IDAT", zlib.compress(b"\0" * 2_000_000, 9))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + rows + chunk(b"IEND", b""))
+    return path
+
+
+@pytest.mark.parametrize("size", [(13_000, 13_000), (1_000_000_000, 1), (8_200, 8_200)])
+def test_a_picture_that_claims_too_much_is_refused_before_it_is_unpacked(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    path = bomb(tmp_path / "a.png", *size)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refusal(open_picture, path)
+    refusal(picture_size, path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_a_picture_of_other_proportions_is_not_unpacked(tmp_path: Path) -> None:
+    path = bomb(tmp_path / "a.png", 8_000, 8_000)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "proportions" in refusal(lambda p: open_picture(p, (40, 30)), path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_what_needs_a_program_to_be_read_is_no_picture(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\n")
+    refusal(open_picture, path)
+
+
+def test_transparency_counts_as_the_paper(tmp_path: Path) -> None:
+    Image.new("RGBA", (4, 2), (255, 0, 0, 0)).save(tmp_path / "a.png")
+    Image.new("L", (4, 2), 7).save(tmp_path / "b.png")
+    assert laid_on(open_picture(tmp_path / "a.png"), "white").getpixel((0, 0)) == (255, 255, 255)
+    assert laid_on(open_picture(tmp_path / "a.png"), "black", (8, 4)).getpixel((0, 0)) == (0, 0, 0)
+    assert laid_on(open_picture(tmp_path / "b.png"), "white").getpixel((0, 0)) == (7, 7, 7)

@@ -66,7 +66,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("scene", "sha256"), "0" * 64, "another bear.ply"),
     (("edits", 1, "sha256"), "0" * 64, "another ears.gdf"),
     (("edits",), [], "layers[0].gdf is 1 of 0"),
-    (("view",), [], "wrong form"),
+    (("view",), [], "Expected"),
     (("view", "blur"), 3, "view.blur is unknown"),
     (("view", "camera", "distance"), 0.0, "view.camera.distance"),
     (("view", "camera", "distance"), 1e400, "Infinity"),
@@ -86,7 +86,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("view", "timeline", "length"), -5, "length"),
     (("view", "timeline", "keys", 0, "camera", "distance"), -1.0, "distance"),
     (("snapshots", 0, "edit", "blend"), "none", "none"),
-    (("snapshots",), {"a": 1}, "wrong form"),
+    (("snapshots",), {"a": 1}, "Expected"),
 ]
 
 
@@ -175,6 +175,13 @@ def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: P
     assert main(["render", "--session", str(saved), "--set", "ears=0", *size, "-o", str(out)]) == 0
     expected = np.round(engine.image(moved, (64, 48)).clip(0, 1) * 255)
     assert np.abs(np.asarray(Image.open(out)).astype(int) - expected).max() <= 1
+
+
+def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path: Path) -> None:
+    path = spoilt(saved, "view", "layers", value=[])
+    out, size = tmp_path / "a.png", ("--size", "32x24", "--engine", "cpu")
+    assert main(["render", "--session", str(path), *size, "-o", str(out)]) == 0
+    assert out.is_file()
 
 
 def test_an_option_that_a_session_says_itself_is_refused(

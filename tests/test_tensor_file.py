@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
-from progdf.tensor_file import _TYPES, write_tensors
+from progdf.tensor_file import _TYPES, read_tensors, write_tensors
 
 
 def some(dtype: torch.dtype) -> dict[str, Tensor]:
@@ -46,3 +46,25 @@ def test_every_tensor_lies_where_its_type_is_aligned(tmp_path: Path) -> None:
     size = int.from_bytes(content[:8], "little")
     assert size % 8 == 0
     assert content[8 + size : 16 + size] == b"\0\0\0\0\0\0\xf0\x3f"  # 1.0 comes first
+
+
+def test_every_flipped_bit_is_noticed_where_there_is_a_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    write_tensors(path, {"a": torch.arange(4.0), "b": torch.arange(3)}, {"about": "it"}, checksum=True)
+    tensors, metadata = read_tensors(path)
+    assert torch.equal(tensors["a"], torch.arange(4.0))
+    assert metadata == {"about": "it"}
+    content = path.read_bytes()
+    # a flip in the name of the checksum loses the checksum alone
+    for place in range(len(content)):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        try:
+            found, told = read_tensors(path)
+        except ValueError:
+            continue
+        assert told.get("about") == "it", place
+        assert all(torch.equal(found[name], tensors[name]) for name in tensors), place
+    for kept in range(len(content)):
+        path.write_bytes(content[:kept])
+        with pytest.raises(ValueError):  # noqa: PT011  the library's words
+            read_tensors(path)

@@ -7,7 +7,6 @@ variant its .gdf, so that one can feel the difference in the window.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.dial import same
 from progdf.files import make_folder, written_whole
+from progdf.json_values import decode_json
 from progdf.pictures import write_image
 from progdf.slider_statistics import slider_statistics
 from progdf.trajectory import Trajectory
@@ -210,7 +210,7 @@ def _keep(
 def _kept(root: Path, variant: Variant, ground: Ground) -> Outcome | None:
     """What became of a variant in an earlier call; None where it was not done, or on other ground."""
     try:
-        found = json.loads((root / variant.name / "outcome.json").read_text(encoding="utf-8"))
+        found = decode_json((root / variant.name / "outcome.json").read_bytes())
         if found.pop("digest") != digest_of(ground, variant):
             return None
         return Outcome(**found)

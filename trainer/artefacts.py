@@ -23,6 +23,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.files import is_temporary, remove_abandoned, written_whole
+from progdf.json_values import decode_json
 from progdf.pictures import write_image
 from progdf.trajectory import FILE_NAME
 from trainer.picture_list import add_pictures, remove_pictures_but_of
@@ -209,7 +210,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def _json_or_nothing(text: str) -> dict[str, Any]:
     try:
-        content = json.loads(text)
+        content = decode_json(text)
     except ValueError:
         return {}
     return content if isinstance(content, dict) else {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from progdf.checkpoint import Gdf, fingerprint, save_gdf
 from progdf.compose import Layer, compose
 from progdf.field.dial import same
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
+from progdf.json_values import decode_json
 from progdf.pictures import write_image
 from progdf.trajectory import Trajectory
 from trainer.active import Dropped, dropped_of
@@ -202,7 +202,7 @@ def texts(options: Mapping[str, Any]) -> Texts:
 def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
     """Figures of the stages that this command did not run again."""
     try:
-        stages = json.loads(folder.report.read_text(encoding="utf-8"))[part]
+        stages = decode_json(folder.report.read_bytes())[part]
         return {str(stage): figure for stage, figure in stages.items() if isinstance(figure, int | float)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -1,31 +1,33 @@
-"""Ctrl-C and SIGTERM end a run at once, except between steps that must stay whole: there they wait."""
+"""Ctrl-C, SIGTERM and SIGHUP end a run at once, except in steps that must stay whole: there they wait."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_ENDINGS = (signal.SIGTERM, signal.SIGHUP) if sys.platform != "win32" else (signal.SIGTERM,)
+"""Sent by who wants a process to end, and by a terminal that is closed."""
 
 
 @contextmanager
 def stopping() -> Iterator[None]:
-    """SIGTERM is a KeyboardInterrupt too, so that both end in the same way."""
+    """SIGTERM and SIGHUP are a KeyboardInterrupt too, so that all end in the same way."""
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise KeyboardInterrupt
 
-    with _handled((signal.SIGTERM,), stop):
+    with _handled(_ENDINGS, stop):
         yield
 
 
 @contextmanager
 def held() -> Iterator[Callable[[], bool]]:
-    """Hold Ctrl-C and SIGTERM back; the yielded function tells whether one came.
+    """Hold Ctrl-C, SIGTERM and SIGHUP back; the yielded function tells whether one came.
 
     Ask it where the state is whole, save, and raise KeyboardInterrupt. A second signal does not wait, and
     neither does one that nobody asked about.
@@ -38,7 +40,7 @@ def held() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         came = True
 
-    with _handled(_SIGNALS, note):
+    with _handled((signal.SIGINT, *_ENDINGS), note):
         yield lambda: came
     if came:
         raise KeyboardInterrupt
@@ -52,7 +54,8 @@ def _handled(
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    earlier = {number: signal.signal(number, handler) for number in signals}
+    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]  # nohup's stays
+    earlier = {number: signal.signal(number, handler) for number in heeded}
     try:
         yield
     finally:

@@ -42,6 +42,8 @@ MOST_THREADS = 1024
 """More than any machine has: what --threads says at most."""
 MOST_STEPS = 1_000_000
 """Hours on any machine: what --steps says at most."""
+LONGEST_NAME = 255
+"""Bytes that every file system takes."""
 LARGEST_SEED = 2**32 - 1
 """What every generator of random numbers takes."""
 STAGE_STEPS = 40
@@ -275,8 +277,10 @@ def settled(options: TrainOptions) -> TrainOptions:
             views=min(options.views, QUICK_VIEWS),
         )
     name = options.name or options.out.resolve().name
-    if not name or "/" in name or name.startswith("."):
+    if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
         raise ProgdfError(f"'{name}' cannot be a layer's name; choose one with --name, as --name shirt")
+    if len(f"{name}.gdf".encode()) > LONGEST_NAME:
+        raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
     check_ranges(
         ("--views", options.views, 3, 96),
         ("--image-size", options.image_size, 32, 2048),

@@ -17,6 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from progdf.terminal import printable
 from trainer.memory import PeakMemory
 from trainer.state import Saved
 
@@ -73,7 +74,7 @@ class RunLog:
 
     def note(self, text: str) -> None:
         """A line for the file alone."""
-        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {text}\n")
+        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {printable(text)}\n")
 
     def say(self, text: str) -> None:
         """One line."""
@@ -132,4 +133,4 @@ class RunLog:
 
 
 def _escaped(text: str) -> str:
-    return text.replace("[", "\\[")
+    return printable(text).replace("[", "\\[")

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 
 from progdf.camera_files import load_cameras
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.json_values import typed
 from progdf.ply import load_ply
 from progdf.region import Region
 from progdf.trajectory import Trajectory, load_trajectory
@@ -40,6 +42,15 @@ class FinishedRun:
     about: Mapping[str, Any]
 
 
+class _About(msgspec.Struct):
+    """What of `FinishedRun.about` is used to open it."""
+
+    scene: str
+    held_out: list[str]
+    background: tuple[float, float, float]
+    options: dict[str, Any]
+
+
 def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
     """Open a run folder.
 
@@ -54,17 +65,26 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
     if not folder.trajectory.is_file():
         raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
     trajectory, extra, about = load_trajectory(folder.trajectory)
-    path = scene or Path(about["scene"])
-    if not path.is_file():
-        raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
-    gaussians = load_ply(path)
-    score = extra["score"]
-    if len(score) != len(gaussians):
-        raise ProgdfError(
-            f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
-            "give that one with --scene"
-        )
-    region = Region(about["options"]["name"], extra["members"], score)
+    try:
+        told = typed(about, _About)
+        name = typed(told.options["name"], str)
+        members, score = extra["members"], extra["score"]
+        path = scene or Path(told.scene)
+        if not path.is_file():
+            raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
+        gaussians = load_ply(path)
+        if len(score) != len(gaussians):
+            raise ProgdfError(
+                f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
+                "give that one with --scene"
+            )
+        region = Region(name, members, score)
+        if len(region) != trajectory.end.shape[0]:
+            raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")
+    except ProgdfError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProgdfError(f"{folder.trajectory} is damaged ({error}); train again") from error
     return FinishedRun(folder, gaussians, region, before_fit(trajectory, extra), about)
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import torch
 
 from progdf.errors import ProgdfError
 from progdf.files import disk_full
+from progdf.json_values import decode_json, typed
 from progdf.region import Region
 from trainer.artefacts import RunFolder, begin_log, remove_leftovers
-from trainer.options import TrainOptions, settled
+from trainer.options import MOST_THREADS, TrainOptions, settled
 
 _ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
 """Options that change no bit of the result; `quick` is worked into others."""
@@ -44,7 +45,10 @@ def kept_region(options: TrainOptions) -> Region | None:
     """The region of a stopped run that is to go on: what it was made from need not be looked at again."""
     state = RunFolder(options.out).state
     saved = state.load(REGION) if options.resume and state.identity() is not None else None
-    return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"]) if saved else None
+    if saved is None:
+        return None
+    with state.restoring(REGION):
+        return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"])
 
 
 def open_session(
@@ -62,7 +66,7 @@ def open_session(
     Raises:
         ProgdfError: a stopped run that would be lost without --resume; with it, other options than the run's.
     """
-    saved = folder.state.identity()
+    saved = _saved_identity(folder)
     if options.resume and saved is None and folder.report.is_file():
         _check_options(folder, _finished_options(folder), options, "leave --resume away to train anew")
         return Session("nothing", threads)
@@ -70,22 +74,22 @@ def open_session(
     now = _identity(options, threads)
     if options.resume and saved is not None:
         remedy = "give --resume the run's own options, or train anew in another folder"
-        _check_options(folder, saved["options"], options, remedy)
-        for what in ("scene", "cameras"):
-            if saved[what] != now[what]:
+        _check_options(folder, saved.options, options, remedy)
+        for what, was in (("scene", saved.scene), ("cameras", saved.cameras)):
+            if was != now[what]:
                 raise ProgdfError(
                     f"the {what} is no longer what {folder.root} was begun with; bring it back and go on "
                     "with --resume, or train anew in another folder"
                 )
         notes = []
-        if saved["torch"] != now["torch"]:
-            notes.append(f"torch was {saved['torch']} and is {now['torch']}: the last bits may differ")
-        if saved["threads"] != threads:
-            notes.append(f"{saved['threads']} threads, as the run began with, for the same bits")
-        return Session("go on", saved["threads"], tuple(notes))
+        if saved.torch != now["torch"]:
+            notes.append(f"torch was {saved.torch} and is {now['torch']}: the last bits may differ")
+        if saved.threads != threads:
+            notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
+        return Session("go on", saved.threads, tuple(notes))
     if saved is not None and (step := _saved_step(folder)):
         raise ProgdfError(
-            f"{folder.root} holds a run that was stopped at step {step} of {saved['options']['steps']}; "
+            f"{folder.root} holds a run that was stopped at step {step} of {saved.options.get('steps')}; "
             f"add --resume to go on with it, or delete {folder.state.path} to start over"
         )
     begin_log(folder, edit)
@@ -100,11 +104,11 @@ def open_session(
 def found(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
     """What --resume would find in the folder, of a run with these very options."""
     folder, options = RunFolder(options.out), settled(options)
-    saved = folder.state.identity()
+    saved = _saved_identity(folder)
     if saved is None and not folder.report.is_file():
         return "nothing"
     try:
-        _check_options(folder, saved["options"] if saved else _finished_options(folder), options, "")
+        _check_options(folder, saved.options if saved else _finished_options(folder), options, "")
     except ProgdfError:
         return "nothing"
     return "stopped" if saved else "finished"
@@ -160,6 +164,26 @@ def _identity(options: TrainOptions, threads: int) -> dict[str, Any]:
     }
 
 
+class _Identity(msgspec.Struct):
+    """What `_identity` gave, read from run.json."""
+
+    options: dict[str, Any]
+    scene: str
+    cameras: str | None
+    threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
+    torch: str
+
+
+def _saved_identity(folder: RunFolder) -> _Identity | None:
+    found = folder.state.identity()
+    if found is None:
+        return None
+    try:
+        return typed(found, _Identity)
+    except ValueError as error:
+        raise folder.state.damaged(folder.state.path / "run.json", error) from None
+
+
 def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOptions, remedy: str) -> None:
     for name, now in plain_options(options).items():
         was = saved.get(name)
@@ -172,16 +196,18 @@ def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOp
 
 def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
     try:
-        options = json.loads(folder.report.read_text(encoding="utf-8"))["options"]
+        return typed(decode_json(folder.report.read_bytes())["options"], dict[str, Any])
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave --resume away to train anew") from error
-    return options if isinstance(options, dict) else {}
 
 
 def _saved_step(folder: RunFolder) -> int:
     """How far the optimisation was when it was saved; 0: not begun."""
     saved = folder.state.load("training")
-    return int(saved.values["pgs"]["step"]) if saved is not None else 0
+    if saved is None:
+        return 0
+    with folder.state.restoring("training"):
+        return int(saved.values["pgs"]["step"])
 
 
 def _digest(path: Path) -> str:

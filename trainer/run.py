@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from progdf.camera_files import save_cameras
 from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.json_values import decode_json, typed
 from progdf.ply import load_ply
 from progdf.rasterize import set_threads
 from progdf.region import Region
@@ -110,7 +111,11 @@ def _found(folder: RunFolder, options: TrainOptions, scene: Gaussians, log: RunL
     load_gdf(path, scene)
     trajectory, _, _ = load_trajectory(folder.trajectory)
     log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
-    return RunResult(folder, path, json.loads(folder.report.read_text(encoding="utf-8")), trajectory)
+    try:
+        report = typed(decode_json(folder.report.read_bytes()), dict[str, Any])
+    except ValueError as error:
+        raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
+    return RunResult(folder, path, report, trajectory)
 
 
 def _trained(

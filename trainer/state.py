@@ -15,18 +15,19 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
-from progdf.tensor_file import write_tensors
+from progdf.json_values import decode_json, typed
+from progdf.tensor_file import read_tensors, write_tensors
 
 SHARE = 0.01
 """Of the time, at most, that saving the state may take."""
@@ -82,14 +83,11 @@ class StateFolder:
     def identity(self) -> dict[str, Any] | None:
         """What `begin` was told; None where no run was stopped."""
         try:
-            content = json.loads(self._run.read_text(encoding="utf-8"))
+            return typed(decode_json(self._run.read_bytes()), dict[str, Any])
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:
-            raise self._damaged(self._run, error) from error
-        if not isinstance(content, dict):
-            raise self._damaged(self._run, "it holds no table")
-        return content
+            raise self.damaged(self._run, error) from error
 
     def begin(self, identity: Mapping[str, Any]) -> None:
         """Drop what is saved and start anew as the run that `identity`, JSON values, describes.
@@ -118,7 +116,7 @@ class StateFolder:
             path.parent.mkdir(exist_ok=True)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
         with written_whole(path) as beside:
-            write_tensors(beside, tensors, header)
+            write_tensors(beside, tensors, header, checksum=True)
             _flush(beside)
 
     def load(self, part: str, index: int | None = None) -> Saved | None:
@@ -131,11 +129,18 @@ class StateFolder:
         if not path.is_file():
             return None
         try:
-            with safe_open(path, framework="pt") as opened:
-                values = json.loads((opened.metadata() or {})["values"])
-                return Saved({name: opened.get_tensor(name) for name in opened.keys()}, values)  # noqa: SIM118
-        except (OSError, SafetensorError, KeyError, ValueError) as error:
-            raise self._damaged(path, error) from error
+            tensors, metadata = read_tensors(path)
+            return Saved(tensors, typed(decode_json(metadata["values"]), dict[str, Any]))
+        except (OSError, KeyError, ValueError) as error:
+            raise self.damaged(path, error) from error
+
+    @contextmanager
+    def restoring(self, part: str) -> Iterator[None]:
+        """Take over what was saved of a part; values that do not fit make one line, see `load`."""
+        try:
+            yield
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
+            raise self.damaged(self._file(part, None), type(error).__name__) from error
 
     def clear(self) -> None:
         """Remove everything, run.json first: a rest of it is no run. Nothing behind a link is touched."""
@@ -153,7 +158,8 @@ class StateFolder:
         self.clear()
         shutil.rmtree(self.path, ignore_errors=True)  # not if it is a link
 
-    def _damaged(self, path: Path, reason: object) -> ProgdfError:
+    def damaged(self, path: Path, reason: object) -> ProgdfError:
+        """The line for a file of the state that is not what was saved."""
         return ProgdfError(f"{path} is damaged ({reason}); delete {self.path} and train again")
 
     def _file(self, part: str, index: int | None) -> Path:
@@ -184,13 +190,14 @@ class Autosave:
         saved = self._folder.load(self._part)
         if saved is None:
             return False
-        for name, member in self._members.items():
-            tensors = {
-                key.removeprefix(f"{name}/"): tensor
-                for key, tensor in saved.tensors.items()
-                if key.startswith(f"{name}/")
-            }
-            member.restore(Saved(tensors, saved.values[name]))
+        with self._folder.restoring(self._part):
+            for name, member in self._members.items():
+                tensors = {
+                    key.removeprefix(f"{name}/"): tensor
+                    for key, tensor in saved.tensors.items()
+                    if key.startswith(f"{name}/")
+                }
+                member.restore(Saved(tensors, saved.values[name]))
         return True
 
     def step_done(self) -> None:

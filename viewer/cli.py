@@ -17,6 +17,7 @@ from progdf.files import written_whole
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.load_report import counted
 from progdf.ply import GEOMETRY, load_ply, save_ply
+from progdf.terminal import say
 
 from . import arguments, opening
 from .options import ExportOptions, ViewOptions
@@ -61,7 +62,7 @@ def export(argv: Sequence[str]) -> int:
         _check_reloaded(edited, load_ply(beside))
         _check_by_plyfile(edited, beside)
     told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
-    print(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
+    say(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
     return 0
 
 

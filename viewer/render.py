@@ -14,6 +14,7 @@ from progdf.command_line import parsed
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
 from progdf.gaussians import Gaussians
+from progdf.terminal import say
 
 from . import arguments, film, opening, recordings, timeline, timeline_file, timeline_film
 from .camera_arguments import asked_camera
@@ -45,7 +46,7 @@ def render(argv: Sequence[str]) -> int:
     if options.timeline is not None:
         keys, count = _keys(options, found), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
-            print(timeline_film.write(options.out, keys, view, camera, engine, count))
+            say(timeline_film.write(options.out, keys, view, camera, engine, count))
         return 0
     swept = _swept(options, found)
     with _engine(scene, gdfs, options) as engine:
@@ -56,11 +57,11 @@ def render(argv: Sequence[str]) -> int:
             told = _still(options, found, view, camera, engine)
         drawn_by = _drawn_by(engine)
     each = "each " if options.sheet is not None else ""
-    print(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
+    say(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
     if told:
-        print(told)
-    if gdfs and not swept and not any(layer.strength for layer in view.layers):
-        print(f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit")
+        say(told)
+    if view.layers and not swept and not any(layer.strength for layer in view.layers):
+        say(f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit")
     return 0
 
 

@@ -24,6 +24,7 @@ from pathlib import Path
 from progdf.errors import ProgdfError
 from progdf.files import open_failure, written_whole
 from progdf.info import TIMELINE_MARK as MARK
+from progdf.json_values import decode_json
 
 from . import plain, timeline
 from .plain import NotPlainError
@@ -93,8 +94,8 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
     except OSError as error:
         raise open_failure(path, error) from None
     try:
-        value = json.loads(text) if len(text) <= _LARGEST else None
-    except (ValueError, RecursionError):
+        value = decode_json(text) if len(text) <= _LARGEST else None
+    except ValueError:
         value = None
     if not isinstance(value, dict) or MARK not in value:
         raise ProgdfError(f"{path} is not a timeline; give the .json file that Ctrl+K in the window writes")

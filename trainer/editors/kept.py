@@ -21,6 +21,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
+from progdf.json_values import decode_json
 from progdf.pictures import to_picture, write_image
 from trainer.picture_list import add_pictures
 from trainer.pictures import read_picture
@@ -91,6 +92,6 @@ def _eight_bits(image: Tensor) -> Tensor:
 
 def _note(path: Path) -> object:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return decode_json(path.read_bytes())
     except (OSError, ValueError):
         return None

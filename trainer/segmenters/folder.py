@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.lens import straightened
+from progdf.pictures import laid_on, open_picture
 from trainer.editors.folder import SUFFIXES
 
 
@@ -50,20 +51,10 @@ def _file(folder: Path, camera: Camera, count: int) -> Path:
 
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
-    try:
-        with Image.open(path) as opened:
-            picture = opened.convert("RGBA")
-    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
-        raise ProgdfError(f"{path} cannot be read as a picture; save the mask as PNG") from error
-    if abs(picture.width * camera.height / (picture.height * camera.width) - 1.0) > 0.02:
-        raise ProgdfError(
-            f"{path} is {picture.width}x{picture.height} pixels, its camera "
-            f"{camera.width}x{camera.height}; a mask with the camera's proportions would be right"
-        )
-    black = Image.new("RGBA", picture.size, "black")
-    grey = Image.alpha_composite(black, picture).convert("L")
-    if grey.size != (camera.width, camera.height):
-        grey = grey.resize((camera.width, camera.height), Image.Resampling.BOX)
+    size = (camera.width, camera.height)
+    grey = laid_on(open_picture(path, size), "black").convert("L")
+    if grey.size != size:
+        grey = grey.resize(size, Image.Resampling.BOX)
     mask = torch.from_numpy(np.asarray(grey, dtype=np.float32) / 255.0)
     if bent and camera.lens:
         return straightened(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
