@@ -25,6 +25,8 @@ from progdf.user_folders import state_folder
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.demo:main", "make a scene, train its region edits, write previews, open the window"),
     "train": ("trainer.cli:train", "edit a region of a scene and write its .gdf file"),
+    "region": ("trainer.cli:region", "show or keep which Gaussians a region selects"),
+    "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
     "ablate": ("trainer.cli:ablate", "train a run again without each part of the method: one table"),
     "view": ("viewer.cli:view", "open the window: splats, layers, sliders"),

@@ -145,7 +145,8 @@ def orbit_rig(
     up = guess_up(scene) if up is None else up.float() / up.float().norm()
     if is_surrounding(scene, up):
         _log.warning(
-            "this looks like a scene to stand inside: cameras around it cannot frame it; give its own cameras"
+            "this looks like a scene to stand inside: cameras around it cannot frame it; "
+            "give its own cameras, or keep views with F4 in progdf view"
         )
     centre, radius = scene_sphere(scene)
     K = intrinsics(fov_y, width, height)

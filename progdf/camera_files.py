@@ -71,6 +71,22 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     return cameras
 
 
+def read_camera(text: str) -> Camera:
+    """The camera of `FILE[:INDEX]`, the first one where no index is given; −1 is the last.
+
+    Raises:
+        ProgdfError: the file is missing or holds no cameras, or not that many.
+    """
+    name, colon, index = text.rpartition(":")
+    numbered = bool(colon) and index.lstrip("-").isdecimal() and not Path(text).exists()
+    path, number = (name, int(index)) if numbered else (text, 0)
+    cameras = load_cameras(path)
+    if not -len(cameras) <= number < len(cameras):
+        last = len(cameras) - 1
+        raise ProgdfError(f"{path} has no camera {number}; it holds {len(cameras)}, numbered 0 to {last}")
+    return cameras[number]
+
+
 def _from_folder(folder: Path) -> list[Camera]:
     """The one thing in a folder that holds cameras."""
     found = [folder / name for name in _FILES if (folder / name).is_file()]
@@ -118,6 +134,17 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     raise ProgdfError(
         f"{name} holds no cameras; give a cameras.json, a transforms.json or a file of saved cameras"
     )
+
+
+def kind_of_cameras(path: str | os.PathLike[str]) -> str:
+    """ "own" for a file that `save_cameras` wrote, "other" for anything else."""
+    try:
+        content = json.loads(Path(path).read_bytes())
+    except OSError as error:
+        raise open_failure(path, error) from None
+    except (ValueError, RecursionError):
+        return "other"
+    return "own" if isinstance(content, dict) and content.get("format") == _FORMAT else "other"
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> None:

@@ -5,6 +5,7 @@
             | 'labels:' FILE '.npy:' ID (',' ID)*
             | 'box:' x0,y0,z0,x1,y1,z1           two opposite corners, world units
             | 'sphere:' x,y,z,r                  centre and radius, world units
+            | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
             | KIND ':' …                         other kinds that the caller knows, e.g. masks:, text:
 
 Numbers and file names hold '-' and '+' themselves, so a '+' or '-' joins two parts only where a kind and its
@@ -52,7 +53,7 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
     Raises:
         ProgdfError: the spec cannot be read, a file does not fit the scene, or nothing is in the region.
     """
-    known: dict[str, Kind] = {"labels": _labels, "box": _box, "sphere": _sphere, **kinds}
+    known: dict[str, Kind] = {"labels": _labels, "box": _box, "sphere": _sphere, "file": _file, **kinds}
     region = from_mask("", torch.zeros(len(scene), dtype=torch.bool))
     for sign, part in split_spec(spec, tuple(known)):
         kind, colon, rest = part.partition(":")
@@ -94,6 +95,39 @@ def read_labels(path: str, count: int) -> Tensor:
             f"{path} holds {shape} labels, the scene {count} Gaussians; one each would be right"
         )
     return torch.from_numpy(labels.reshape(-1).astype(np.int64))
+
+
+def read_members(path: str, count: int) -> Tensor:
+    """The rows that a .npy file names, sorted and each once: integers, or a bool per Gaussian. [M] int64
+
+    Raises:
+        ProgdfError: no such file, no .npy, of another kind, or rows that the scene does not have.
+    """
+    stored = open_npy(path, "rows, as progdf region … -o FILE.npy writes them")
+    if stored.dtype.kind == "b":
+        if stored.shape != (count,):
+            shape = "x".join(str(side) for side in stored.shape) or "1"
+            raise ProgdfError(f"{path} is a mask of {shape}, the scene has {count} Gaussians; give its own")
+        return torch.from_numpy(np.flatnonzero(stored))
+    if stored.dtype.kind not in "iu" or stored.ndim != 1:
+        raise ProgdfError(
+            f"{path} holds {stored.dtype} numbers of {stored.ndim} dimensions; "
+            "give a list of integer rows, or a bool for each Gaussian"
+        )
+    if len(stored) and not 0 <= int(stored.min()) <= int(stored.max()) < count:
+        raise ProgdfError(
+            f"{path} names row {int(stored.min() if stored.min() < 0 else stored.max())}, "
+            f"the scene has rows 0 to {count - 1}; it was made for another scene"
+        )
+    return torch.from_numpy(np.unique(stored).astype(np.int64))
+
+
+def _file(rest: str, scene: Gaussians) -> Region:
+    if not rest:
+        raise ProgdfError("file: names no file; write file:MEMBERS.npy, as progdf region … -o writes it")
+    mask = torch.zeros(len(scene), dtype=torch.bool)
+    mask[read_members(rest, len(scene))] = True
+    return from_mask(f"file:{rest}", mask)
 
 
 def _labels(rest: str, scene: Gaussians) -> Region:

@@ -76,7 +76,8 @@ class Survey:
         lines += [f"odd: {counted(rows, noun)} {what}" for rows, noun, what in odd if rows]
         if self.surrounding:
             lines.append(
-                "cameras: a scene to stand inside, which cameras around it cannot frame; give its own"
+                "cameras: a scene to stand inside, which cameras around it cannot frame; give its own, "
+                "or keep views with F4 in progdf view"
             )
         return lines
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from imgui_bundle import imgui
 
-from progdf.camera_files import save_cameras
+from progdf.camera_files import load_cameras, save_cameras
 from progdf.ply import save_ply
 from tests.null_app import null_app, press
 from tests.sessions import bear_files, full_view, opened_document, saved_session, spoilt
 from tests.ui_rig import bear, first_view
 from viewer import app as application
-from viewer import desk, recent, session
+from viewer import desk, recent, session, workspace
 from viewer.turntable import to_camera
 from viewer.workspace import Dialog
 
@@ -271,3 +273,28 @@ def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: app
     assert "~nobody-here does not exist" in question(window).error
     window.desk.serve("open_file:~nobody-here/bear.ply")
     assert "~nobody-here/bear.ply" in message(window)
+
+
+def test_f4_keeps_each_view_as_a_camera_beside_the_session(window: application.App, folder: Path) -> None:
+    assert window.document.path is not None
+    kept = folder / f"{window.document.path.stem}.cameras.json"
+    for azimuth in (10.0, 70.0):
+        camera = replace(window.stage.work.view.camera, azimuth=azimuth)
+        window.stage.work = workspace.with_camera(window.stage.work, camera)
+        press(window, "F4")
+        assert kept.name in message(window)
+    found = load_cameras(kept)
+    assert [camera.name for camera in found] == ["view_000", "view_001"]
+    shown = to_camera(window.stage.work.view.camera, *window.stage.picture_size)
+    assert torch.equal(found[1].viewmat, shown.viewmat)
+    assert torch.equal(found[1].K, shown.K)
+    assert not torch.equal(found[0].viewmat, found[1].viewmat)
+
+
+def test_f4_overwrites_no_file_of_cameras_that_it_did_not_make(window: application.App, folder: Path) -> None:
+    assert window.document.path is not None
+    theirs = folder / f"{window.document.path.stem}.cameras.json"
+    theirs.write_text("[]")
+    press(window, "F4")
+    assert theirs.read_text() == "[]"
+    assert "was not made with F4" in message(window)

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from progdf.camera import Camera, orbit_rig
-from progdf.camera_files import save_cameras
+from progdf.camera_files import load_cameras, save_cameras
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.lens import Lens
@@ -130,11 +130,27 @@ def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None
     assert "names no folder" in refusal("masks:", told)
     assert "is not a folder" in refusal(f"masks:{tmp_path}/nowhere", given)
     (masks / f"{name}.png").rename(masks / "other.png")
-    assert f"no mask {name}.png; put one there for each of the 6 cameras" in refusal(f"masks:{masks}", told)
     Image.new("L", (SIZE, SIZE // 2)).save(masks / f"{name}.png")
     assert "96x48 pixels, its camera 96x96" in refusal(f"masks:{masks}", told)
     (masks / f"{name}.png").write_bytes(b"no picture")
     assert "cannot be read as a picture" in refusal(f"masks:{masks}", told)
+
+
+def test_a_camera_without_a_mask_tells_nothing_and_none_at_all_is_one_line(
+    masks: Path, tmp_path: Path
+) -> None:
+    whole = set(region_of(f"masks:{masks}", settings(tmp_path)).members.tolist())
+    names = [camera.name for camera in load_cameras(masks / "cameras.json")]
+    (masks / f"{names[0]}.png").unlink()
+    said: list[str] = []
+    fewer = set(region_of(f"masks:{masks}", settings(tmp_path, say=said.append)).members.tolist())
+    assert len(whole & fewer) > 0.8 * len(whole | fewer)
+    assert "5 of 6 cameras have a mask; the others tell nothing" in said
+    for name in names[1:]:
+        (masks / f"{name}.png").unlink()
+    assert f"no mask for any of the 6 cameras; name each as its view, as {names[0]}.png" in refusal(
+        f"masks:{masks}", settings(tmp_path)
+    )
 
 
 def test_masks_that_select_nothing_tell_the_highest_score(masks: Path, tmp_path: Path) -> None:

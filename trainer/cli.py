@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from progdf.command_line import parsed
 from trainer.options import AblateOptions, FitOptions, TrainOptions
 from trainer.presets import under_preset
+from trainer.region_options import RegionOptions, ViewsOptions, joined
 
 
 def train(argv: Sequence[str]) -> int:
@@ -33,6 +34,24 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
     if options.preset == "default":
         return options
     return parsed(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
+
+
+def region(argv: Sequence[str]) -> int:
+    """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
+    options = parsed(RegionOptions, joined(argv), "progdf region")
+    from trainer.region_picture import show
+
+    print(show(options))
+    return 0
+
+
+def views(argv: Sequence[str]) -> int:
+    """Run `progdf views`; 0 when they are written. Raises ProgdfError for what the user can mend."""
+    options = parsed(ViewsOptions, argv, "progdf views")
+    from trainer.original_views import write
+
+    print(write(options))
+    return 0
 
 
 def ablate(argv: Sequence[str]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +14,7 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.region import Region
+from trainer.few_masks import FEW, holes_of, without_strays
 from trainer.neighbours import surface_vote
 
 Rule = Literal["share", "count", "paper"]
@@ -21,7 +22,7 @@ Rule = Literal["share", "count", "paper"]
 THRESHOLDS: dict[Rule, float] = {"share": 0.7, "count": 0.8, "paper": 0.8}
 """Least score of a member under each rule; those of `count` and `paper` are the paper's."""
 
-_HIDDEN = 0.06
+HIDDEN = 0.06
 """Below this clearness a Gaussian counts as never seen: what shines through tells of what covers it."""
 
 _HALF_HIDDEN, _DOUBTFUL = 0.3, (0.3, 0.7)
@@ -38,6 +39,8 @@ class Evidence:
         weight: Σ w, its contribution in all. [N]
         pixels: n. [N]
         clearness: mean transmittance in front of it in the view that shows it best, 0 hidden .. 1 bare. [N]
+        views: how many views show it: clearer than `HIDDEN`. [N]
+        views_inside: in how many of these more than half of its contribution falls inside the mask. [N]
     """
 
     inside: Tensor
@@ -45,6 +48,8 @@ class Evidence:
     weight: Tensor
     pixels: Tensor
     clearness: Tensor
+    views: Tensor
+    views_inside: Tensor
 
 
 def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Evidence:
@@ -57,15 +62,21 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     """
     sums = torch.zeros(len(scene), 4, dtype=torch.float64)
     mean_weight = torch.zeros(len(scene))
+    views, views_inside = torch.zeros(len(scene)), torch.zeros(len(scene))
+    # the mean α of a Gaussian of opacity o over the ellipse {α ≥ 1/255}, where nothing covers it
+    bare = (scene.opacities - ALPHA_MIN) / (scene.opacities / ALPHA_MIN).clamp_min(1.001).log()
+    bare = bare.clamp_min(1e-6)
     for camera, mask in zip(cameras, masks, strict=True):
         found = alpha_weights(scene, camera, mask, near=camera.near)
         sums += found
-        mean_weight = torch.maximum(mean_weight, found[:, 2] / found[:, 3].clamp_min(1.0))
-    # the mean α of a Gaussian of opacity o over the ellipse {α ≥ 1/255}, where nothing covers it
-    bare = (scene.opacities - ALPHA_MIN) / (scene.opacities / ALPHA_MIN).clamp_min(1.001).log()
-    clearness = (mean_weight / bare.clamp_min(1e-6)).clamp(0.0, 1.0)
+        mean = (found[:, 2] / found[:, 3].clamp_min(1.0)).float()
+        mean_weight = torch.maximum(mean_weight, mean)
+        shown = mean > HIDDEN * bare
+        views += shown
+        views_inside += shown & (found[:, 0] > 0.5 * found[:, 2])
+    clearness = (mean_weight / bare).clamp(0.0, 1.0)
     inside, pixels_inside, weight, pixels = sums.float().unbind(1)
-    return Evidence(inside, pixels_inside, weight, pixels, clearness)
+    return Evidence(inside, pixels_inside, weight, pixels, clearness, views, views_inside)
 
 
 def score(evidence: Evidence, rule: Rule = "share") -> Tensor:
@@ -87,6 +98,7 @@ def lift_masks(
     name: str = "masks",
     rule: Rule = "share",
     threshold: float | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Region:
     """The Gaussians that the masks select (ProGDF appendix, region extraction; see method.md 4).
 
@@ -97,6 +109,7 @@ def lift_masks(
         name: the region's name
         rule: see `score`
         threshold: least score of a member, 0..1; None is the rule's own, see `THRESHOLDS`
+        say: hears what few masks were cleaned of, see `few_masks`
 
     Returns:
         The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
@@ -130,17 +143,30 @@ def lift_masks(
     scores = score(evidence, rule)
     rows = undecided(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
+    few = len(masks) <= FEW
+    if few:
+        member = without_strays(scene, member, evidence.views, evidence.views_inside, say)
+        scores = torch.where(member, scores, scores.clamp_max(_below(least)))
     scores[rows] = 0.0
     if bool(member.any()):
         vote = surface_vote(scene, member, rows)
-        below = (least * (1 + vote)).clamp_max(float(torch.nextafter(torch.tensor(least), torch.tensor(0.0))))
+        below = (least * (1 + vote)).clamp_max(_below(least))
         scores[rows] = torch.where(vote > 0, least + (1 - least) * vote, below)
         member[rows] = vote > 0
+    if few:
+        holes = holes_of(scene, member, evidence.views - evidence.views_inside, say)
+        member[holes] = True
+        scores[holes] = scores[holes].clamp_min(least)
     return Region(name, member.nonzero()[:, 0], scores.clamp(0.0, 1.0))
+
+
+def _below(least: float) -> float:
+    """The largest score of no member."""
+    return float(torch.nextafter(torch.tensor(least), torch.tensor(0.0)))
 
 
 def undecided(evidence: Evidence, least: float) -> Tensor:
     """Which Gaussians the views tell nothing sure of: hidden, or half hidden and of mixed share. [N] bool"""
     share = score(evidence, "share")
     mixed = (share > min(_DOUBTFUL[0], 1 - least)) & (share < max(_DOUBTFUL[1], least))
-    return (evidence.clearness < _HIDDEN) | (mixed & (evidence.clearness < _HALF_HIDDEN))
+    return (evidence.clearness < HIDDEN) | (mixed & (evidence.clearness < _HALF_HIDDEN))

@@ -25,6 +25,12 @@ from trainer.views import View, fit_size, named, near_enough, region_rig
 
 BACKGROUND = (1.0, 1.0, 1.0)
 _PROBES = 3
+INSIDE = (
+    "looks like a scene to stand inside, which cameras around it cannot show; give its own with --cameras "
+    "(cameras.json, transforms.json or a COLMAP folder), or make some: progdf view, look around, F4 keeps "
+    "each view"
+)
+"""What is said of such a scene without cameras, after its name."""
 
 Pictures = Mapping[float, Sequence[Tensor]]
 """Strength → whole edited pictures, one per view. [H,W,3] each"""
@@ -55,10 +61,7 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
     if options.cameras is not None:
         cameras = [fit_size(camera, options.image_size) for camera in given]
     elif is_surrounding(scene, up.direction):
-        raise ProgdfError(
-            f"{options.scene} looks like a scene to stand inside, which cameras around it cannot show; "
-            "give its own with --cameras (cameras.json, transforms.json or a COLMAP folder)"
-        )
+        raise ProgdfError(f"{options.scene} {INSIDE}")
     else:
         # half as many again, as some will find the region hidden
         count = options.views + options.views // 2

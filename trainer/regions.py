@@ -24,7 +24,7 @@ from trainer.artefacts import claim
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.lift import Rule, lift_masks
 from trainer.options import TrainOptions
-from trainer.preparation import BACKGROUND
+from trainer.preparation import BACKGROUND, INSIDE
 from trainer.segmenters import SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
 from trainer.views import fit_size, named, near_enough, pictured, region_rig
@@ -47,6 +47,7 @@ class RegionSettings:
         quiet: no progress on the screen
         up: as --up
         scene: the scene's file, whose format may say which way is up
+        say: hears in a line each what became of the masks
     """
 
     cameras: Path | None
@@ -58,19 +59,22 @@ class RegionSettings:
     quiet: bool = False
     up: UpChoice = "auto"
     scene: Path | None = None
+    say: Callable[[str], None] | None = None
 
     def up_of(self, scene: Gaussians) -> Tensor:
         """The direction that is up in a scene without cameras. [3]"""
         return find_up(scene, (), self.up, convention_of(self.scene)).direction
 
 
-def region_settings(options: TrainOptions, edit: Mapping[str, str], quiet: bool) -> RegionSettings:
+def region_settings(
+    options: TrainOptions, edit: Mapping[str, str], quiet: bool, say: Callable[[str], None] | None = None
+) -> RegionSettings:
     """What the options of a run say; pictures that are segmented are kept in its folder.
 
     Args:
         options: settled
         edit: see `claim`
-        quiet: see `RegionSettings`
+        quiet, say: see `RegionSettings`
     """
 
     def kept() -> Path:
@@ -86,6 +90,7 @@ def region_settings(options: TrainOptions, edit: Mapping[str, str], quiet: bool)
         quiet,
         options.up,
         options.scene,
+        say,
     )
 
 
@@ -108,6 +113,9 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
             )
         cameras = _cameras(own if own.is_file() or settings.cameras is None else settings.cameras)
         masks = read_masks(folder, cameras, bent)
+        told = sum(mask is not None for mask in masks)
+        if settings.say is not None and told < len(masks):
+            settings.say(f"{told} of {len(masks)} cameras have a mask; the others tell nothing")
         return _lifted(scene, cameras, masks, f"{kind}:{rest}", settings)
 
     def from_text(rest: str, scene: Gaussians) -> Region:
@@ -149,7 +157,7 @@ def _lifted(
     ]
     small = near_enough([camera for camera, _ in told], scene)
     scaled = [_scaled(mask, camera) for camera, mask in told]
-    region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold)
+    region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold, settings.say)
     if not len(region):
         raise ProgdfError(
             f"{name} selects no Gaussian by the rule {settings.rule}; its highest score is "
@@ -211,10 +219,7 @@ def _segmented_cameras(scene: Gaussians, settings: RegionSettings) -> list[Camer
         return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
     up = settings.up_of(scene)
     if is_surrounding(scene, up):
-        raise ProgdfError(
-            "the scene looks like one to stand inside, which cameras around it cannot show; "
-            "give its own with --cameras"
-        )
+        raise ProgdfError(f"the scene {INSIDE}")
     return named(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT, up=up))
 
 

@@ -80,16 +80,16 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
     use_threads(options.threads)
     scene = load_ply(options.scene)
     edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
-    region = kept_region(options)
+    region, notes = kept_region(options), list[str]()
     if region is None:
-        kinds = region_kinds(region_settings(options, edit, quiet))
+        kinds = region_kinds(region_settings(options, edit, quiet, notes.append))
         region = parse_region(options.region, scene, options.name, kinds)
     folder = claim(options.out, edit)
     with stopping(), locked(folder), one_line(folder):
         session = open_session(folder, options, edit, region, wanted_threads(options.threads))
         log = RunLog(folder.log, quiet)
         try:
-            for note in session.notes:
+            for note in (*session.notes, *notes):
                 log.say(note)
             if session.does == "nothing":
                 return _found(folder, options, scene, log)

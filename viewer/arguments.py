@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Protocol
 
 from progdf.camera import Camera
-from progdf.camera_files import load_cameras
 from progdf.checkpoint import Gdf, load_gdf
 from progdf.colour import parse_color
 from progdf.errors import ProgdfError
@@ -132,22 +131,6 @@ def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
             f"--orbit {text}: the distance is {distance:g}; above 0 and up to {FARTHEST:g} would be right"
         )
     return replace(framed, azimuth=numbers[0], elevation=numbers[1], distance=distance)
-
-
-def read_camera(text: str) -> Camera:
-    """The camera of `FILE[:INDEX]`, the first one where no index is given; −1 is the last.
-
-    Raises:
-        ProgdfError: the file is missing or holds no cameras, or not that many.
-    """
-    name, colon, index = text.rpartition(":")
-    numbered = bool(colon) and index.lstrip("-").isdecimal() and not Path(text).exists()
-    path, number = (name, int(index)) if numbered else (text, 0)
-    cameras = load_cameras(path)
-    if not -len(cameras) <= number < len(cameras):
-        last = len(cameras) - 1
-        raise ProgdfError(f"{path} has no camera {number}; it holds {len(cameras)}, numbered 0 to {last}")
-    return cameras[number]
 
 
 def fitted(camera: Camera, size: tuple[int, int]) -> Camera:

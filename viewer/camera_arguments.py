@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from progdf.camera import Camera
+from progdf.camera_files import read_camera
 from progdf.checkpoint import Gdf
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -43,7 +44,7 @@ def asked_camera(
     if options.camera is not None:
         if options.frame is not None:
             raise ProgdfError("--camera and --frame were both given; give one of them")
-        camera = arguments.read_camera(options.camera)
+        camera = read_camera(options.camera)
         return camera if size is None else arguments.fitted(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height

@@ -223,6 +223,7 @@ KEYS = (
     Key("F2", "picture", "save the picture as PNG"),
     Key("Shift+F2", "window_picture", "save the whole window as PNG"),
     Key("F3", "snapshot", "take a snapshot of the sliders"),
+    Key("F4", "camera", "keep this view as a camera"),
     Key("Ctrl+S", "save", "save the session"),
     Key("Ctrl+Shift+S", "save_as", "save it under another name"),
     Key("Ctrl+O", "open", "open a session, scene or edit"),

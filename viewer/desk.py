@@ -18,14 +18,14 @@ from progdf.info import kind_of
 from progdf.session_file import SUFFIX
 
 from . import document as documents
-from . import native, recent, session, timeline_file, workspace
+from . import native, recent, saved_files, session, timeline_file, workspace
 from .document import Document
 from .playback import Player
 from .session import Session
 from .stage import Stage
 from .state import LayerState, Timeline
 from .threads import all_threads
-from .turntable import first_camera, from_camera
+from .turntable import first_camera, from_camera, to_camera
 from .upright import up_of
 from .workspace import Dialog
 
@@ -86,6 +86,8 @@ class Desk:
             self._browse()
         elif name == "open_file":
             self.open(_typed(argument))
+        elif name == "camera":
+            self._told(self._keep_camera)
         elif name == "discard":
             self._app.stage.work = workspace.as_saved(self._app.stage.work)
         elif name == "quit":
@@ -235,6 +237,13 @@ class Desk:
             stage.work, from_camera(stage.work.view.camera, load_cameras(path)[0], stage.facts.bounds)
         )
         stage.tell(f"Looking through the first camera of {path.name}")
+
+    def _keep_camera(self) -> None:
+        """Add the view on screen to the cameras kept beside the session or the scene."""
+        stage = self._app.stage
+        place = self.path or self._app.document.path or stage.pictures / self._app.document.title
+        path, count = saved_files.camera(place, to_camera(stage.work.view.camera, *stage.picture_size))
+        stage.tell(f"Kept as camera {count} of {path.resolve()}; progdf train … --cameras {path.name}")
 
     def _session(self) -> Session:
         work = self._app.stage.work

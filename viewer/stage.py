@@ -240,6 +240,11 @@ class Stage:
         return self.canvas.drawn
 
     @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height in pixels of the picture on screen."""
+        return self._sight().size
+
+    @property
     def timings(self) -> FrameTimings:
         """Of the picture on screen."""
         return self.canvas.timings

@@ -354,7 +354,7 @@ def _snapshot(workspace: Workspace, _: str) -> Workspace:
 
 
 REQUESTS = (
-    *("picture", "window_picture", "timeline_file", "full_screen", "quit"),
+    *("picture", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
 )
 """What only the window can do: `save_to:PATH`, `open_file:PATH`; `save:THEN` asks for THEN afterwards;

@@ -3,7 +3,8 @@
     DIR/NAME.png        named as the run names the camera's view (see RUN/views/original)
     DIR/cameras.json    the cameras, where the masks bring their own; else those of --cameras
 
-Any size with the camera's proportions will do. Transparent pixels lie outside the region.
+Any size with the camera's proportions will do. Transparent pixels lie outside the region. A camera without a
+mask tells nothing; a black mask says that the view does not show the region.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from progdf.pictures import laid_on, open_picture
 from trainer.editors.folder import SUFFIXES
 
 
-def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor]:
-    """The mask of every camera, scaled to its size. [H,W] float32 0..1 each
+def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor | None]:
+    """The mask of every camera, scaled to its size, [H,W] float32 0..1 each; None where there is none.
 
     Args:
         folder: see the module's head
@@ -32,22 +33,23 @@ def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> l
         bent: the masks were drawn over photographs, which the cameras' lenses have bent: straighten them
 
     Raises:
-        ProgdfError: the folder or a mask is missing, broken, or of other proportions.
+        ProgdfError: no such folder, not one mask in it, or one that is broken or of other proportions.
     """
     if not folder.is_dir():
         raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
-    return [_mask(_file(folder, camera, len(cameras)), camera, bent) for camera in cameras]
+    files = [_file(folder, camera) for camera in cameras]
+    if not any(files):
+        raise ProgdfError(
+            f"{folder} has no mask for any of the {len(cameras)} cameras; "
+            f"name each as its view, as {cameras[0].name}.png"
+        )
+    found = zip(files, cameras, strict=True)
+    return [None if file is None else _mask(file, camera, bent) for file, camera in found]
 
 
-def _file(folder: Path, camera: Camera, count: int) -> Path:
-    for suffix in SUFFIXES:
-        path = folder / f"{camera.name}{suffix}"
-        if path.is_file():
-            return path
-    raise ProgdfError(
-        f"{folder} has no mask {camera.name}.png; put one there for each of the {count} cameras, "
-        "black where a view does not show the region"
-    )
+def _file(folder: Path, camera: Camera) -> Path | None:
+    paths = (folder / f"{camera.name}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
