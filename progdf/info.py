@@ -17,10 +17,10 @@ from progdf.checkpoint import open_gdf
 from progdf.command_line import parsed
 from progdf.errors import ProgdfError
 from progdf.files import open_failure
+from progdf.formats import load_scene_with_report, scene_file, scene_format
 from progdf.gdf_head import GdfHead
 from progdf.json_values import decode_json, typed
 from progdf.load_report import counted, file_size, grouped
-from progdf.ply import load_ply_with_report
 from progdf.survey import survey
 from progdf.terminal import say
 
@@ -30,7 +30,7 @@ TIMELINE_MARK = "progdf_timeline"
 
 @dataclass(frozen=True)
 class Options:
-    """Tell what a .ply scene, a .gdf edit, a session or a camera file holds, an edit with its error report.
+    """Tell what a scene, a .gdf edit, a session or a camera file holds, an edit with its error report.
 
     Args:
         file: the file; its content decides what it is, not its name
@@ -48,34 +48,34 @@ def main(argv: Sequence[str]) -> int:
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """ "ply", "gdf", "session", "timeline" or "cameras", by content; by name where the content says nothing.
+    """ "scene", "gdf", "session", "timeline" or "cameras", by content, else by name.
 
     Raises:
         ProgdfError: it cannot be read, or is nothing we know.
     """
+    path = scene_file(path)
     try:
-        with Path(path).open("rb") as file:
+        with path.open("rb") as file:
             start = file.read(64)
     except OSError as error:
         raise open_failure(path, error) from None
-    if start[:3] == b"ply":
-        return "ply"
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "gdf"
+    if scene_format(path) is not None:
+        return "scene"
     if start.lstrip()[:1] == b"{" and f'"{session_file.MARK}"'.encode() in start:
         return "session"
     if start.lstrip()[:1] == b"{" and f'"{TIMELINE_MARK}"'.encode() in start:
         return "timeline"
     if start.lstrip()[:1] in (b"{", b"["):
         return "cameras"
-    suffix = Path(path).suffix.lower().lstrip(".")
-    if suffix in ("ply", "gdf"):
-        return suffix  # its reader knows best what is wrong
-    raise ProgdfError(f"{path} is nothing progdf knows; give a .ply scene, a .gdf edit or a camera file")
+    if path.suffix.lower() == ".gdf":
+        return "gdf"  # its reader knows best what is wrong
+    raise ProgdfError(f"{path} is nothing progdf knows; give a scene, a .gdf edit or a camera file")
 
 
 def _scene_lines(path: Path) -> Iterator[str]:
-    scene, report = load_ply_with_report(path)
+    scene, report = load_scene_with_report(path)
     yield from report.lines()
     yield from survey(scene).lines()
 
@@ -153,7 +153,7 @@ def _camera_lines(path: Path) -> Iterator[str]:
 
 
 _DESCRIBE = {
-    "ply": _scene_lines,
+    "scene": _scene_lines,
     "gdf": _edit_lines,
     "session": _session_lines,
     "timeline": _timeline_lines,

@@ -166,7 +166,7 @@ def _check_properties(name: str, header: PlyHeader, vertex: Element) -> int:
 
 def _what_it_is(header: PlyHeader, present: set[str], missing: list[str]) -> str:
     if "packed_position" in present:
-        return "is a compressed .ply; convert it to a plain 3DGS .ply (splat-transform does)"
+        return "is a compressed .ply; open it with load_scene"
     if missing == ["scale_2"]:
         return "has no scale_2, so it holds 2D Gaussians; a 3DGS .ply has scale_0, scale_1 and scale_2"
     listed = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")

@@ -40,8 +40,8 @@ BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">
 
 _FOREIGN = (
     (b"version https://git-lfs", "is a Git LFS pointer, not the file itself; run `git lfs pull` to fetch it"),
-    (b"\x1f\x8b", "is gzip data (an .spz scene?); convert it to a 3DGS .ply first"),
-    (b"PK\x03\x04", "is a zip archive (an .sog scene?); unpack or convert it to a 3DGS .ply first"),
+    (b"\x1f\x8b", "is gzip data, but no .spz scene; unpack it first"),
+    (b"PK\x03\x04", "is a zip archive, but no .sog scene; unpack it first"),
     (b"<", "is a web page or XML, not a .ply; download the file itself"),
 )
 

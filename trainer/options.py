@@ -62,7 +62,7 @@ class TrainOptions:
     """
 
     scene: tyro.conf.Positional[Path]
-    """The scene, a 3DGS .ply file."""
+    """The scene: a .ply (also compressed), .spz, .splat, .ksplat or .sog."""
     out: Path
     """Folder of the run; made if need be."""
     region: str

@@ -12,9 +12,9 @@ import torch
 
 from progdf.camera_files import load_cameras
 from progdf.errors import ProgdfError
+from progdf.formats import load_scene, scene_file
 from progdf.gaussians import Gaussians
 from progdf.json_values import typed
-from progdf.ply import load_ply
 from progdf.region import Region
 from progdf.trajectory import Trajectory, load_trajectory
 from trainer.artefacts import RunFolder
@@ -70,9 +70,9 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
         name = typed(told.options["name"], str)
         members, score = extra["members"], extra["score"]
         path = scene or Path(told.scene)
-        if not path.is_file():
+        if not scene_file(path).is_file():
             raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
-        gaussians = load_ply(path)
+        gaussians = load_scene(path)
         if len(score) != len(gaussians):
             raise ProgdfError(
                 f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "

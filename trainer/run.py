@@ -11,9 +11,9 @@ from torch import Tensor
 from progdf.camera_files import save_cameras
 from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
+from progdf.formats import load_scene
 from progdf.gaussians import Gaussians
 from progdf.json_values import decode_json, typed
-from progdf.ply import load_ply
 from progdf.rasterize import set_threads
 from progdf.region import Region
 from progdf.region_spec import parse_region
@@ -78,7 +78,7 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
     if not options.out.is_dir() or not any(options.out.iterdir()):
         check_new_editor(options.editor)
     use_threads(options.threads)
-    scene = load_ply(options.scene)
+    scene = load_scene(options.scene)
     edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
     region, notes = kept_region(options), list[str]()
     if region is None:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from progdf.checkpoint import Gdf, fingerprint
 from progdf.field.baked import AttributeBases, BakedField
+from progdf.formats import load_scene
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.ply import load_ply
 from progdf.region import Region
 from progdf.scenes import bear
 
@@ -36,7 +36,7 @@ def scenes_of(paths: Sequence[Path] = ()) -> list[Gaussians]:
     Raises:
         ProgdfError: a file is missing or broken.
     """
-    scenes = [load_ply(path) for path in paths] or [bear(size).gaussians for size in SIZES]
+    scenes = [load_scene(path) for path in paths] or [bear(size).gaussians for size in SIZES]
     return sorted(scenes, key=len)
 
 

@@ -14,6 +14,7 @@ from progdf.command_line import parsed
 from progdf.compose import compose
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
+from progdf.formats import scene_format
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.load_report import counted
 from progdf.ply import GEOMETRY, load_ply, save_ply
@@ -63,6 +64,9 @@ def export(argv: Sequence[str]) -> int:
         _check_by_plyfile(edited, beside)
     told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
     say(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
+    source = found.document.path
+    if source is not None and (kind := scene_format(source)) != "ply":
+        say(f"{found.document.title} is a .{kind}, this is a plain .ply")
     return 0
 
 

@@ -22,7 +22,7 @@ _POPUP = "##dialog"
 _NAMES = {"save": "Save the session", "open": "Open", "leave": "There are unsaved changes"}
 _HINTS = {
     "save": "A .session.json file; the scene and its edits stay where they are.",
-    "open": "A scene (.ply), an edit (.gdf), a session or cameras, told apart by content.",
+    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a session or cameras, told apart by content.",
     "leave": "Save them in {} first?",
 }
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from progdf.checkpoint import Gdf
+from progdf.formats import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
-from progdf.ply import load_ply
 
 from . import arguments
 from .layer_rows import layer_rows
@@ -67,5 +67,8 @@ def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
     Raises:
         ProgdfError: a file is missing or broken, or an edit was made for another scene.
     """
-    gaussians = load_ply(scene)
-    return Document(scene.name, gaussians, arguments.load_edits(gdfs, gaussians, scene), scene, tuple(gdfs))
+    scene = scene_file(scene)
+    gaussians = load_scene(scene)
+    return Document(
+        scene_name(scene), gaussians, arguments.load_edits(gdfs, gaussians, scene), scene, tuple(gdfs)
+    )

@@ -22,7 +22,12 @@ PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")
 POLL_S = 0.05
 """How often to look whether the person has chosen."""
 
-_OPEN = ["Scenes, edits, sessions, cameras", "*.ply *.gdf *.json", "All files", "*"]
+_OPEN = [
+    "Scenes, edits, sessions, cameras",
+    "*.ply *.spz *.splat *.ksplat *.sog *.gdf *.json",
+    "All files",
+    "*",
+]
 _SAVE = ["Sessions", "*.json", "All files", "*"]
 
 

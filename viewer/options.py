@@ -15,7 +15,7 @@ Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf
 Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
 Paint = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FILE.npy"), tyro.conf.UseAppendAction]
 Solo = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction]
-Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE.ply")]
+Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
@@ -25,7 +25,7 @@ class StackOptions:
     """A scene under a stack of edits: what the three commands have in common."""
 
     scene: Scene
-    """The scene, a 3DGS .ply file; or a session saved with Ctrl+S, also as --session FILE."""
+    """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
     gdfs: Edits = ()
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()

@@ -1,0 +1,58 @@
+"""Run as a script of its own: one scene file through gaussforge into a plain .ply, within bounds.
+
+    python -P gaussforge_child.py FORMAT IN OUT MEMORY OUTPUT SECONDS
+
+Its native code reads files of strangers, so it works in a process that may crash, and that has no more
+memory, output and time than it is given (bytes, bytes, seconds of processor time). Nothing of progdf is
+imported, as that would take seconds. What is wrong is one line on stderr, exit 3.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import zipfile
+from pathlib import Path
+
+
+def _bundled(meta: Path) -> bytes:
+    """An unpacked .sog as the archive that it would be: meta.json and the images that it names."""
+    table = json.loads(meta.read_bytes())
+    named = [name for part in table.values() if isinstance(part, dict) for name in part.get("files", ())]
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as out:
+        out.writestr("meta.json", meta.read_bytes())
+        for name in dict.fromkeys(map(str, named)):
+            if Path(name).name != name:
+                raise ValueError("meta.json names images outside its folder")
+            out.writestr(name, (meta.parent / name).read_bytes())
+    return archive.getvalue()
+
+
+def main(kind: str, source: str, target: str, memory: int, output: int, seconds: int) -> None:
+    import gaussforge
+
+    try:
+        import resource
+    except ImportError:  # not on Windows, where the time limit of the caller has to do
+        pass
+    else:
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (output, output))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    path = Path(source)
+    content = _bundled(path) if path.name.lower() == "meta.json" else path.read_bytes()
+    found = gaussforge.GaussForge().convert(content, kind, "ply")
+    if "data" not in found:
+        raise ValueError(str(found.get("error", "it gives no scene")))
+    Path(target).write_bytes(found["data"])
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1], sys.argv[2], sys.argv[3], *map(int, sys.argv[4:7]))
+    except Exception as error:  # whatever it is, the caller tells it
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(3)
