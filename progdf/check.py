@@ -14,7 +14,7 @@ from progdf.command_line import parsed
 from progdf.formats import load_scene_with_report
 from progdf.survey import survey
 from progdf.terminal import say
-from progdf.up_axis import UpChoice, convention_of, find_up
+from progdf.up_axis import UpChoice, find_up
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     options = parsed(Options, argv, "progdf check")
     scene, report = load_scene_with_report(options.scene)
     cameras = [] if options.cameras is None else load_cameras(options.cameras)
-    up = find_up(scene, cameras, options.up, convention_of(options.scene))
+    up = find_up(scene, cameras, options.up)
     for line in report.lines() + survey(scene, up).lines():
         say(line)
     return 0

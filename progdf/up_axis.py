@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
@@ -23,9 +22,6 @@ UpChoice = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
 CONVENTION: Axis = "-y"
 """COLMAP's, and so that of most trained scenes: the first camera is level, and y points down in a picture."""
-
-_CONVENTIONS: dict[str, Axis] = {".spz": "+y"}
-"""Of formats that define their axes; SPZ is right, up, back."""
 
 _LEVEL = math.cos(math.radians(2.0))
 """Cameras' up within two degrees of an axis is that axis: nobody holds a camera straighter."""
@@ -72,21 +68,13 @@ def axis_direction(axis: str) -> Tensor:
     return direction
 
 
-def convention_of(path: Path | None) -> Axis:
-    """The axis that is up in scenes of this file's format if nothing says otherwise."""
-    return _CONVENTIONS.get(path.suffix.lower(), CONVENTION) if path is not None else CONVENTION
-
-
-def find_up(
-    scene: Gaussians, cameras: Sequence[Camera] = (), asked: str = "auto", convention: Axis = CONVENTION
-) -> UpAxis:
+def find_up(scene: Gaussians, cameras: Sequence[Camera] = (), asked: str = "auto") -> UpAxis:
     """The world direction that is up.
 
     Args:
         scene: N Gaussians
         cameras: given with the scene; people hold them level, so their mean up is the scene's, if they agree
         asked: an axis decides all; "auto" leaves it to what follows
-        convention: holds unless cameras or a ground say otherwise
     """
     if asked != "auto":
         return UpAxis(axis_direction(asked), "as --up says")
@@ -98,9 +86,9 @@ def find_up(
             if float(direction.abs()[axis]) > _LEVEL:
                 direction = torch.zeros(3).index_fill(0, axis, math.copysign(1.0, float(direction[axis])))
             return UpAxis(direction, "as the cameras are held")
-    if (ground := _ground_axis(scene, convention)) is not None:
+    if (ground := _ground_axis(scene, CONVENTION)) is not None:
         return UpAxis(axis_direction(ground), "a ground lies across it")
-    return UpAxis(axis_direction(convention), "by convention, as no ground tells; --up says otherwise")
+    return UpAxis(axis_direction(CONVENTION), "by convention, as no ground tells; --up says otherwise")
 
 
 def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:

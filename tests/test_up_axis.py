@@ -17,7 +17,7 @@ from progdf.command_line import parsed
 from progdf.gaussians import Gaussians
 from progdf.ply import load_ply, save_ply
 from progdf.scenes import bear, room
-from progdf.up_axis import AXES, axis_direction, convention_of, find_up, guess_up, saved_up
+from progdf.up_axis import AXES, axis_direction, find_up, guess_up, saved_up
 from tests.scenes import ball, random_gaussians
 from tests.stacks import bear_stack
 from viewer import opening, session
@@ -71,11 +71,6 @@ def test_cameras_go_before_a_ground_and_are_level_within_two_degrees() -> None:
     scene = bear(3000).gaussians
     held = torch.nn.functional.normalize(torch.tensor([0.01, 0.0, -1.0]), dim=0)
     assert find_up(scene, orbit_rig(ball(), 12, 64, 64, up=held, elevations=(0.0, 0.0))).name == "-z"
-
-
-def test_an_spz_is_y_up_unless_a_ground_says_otherwise() -> None:
-    assert find_up(statue(), convention=convention_of(Path("a.SPZ"))).name == "+y"
-    assert find_up(statue(), convention=convention_of(Path("a.ply"))).name == "-y"
 
 
 def test_too_few_gaussians_are_upright_by_convention() -> None:

@@ -13,7 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.framing import is_surrounding
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from progdf.up_axis import UpAxis, convention_of, find_up
+from progdf.up_axis import UpAxis, find_up
 from trainer.artefacts import RunFolder, write_views
 from trainer.crops import CropScene, crop_scene
 from trainer.editors import EditorSettings, ImageEditor
@@ -57,7 +57,7 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
     """
     background = torch.tensor(BACKGROUND)
     given = [] if options.cameras is None else load_cameras(options.cameras)
-    up = find_up(scene, given, options.up, convention_of(options.scene))
+    up = find_up(scene, given, options.up)
     if options.cameras is not None:
         cameras = [fit_size(camera, options.image_size) for camera in given]
     elif is_surrounding(scene, up.direction):

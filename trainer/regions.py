@@ -19,7 +19,7 @@ from progdf.framing import is_surrounding
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from progdf.region_spec import Kind
-from progdf.up_axis import UpChoice, convention_of, find_up
+from progdf.up_axis import UpChoice, find_up
 from trainer.artefacts import claim
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.lift import Rule, lift_masks
@@ -63,7 +63,7 @@ class RegionSettings:
 
     def up_of(self, scene: Gaussians) -> Tensor:
         """The direction that is up in a scene without cameras. [3]"""
-        return find_up(scene, (), self.up, convention_of(self.scene)).direction
+        return find_up(scene, (), self.up).direction
 
 
 def region_settings(

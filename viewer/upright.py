@@ -8,7 +8,7 @@ from pathlib import Path
 from progdf.camera import Camera
 from progdf.checkpoint import Gdf
 from progdf.gaussians import Gaussians
-from progdf.up_axis import convention_of, find_up, saved_up
+from progdf.up_axis import find_up, saved_up
 
 from .state import Vec3
 
@@ -32,6 +32,6 @@ def up_of(
     kept = (saved_up(gdf.report.get("up")) for gdf in gdfs) if asked == "auto" else ()
     found = next((up for up in kept if up is not None), None)
     if found is None:
-        found = find_up(scene, cameras, asked, convention_of(path)).direction if len(scene) else None
+        found = find_up(scene, cameras, asked).direction if len(scene) else None
     x, y, z = (0.0, 1.0, 0.0) if found is None else (float(c) for c in found)
     return x, y, z
