@@ -9,12 +9,12 @@ import torch
 from progdf.camera import orbit_rig
 from progdf.camera_files import load_cameras, save_cameras
 from progdf.errors import ProgdfError
+from progdf.formats import load_scene
 from progdf.framing import is_surrounding
 from progdf.pictures import write_image
-from progdf.ply import load_ply
 from progdf.region import everything
 from progdf.region_spec import parse_region
-from progdf.up_axis import convention_of, find_up
+from progdf.up_axis import find_up
 from trainer.options import check_ranges
 from trainer.preparation import BACKGROUND, INSIDE
 from trainer.region_options import ViewsOptions
@@ -33,9 +33,9 @@ def write(options: ViewsOptions) -> str:
     out, background = options.out, torch.tensor(BACKGROUND)
     if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
         raise ProgdfError(f"{out / 'cameras.json'} is there already; give --out another folder")
-    scene = load_ply(options.scene)
+    scene = load_scene(options.scene)
     given = [] if options.cameras is None else load_cameras(options.cameras)
-    up = find_up(scene, given, options.up, convention_of(options.scene)).direction
+    up = find_up(scene, given, options.up).direction
     region = None
     if options.region is not None:
         settings = RegionSettings(options.cameras, options.views, lambda: out / "segmented", up=options.up)

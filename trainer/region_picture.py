@@ -17,15 +17,15 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.camera_files import load_cameras, read_camera
 from progdf.errors import ProgdfError
 from progdf.files import written_whole
+from progdf.formats import load_scene
 from progdf.framing import front
 from progdf.gaussians import Gaussians
 from progdf.load_report import counted, grouped
 from progdf.pictures import write_image
-from progdf.ply import load_ply
 from progdf.region import Region
 from progdf.region_spec import parse_region
 from progdf.subject import fitted_eye, subject_rows
-from progdf.up_axis import convention_of, find_up
+from progdf.up_axis import find_up
 from trainer.options import check_ranges
 from trainer.region_options import RegionOptions
 from trainer.regions import RegionSettings, region_kinds
@@ -55,7 +55,7 @@ def show(options: RegionOptions) -> str:
         raise ProgdfError("--camera and --orbit were both given; give one of them")
     check_ranges(("--lift-threshold", options.lift_threshold, 0, 1))
     size = _size(options.size)
-    scene = load_ply(options.scene)
+    scene = load_scene(options.scene)
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         settings = RegionSettings(
@@ -70,7 +70,7 @@ def show(options: RegionOptions) -> str:
             beside.write_bytes(stored.getvalue())
     else:
         given = [] if options.cameras is None else load_cameras(options.cameras)
-        up = find_up(scene, given, options.up, convention_of(options.scene)).direction
+        up = find_up(scene, given, options.up).direction
         cameras = near_enough(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
     share = 100 * len(region) / max(1, len(scene))
