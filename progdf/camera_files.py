@@ -243,7 +243,7 @@ def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, 
 
     for suffix in _IMAGE_SUFFIXES:
         picture = path.parent / (str(table.get("file_path", "")) + suffix)
-        if picture.is_file():
+        if os.path.isfile(picture):  # pathlib's raises where a name is too long
             try:
                 return picture_size(picture)
             except ProgdfError:

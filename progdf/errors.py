@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from progdf.terminal import printable
+
 
 class ProgdfError(ValueError):
     """Something the user can mend: a broken file, a wrong option, two files that do not belong together.
 
-    The message is one line, `WHAT IS WRONG; WHAT WOULD BE RIGHT`. Commands print it and exit with status 2.
+    The message is one line, `WHAT IS WRONG; WHAT WOULD BE RIGHT`, whatever names in files hold. Commands
+    print it and exit with status 2.
     """
+
+    def __str__(self) -> str:
+        return printable(" ".join(super().__str__().split()))

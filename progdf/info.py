@@ -102,8 +102,8 @@ def _session_lines(path: Path) -> Iterator[str]:
     yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
     for what, ref in (("scene", session.scene), *(("edit", edit) for edit in session.edits)):
         file = ref.path(path.resolve().parent)
-        known = file.is_file() and session_file.sha256(file) == ref.sha256.lower()
-        state = "as it was saved" if known else "changed since" if file.is_file() else "missing"
+        known = os.path.isfile(file) and session_file.sha256(file) == ref.sha256.lower()
+        state = "as it was saved" if known else "changed since" if os.path.isfile(file) else "missing"
         yield f"{what}: {ref.file} ({state})"
     layers = session.view.get("layers", [])
     for layer in layers if isinstance(layers, list) else ():

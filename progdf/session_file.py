@@ -163,7 +163,7 @@ def verified(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
     found = []
     for ref in (session.scene, *session.edits):
         file = ref.path(path.resolve().parent)
-        if not file.is_file():
+        if not os.path.isfile(file):  # pathlib's raises where a name is too long
             raise ProgdfError(f"{path.name} needs {file}, which is not there; put it back or save anew")
         if sha256(file) != ref.sha256.lower():
             raise ProgdfError(

@@ -30,14 +30,14 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def twice(cache: Path) -> Callable[[int], int]:
+def twice(cache: Path) -> Callable[[float], float]:
     """The kernel as a new process has it: compiled, or from the cache."""
     spec = importlib.util.spec_from_file_location("kernels", cache.parent / "kernels.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    found: Callable[[int], int] = module.twice
+    found: Callable[[float], float] = module.twice
     return found
 
 
@@ -72,10 +72,23 @@ def test_one_flipped_bit_of_machine_code_is_not_run(cache: Path) -> None:
     assert not file.exists()
 
 
-def test_files_of_a_process_that_was_killed_are_dropped_without_a_word(cache: Path) -> None:
+def test_files_of_a_process_at_work_stay_if_they_are_whole(cache: Path) -> None:
     assert twice(cache)(4) == 8
     assert not jit.drop_damaged(cache)
-    assert not list(cache.rglob("*.nb?"))
+    assert len(list(cache.rglob("*.nb?"))) == 2
+    jit.record_cache(cache)
+    assert twice(cache)(0.5) == 1.0, "the index grows"
+    assert not jit.drop_damaged(cache)
+    assert len(list(cache.rglob("*.nb?"))) == 3
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_files_that_nobody_recorded_are_dropped_if_they_are_cut(suffix: str, cache: Path) -> None:
+    assert twice(cache)(4) == 8
+    (file,) = cache.rglob(f"*{suffix}")
+    file.write_bytes(file.read_bytes()[:-20])
+    assert jit.drop_damaged(cache)
+    assert twice(cache)(4) == 8
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"{", b"[" * 100_000, b'{"a": {}}'])

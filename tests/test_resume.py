@@ -59,7 +59,7 @@ def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
     assert bits(tmp_path / OUT) == expected
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
     bear_folder: Path,
     uninterrupted: Path,

@@ -12,6 +12,7 @@ import pytest
 from progdf.__main__ import main
 from progdf.camera_files import save_cameras
 from progdf.checkpoint import save_gdf
+from progdf.errors import ProgdfError
 from progdf.terminal import PrintableFormatter, printable
 from tests.edits import curved_field, edit_of, some_rows
 from tests.ply_files import scene_of, table_of, with_extra, write
@@ -30,6 +31,12 @@ def test_what_is_nothing_to_look_at_becomes_its_escape() -> None:
     assert printable("two\nlines") == r"two\nlines"
     assert printable("caf\udce9") == r"caf\udce9", "a file name that is no UTF-8"
     assert printable("Größe 12 345 × “…” 界") == "Größe 12 345 × “…” 界"
+
+
+def test_an_error_is_one_line_whatever_names_it_tells() -> None:
+    told = str(ProgdfError(f"camera {EVIL}\nis broken; export it again"))
+    assert told.endswith("is broken; export it again")
+    assert told.isprintable()
 
 
 def test_info_and_check_show_names_of_a_ply_harmlessly(

@@ -5,6 +5,7 @@ One path a line, relative to the folder. Where there is no list, or a line is lo
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable
 from pathlib import Path, PurePosixPath
 
@@ -36,7 +37,7 @@ def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
         path = folder / line
         if path.stem in views or not _is_inside(folder, line):
             kept.append(line)
-        elif path.is_file():
+        elif os.path.isfile(path):  # pathlib's raises where a name is too long
             path.unlink()
     if listed(folder) != kept:
         _write(folder, kept)

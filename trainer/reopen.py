@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +71,7 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
         name = typed(told.options["name"], str)
         members, score = extra["members"], extra["score"]
         path = scene or Path(told.scene)
-        if not scene_file(path).is_file():
+        if not os.path.isfile(scene_file(path)):
             raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
         gaussians = load_scene(path)
         if len(score) != len(gaussians):

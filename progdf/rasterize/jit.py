@@ -7,6 +7,8 @@ import hashlib
 import json
 import logging
 import os
+import pickle
+import pickletools
 import shutil
 import tempfile
 import threading
@@ -83,17 +85,36 @@ def record_cache(folder: Path) -> None:
 
 
 def drop_damaged(folder: Path) -> bool:
-    """Remove the files of the cache that are not as they were recorded; whether any had been recorded.
+    """Remove the files of the cache that are damaged; whether there were any.
 
-    numba would fail over them at every call, or run what is in them. Files that were never recorded go too:
-    their process was killed, and nobody knows whether they are whole.
+    numba would fail over them at every call, or run what is in them. Files that were not recorded are of a
+    process at work, or of one that was killed; of these, and of indices that have grown, those are dropped
+    that end too early.
     """
-    recorded, changed = _recorded(folder), set[str]()
+    recorded, damaged = _recorded(folder), []
     with suppress(OSError):
-        changed = {name for name, sum_ in _checksums(folder).items() if recorded.get(name) != sum_}
-        for path in [folder / name for name in changed] + (list(folder.glob("*.ready")) if changed else []):
+        for name, checksum in _checksums(folder).items():
+            known = recorded.get(name)
+            if known != checksum and ((known and name.endswith(".nbc")) or not _is_whole(folder / name)):
+                damaged.append(folder / name)
+        for path in [*damaged, *(folder.glob("*.ready") if damaged else ())]:
             path.unlink(missing_ok=True)
-    return not changed.isdisjoint(recorded)
+    return bool(damaged)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether numba can take a file apart: an index is two pickles, machine code is one."""
+    try:
+        with path.open("rb") as file:
+            if path.suffix == ".nbi":
+                pickle.load(file)
+                pickle.loads(file.read())
+            else:
+                for _ in pickletools.genops(file.read()):
+                    pass
+    except Exception:  # whatever a damaged pickle raises
+        return False
+    return True
 
 
 def _checksums(folder: Path) -> dict[str, int]:
