@@ -90,12 +90,28 @@ def test_a_strength_said_beside_the_session_wins_under_the_layers_name_or_its_ed
         assert torch.equal(load_ply("edited.ply").means, bear().scene.means)
 
 
+def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: Path) -> None:
+    view = replace(full_view(), blend="normalised")
+    view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
+    scene, _, ears = bear().save(here)
+    opened = document.load(scene, [ears, ears])
+    session.save(here / "work.session.json", Session(opened, view))
+    for name, given in (("own", ()), ("sum", ("--blend", "sum"))):
+        assert run("export", "work.session.json", "--set", "ears=1", *given, "-o", f"{name}.ply") == 0
+        shown = replace(view, blend=given[1] if given else view.blend)
+        layers = tuple(
+            replace(layer, strength=1.0 if layer.gdf == 0 else layer.strength) for layer in view.layers
+        )
+        expected = Engine(None, opened.scene, opened.gdfs).gaussians(replace(shown, layers=layers))
+        assert torch.allclose(load_ply(f"{name}.ply").means, expected.means, atol=1e-6)
+    assert not torch.equal(load_ply("own.ply").sh0, load_ply("sum.ply").sh0)
+
+
 @pytest.mark.parametrize(
     ("argv", "told"),
     [
         (("--out", "bear.ply"), "bear.ply is one of the files to read"),
         (("--out", "x.ply", "--paint", "ears=w.npy"), "--paint was given with the session"),
-        (("--out", "x.ply", "--blend", "sum"), "--blend was given with the session"),
         (("--out", "x.ply", "--set", "hat=1"), "there is no edit of that name; there are ears → gold, scarf"),
         (("--out", "x.ply", "ears.gdf"), "an edit was given with the session"),
     ],

@@ -84,13 +84,29 @@ def test_both_engines_write_the_same_picture(run: Run) -> None:
     assert np.abs(pixels("cpu.png").astype(int) - pixels("gl.png")).max() <= 3, "the early stop: 0.01 of 255"
 
 
-def test_sliders_that_are_not_set_are_at_zero_and_the_command_says_so(
-    run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_edits_without_a_strength_are_rendered_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    edits, both = ("bear.ply", "scarf.gdf", "ears.gdf"), ("--set", "scarf=1", "--set", "ears=1")
+    for name, settings in (("none", ()), ("full", both), ("one", both[:2])):
+        assert run("render", *edits, *settings, *SMALL, "-o", f"{name}.png") == 0
+    assert np.array_equal(pixels("none.png"), pixels("full.png"))
+    assert not np.array_equal(pixels("one.png"), pixels("full.png")), "one that is set leaves the others at 0"
+    capsys.readouterr()
     assert run("render", "bear.ply", *SMALL, "-o", "plain.png") == 0
-    assert run("render", "bear.ply", "ears.gdf", *SMALL, "-o", "zero.png") == 0
-    assert "--set ears=1" in capsys.readouterr().out
+    assert run("render", *edits, "--set", "ears=0", *SMALL, "-o", "zero.png") == 0
+    assert "every slider is at 0" in capsys.readouterr().out
     assert np.array_equal(pixels("plain.png"), pixels("zero.png"))
+
+
+def test_edits_without_a_strength_are_exported_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("export", "bear.ply", "scarf.gdf", "ears.gdf", "-o", "none.ply") == 0
+    assert "scarf 1, ears 1" in capsys.readouterr().out
+
+
+def test_a_sweep_of_one_edit_leaves_the_others_at_zero(run: Run) -> None:
+    for edits in (("ears.gdf",), ("ears.gdf", "scarf.gdf")):
+        command = ("render", "bear.ply", *edits, "--sheet", "ears", *SMALL)
+        assert run(*command, "-o", f"{len(edits)}.png") == 0
+    assert np.array_equal(pixels("1.png"), pixels("2.png"))
 
 
 def test_an_orbit_turns_the_camera_even_with_a_leading_minus(run: Run) -> None:

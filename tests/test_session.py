@@ -190,8 +190,8 @@ def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path
 def test_an_option_that_a_session_says_itself_is_refused(
     saved: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["render", "--session", str(saved), "--blend", "sum", "-o", "a.png"]) == 2
-    assert "--blend was given" in capsys.readouterr().err
+    assert main(["render", "--session", str(saved), "--overshoot", "-o", "a.png"]) == 2
+    assert "--overshoot was given" in capsys.readouterr().err
 
 
 def test_a_pinhole_camera_becomes_the_windows_camera() -> None:

@@ -50,14 +50,20 @@ def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tup
     return tuple(gdfs)
 
 
-def layers_of(gdfs: Sequence[Gdf], settings: Sequence[str], most: float = 1.0) -> tuple[LayerState, ...]:
+def layers_of(
+    gdfs: Sequence[Gdf], settings: Sequence[str], most: float = 1.0, unset: float = 0.0
+) -> tuple[LayerState, ...]:
     """One layer per edit, at 0 unless a `NAME=S` of `settings` says otherwise.
+
+    Args:
+        unset: the strength of all of them where there are no settings
 
     Raises:
         ProgdfError: there is no edit NAME, or S is no number from 0 to `most`.
     """
     strengths = strengths_of(gdfs, settings, most)
-    return tuple(LayerState(i, gdf.name, strengths.get(gdf.name, 0.0)) for i, gdf in enumerate(gdfs))
+    rest = 0.0 if strengths else unset
+    return tuple(LayerState(i, gdf.name, strengths.get(gdf.name, rest)) for i, gdf in enumerate(gdfs))
 
 
 def strengths_of(edits: Sequence[Named], settings: Sequence[str], most: float = 1.0) -> dict[str, float]:

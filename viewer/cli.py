@@ -53,7 +53,7 @@ def export(argv: Sequence[str]) -> int:
     options = parsed(ExportOptions, arguments.joined(opening.without_name(argv)), "progdf export")
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
-    found = opening.opened(options)
+    found = opening.opened(options, unset=1.0)
     arguments.check_not_an_input(options.out, found.files)
     gdfs, states = found.document.gdfs, shown(found.view)
     layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]

@@ -27,6 +27,7 @@ def stack_of(
     solo: Sequence[str] = (),
     overshoot: bool = False,
     paint: Sequence[str] = (),
+    unset: float = 0.0,
 ) -> tuple[LayerState, ...]:
     """One layer per edit.
 
@@ -37,11 +38,13 @@ def stack_of(
         solo: names of the edits that alone are shown
         overshoot: whether strengths go to `stack.OVERSHOOT`
         paint: `NAME=WEIGHTS.npy`, a weight 0..1 per member, or per Gaussian of the scene
+        unset: the strength of the edits where there are no settings
 
     Raises:
         ProgdfError: there is no such edit or kind, or a number is outside its range.
     """
-    layers = {layer.name: layer for layer in layers_of(gdfs, settings, stack.OVERSHOOT if overshoot else 1.0)}
+    most = stack.OVERSHOOT if overshoot else 1.0
+    layers = {layer.name: layer for layer in layers_of(gdfs, settings, most, unset)}
     for text in gains:
         name, kind, gain = _gain(text, gdfs)
         layers[name] = stack.dialled(layers[name], kind, gain)

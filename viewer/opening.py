@@ -20,7 +20,7 @@ from .turntable import with_up
 from .upright import up_of
 
 NAME = "--session"
-_SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "blend", "background")
+_SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "background")
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,12 @@ class Opened:
         return name if name in named.values() else named.get(name, name)
 
 
-def opened(options: StackOptions) -> Opened:
+def opened(options: StackOptions, unset: float = 0.0) -> Opened:
     """Open what the options name.
+
+    Args:
+        options: of the command
+        unset: the strength of a scene's edits where no --set names one
 
     Raises:
         ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, options
@@ -69,11 +73,13 @@ def opened(options: StackOptions) -> Opened:
     if is_session(options.scene):
         return _session(options)
     _check_each_once(options.gdfs)
-    view = ViewState(blend=options.blend, overshoot=options.overshoot)
+    view = ViewState(blend=options.blend or "normalised", overshoot=options.overshoot)
     if isinstance(options, PictureOptions):
         view = replace(view, background=arguments.parse_background(options.background))
     found = document.load(options.scene, options.gdfs)
-    layers = stack_of(found.gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint)
+    layers = stack_of(
+        found.gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint, unset
+    )
     return Opened(found, replace(view, layers=layers), asked_up=_asked_up(options))
 
 
@@ -111,7 +117,7 @@ def _check_each_once(gdfs: Sequence[Path]) -> None:
 
 
 def _session(options: StackOptions) -> Opened:
-    """The session with the strengths that were said beside it."""
+    """The session with the strengths and the blend rule that were given beside it."""
     defaults = {f.name: f.default for f in fields(options)}
     for name in _SAID_BY_SESSION:
         if name in defaults and getattr(options, name) != defaults[name]:
@@ -126,7 +132,7 @@ def _session(options: StackOptions) -> Opened:
     ]
     strengths = arguments.strengths_of(kept.view.layers, settings, stack.most(kept.view))
     layers = (replace(l, strength=strengths.get(l.name, l.strength)) for l in kept.view.layers)
-    view = replace(kept.view, layers=tuple(layers))
+    view = replace(kept.view, layers=tuple(layers), blend=options.blend or kept.view.blend)
     if _asked_up(options) != "auto":  # else the session's own
         view = replace(view, camera=with_up(view.camera, found.up))
     return replace(found, view=view)

@@ -29,7 +29,8 @@ class StackOptions:
     gdfs: Edits = ()
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
-    """Strength of an edit, 0 to 1; 0 where not set. Repeat it for several edits."""
+    """Strength of an edit, 0 to 1; repeat it for several edits. Without any, `render` and `export` show every
+    edit at 1 and `view` opens at 0; beside a session it takes the place of the session's."""
     gain: Gains = ()
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
     solo: Solo = ()
@@ -38,8 +39,8 @@ class StackOptions:
     """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: bool = False
     """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
-    blend: Blend = "normalised"
-    """How edits that share Gaussians go together."""
+    blend: Blend | None = None
+    """How edits that share Gaussians go together; normalised, or as the session has it, if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,8 @@ def render(argv: Sequence[str]) -> int:
     options = parsed(RenderOptions, arguments.joined(opening.without_name(argv)), "progdf render")
     _check_output(options)
     size = None if options.size is None else arguments.parse_size(options.size)
-    found = opening.opened(options)
+    one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
+    found = opening.opened(options, unset=0.0 if one_moves else 1.0)
     arguments.check_not_an_input(options.out, found.files)
     scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
     view = replace(view, compare=_comparison(options, view.compare))
