@@ -17,7 +17,7 @@ from tests.null_app import null_app, press
 from tests.sessions import bear_files, full_view, opened_document, saved_session, spoilt
 from tests.ui_rig import bear, first_view
 from viewer import app as application
-from viewer import desk, recent, session, workspace
+from viewer import autosave, recent, session, workspace
 from viewer.turntable import to_camera
 from viewer.workspace import Dialog
 
@@ -127,10 +127,10 @@ def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
     assert window.desk.autosave(0.0) is None, "nothing to lose"
     press(window, "Shift+Left")
     waits = window.desk.autosave(10.0)
-    assert waits == desk.AUTOSAVE_S
+    assert waits == autosave.AUTOSAVE_S
     beside = folder / "bear.autosave.session.json"
     assert not beside.exists()
-    assert window.desk.autosave(10.0 + desk.AUTOSAVE_S) is None
+    assert window.desk.autosave(10.0 + autosave.AUTOSAVE_S) is None
     assert session.open_session(beside).view.layers == window.stage.work.view.layers
     assert window.desk.autosave(99.0) is None, "the same again is not written again"
     window.desk.save(folder / "bear.session.json")
@@ -140,18 +140,160 @@ def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
 @pytest.mark.gl
 def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left")
+    beside = left_over(window, folder)
+    window.desk.save(folder / "bear.session.json")
+    window.open(folder / "bear.session.json")
+    assert question(window) == Dialog("restore", str(beside))
+    press(window, "R")
+    assert window.desk.path == folder / "bear.session.json"
+    assert window.desk.unsaved
+    assert window.stage.work.view.layers[-1].strength == pytest.approx(0.4)
+    press(window, "Ctrl+S")
+    assert not beside.exists(), "saved, it has done its work"
+
+
+def left_over(window: application.App, folder: Path) -> Path:
+    """An autosave of the present work as a crash leaves it: the window knows nothing of it."""
     window.desk.autosave(0.0)
-    window.desk.autosave(desk.AUTOSAVE_S)
+    window.desk.autosave(autosave.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
     kept = beside.read_bytes()
     window.desk.serve("discard")
-    window.desk.save(folder / "bear.session.json")
+    for discarded in folder.glob("*.discarded*"):
+        discarded.unlink()
     beside.write_bytes(kept)
-    window.open(folder / "bear.session.json")
-    assert "Unsaved work was kept in bear.autosave.session.json" in message(window)
-    window.open(beside)
-    assert window.desk.path == folder / "bear.session.json"
+    return beside
+
+
+@pytest.mark.gl
+def test_a_new_sessions_autosave_never_takes_the_place_of_one_that_was_left(
+    window: application.App, folder: Path
+) -> None:
+    press(window, "Shift+Left")
+    beside = left_over(window, folder)
+    kept = beside.read_bytes()
+    window.desk.offer_autosave()
+    assert question(window).kind == "restore"
+    assert beside in window.stage.recent
+    press(window, "Escape", "Shift+Left")
+    window.desk.autosave(100.0)
+    window.desk.autosave(100.0 + autosave.AUTOSAVE_S)
+    assert beside.read_bytes() == kept
+    own = [path for path in folder.glob("*.autosave*") if path != beside]
+    assert [session.open_session(path).view.layers for path in own] == [window.stage.work.view.layers]
+    window.desk.offer_autosave()
+    assert window.stage.work.dialog is None, "it asks once"
+    press(window, "Ctrl+Q", "D")
+    assert not own[0].exists()
+    assert beside.read_bytes() == kept
+
+
+@pytest.mark.gl
+def test_discarded_work_stays_under_another_name_the_last_three(
+    window: application.App, folder: Path
+) -> None:
+    strengths = []
+    for _ in range(autosave.MOST_DISCARDED + 2):
+        press(window, "Shift+Left")
+        left_over_now = folder / "bear.autosave.session.json"
+        window.desk.autosave(0.0)
+        window.desk.autosave(autosave.AUTOSAVE_S)
+        strengths.append(window.stage.work.view.layers[-1].strength)
+        window.desk.offer_autosave()
+        assert window.stage.work.dialog is None, "its own autosave is nothing that was left"
+        window.desk.serve(f"discard_autosave:{left_over_now}")
+        window.desk._autosave = autosave.Autosave()
+    kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
+    assert len(kept) == autosave.MOST_DISCARDED
+    found = [session.open_session(path).view.layers[-1].strength for path in kept]
+    assert sorted(found) == sorted(strengths[-autosave.MOST_DISCARDED :])
+    assert kept[-1] in window.stage.recent
+    window.desk.serve("discard")
+    window.open(kept[-1])
+    assert window.desk.path is None, "saving it asks where"
     assert window.desk.unsaved
+
+
+@pytest.mark.gl
+def test_work_that_never_had_a_name_is_not_saved_over_a_session_that_has_it(
+    window: application.App, folder: Path
+) -> None:
+    window.desk.save(folder / "bear.session.json")
+    yesterday = (folder / "bear.session.json").read_bytes()
+    window.desk.path = None  # the next day, from the scene
+    press(window, "Shift+Left", "Ctrl+S")
+    assert question(window).text == str(folder / "bear-2.session.json")
+    press(window, "Enter")
+    assert (folder / "bear-2.session.json").is_file()
+    assert (folder / "bear.session.json").read_bytes() == yesterday
+
+
+@pytest.mark.gl
+def test_a_name_that_a_session_has_is_asked_about(window: application.App, folder: Path, saved: Path) -> None:
+    yesterday = saved.read_bytes()
+    press(window, "Shift+Left")
+    for answer in ("Escape", "Enter"):  # Cancel; Rename…, which asks where again
+        window.desk.serve(f"save_to:{saved}")
+        assert question(window).kind == "overwrite"
+        press(window, answer)
+    assert question(window).kind == "save"
+    assert question(window).text == str(saved)
+    assert saved.read_bytes() == yesterday
+    window.desk.serve(f"overwrite:{saved}")
+    assert window.stage.work.dialog is None
+    assert session.open_session(saved).view.layers == window.stage.work.view.layers
+    press(window, "Shift+Left", "Ctrl+S")
+    assert window.stage.work.dialog is None, "its own file is replaced without a question"
+
+
+@pytest.mark.gl
+def test_the_title_shows_unsaved_changes(window: application.App, folder: Path) -> None:
+    titles: list[str] = []
+    window.window.rename = titles.append  # type: ignore[method-assign]
+    press(window, "Shift+Left")
+    assert titles == ["• bear.ply – ProGDF Studio"]
+    press(window, "Ctrl+Z")
+    assert titles[1:] == ["bear.ply – ProGDF Studio"]
+
+
+@pytest.mark.gl
+def test_a_layer_is_duplicated_replaced_and_saved_without_what_was_deleted(
+    window: application.App, folder: Path
+) -> None:
+    def layers() -> list[tuple[str, int]]:
+        return [(layer.name, layer.gdf) for layer in window.stage.work.view.layers]
+
+    press(window, "2", "Ctrl+D")  # the lower one
+    assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
+    assert window.stage.work.focus == 1
+    assert window.stage.work.view.layers[1].strength == 0.5
+    window.desk.serve(f"replace_by:1:{folder / 'edits' / 'ears.gdf'}")
+    assert layers() == [("scarf", 0), ("ears-2", 3), ("ears", 1)]
+    assert window.stage.work.view.layers[1].strength == 0.5
+    press(window, "Ctrl+Z")
+    assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
+    press(window, "Ctrl+Shift+Z", "3", "Ctrl+Delete")
+    assert layers() == [("ears-2", 3), ("ears", 1)]
+    shown = window.engine.gaussians(window.stage.work.view).means.clone()
+    window.desk.save(folder / "two")
+    (folder / "edits" / "scarf.gdf").unlink()
+    again = session.open_session(folder / "two.session.json")
+    assert [(layer.name, layer.gdf) for layer in again.view.layers] == [("ears-2", 1), ("ears", 0)]
+    assert len(again.document.gdfs) == 2
+    window.desk.open(folder / "two.session.json")
+    assert torch.equal(window.engine.gaussians(window.stage.work.view).means, shown)
+
+
+@pytest.mark.gl
+def test_an_edit_of_another_scene_replaces_nothing_and_is_one_line(
+    window: application.App, folder: Path, tmp_path: Path
+) -> None:
+    before = window.stage.work.view
+    window.desk.serve(f"replace_by:0:{folder / 'bear.ply'}")
+    assert window.stage.work.view == before
+    assert "\n" not in message(window)
+    assert window.stage.work.message is not None
+    assert window.stage.work.message.error
 
 
 @pytest.mark.gl

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from progdf.layers import BLENDS
 from progdf.ply import load_ply
 from tests.stacks import Stack, bear_stack
 from tests.ui_rig import Rig, bear, first_view, rig
-from viewer import change_curve, layer_fold, panel, stack
+from viewer import change_curve, layer_fold, panel, stack, timeline
 from viewer.layer_arguments import stack_of
 from viewer.layer_rows import layer_rows
 from viewer.state import LayerState, ViewState
@@ -29,7 +30,7 @@ from viewer.workspace import original
 POINTS = (700, 640)
 LEFT = POINTS[0] - panel.WIDTH_PX
 CARD_PX, HEADS, FOOTS = 97.0, 109.0, 166.0
-TOGGLES = {"solo": 82.0, "lock": 58.0, "fold": 34.0}  # from the right edge
+TOGGLES = {"solo": 106.0, "lock": 82.0, "fold": 58.0, "menu": 34.0}  # from the right edge
 THREE = ViewState(layers=(LayerState(0, "a", 0.5), LayerState(1, "b", 0.5), LayerState(2, "c", 0.5)))
 
 
@@ -46,7 +47,12 @@ def click(hand: Rig, x: float, y: float) -> None:
 
 
 def toggle(hand: Rig, name: str, layer: int) -> None:
-    click(hand, POINTS[0] - TOGGLES[name], FOOTS + CARD_PX * layer)
+    click(hand, POINTS[0] - TOGGLES[name], FOOTS + row(layer))
+
+
+def row(layer: int) -> float:
+    """How far below the top one the card of a layer is: of two, the last one lies on top."""
+    return CARD_PX * (1 - layer)
 
 
 def layers(hand: Rig) -> tuple[LayerState, ...]:
@@ -68,7 +74,7 @@ def type_name(hand: Rig, text: str, end: imgui.Key = imgui.Key.enter) -> None:
 
 
 def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> None:
-    top, left = round(HEADS) - 12, POINTS[0] - 80
+    top, left = round(HEADS + row(0)) - 12, POINTS[0] - 80
     hand.move(*hand.slider(0, 0.5))
     hand.press()
     before = hand.image()[top : top + 24, left:]
@@ -118,7 +124,7 @@ def test_without_overshoot_nothing_stands_beyond_one() -> None:
 
 
 def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
-    hand.key("2")
+    hand.key("1")
     for chord, field in (("Shift+H", "solo"), ("L", "locked")):
         hand.key(chord)
         assert [getattr(layer, field) for layer in layers(hand)] == [False, True]
@@ -132,7 +138,7 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     assert all(layer.enabled and not layer.solo for layer in layers(hand))
     hand.key("G")
     assert hand.stage.work.view.unfolded == (1,)
-    hand.key("Alt+Up")
+    hand.key("Alt+Down")
     assert names(hand) == ["ears", "scarf"]
     assert hand.stage.work.focus == 0, "the focus goes with its layer"
     hand.key("M")
@@ -146,6 +152,7 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
 
 
 def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
+    hand.key("2")
     hand.key("Tab")
     assert hand.stage.work.dial == "colour", "a change of colour has no other gain"
     assert hand.stage.work.view.unfolded == (0,)
@@ -154,7 +161,7 @@ def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None
     assert hand.strengths == [0.5, 0.5]
     hand.key("Tab")
     assert hand.stage.work.dial == "strength"
-    hand.key("2")
+    hand.key("1")
     hand.key("Shift+Tab")
     hand.key("Shift+Tab")
     assert hand.stage.work.dial == "geometry"
@@ -188,7 +195,7 @@ def test_the_toggles_of_a_card_turn_their_own_layer(hand: Rig, name: str, field:
 
 def test_alt_click_on_an_eye_shows_its_layer_alone(hand: Rig) -> None:
     hand.modifier(imgui.Key.mod_alt)
-    click(hand, LEFT + 34, HEADS + CARD_PX)
+    click(hand, LEFT + 34, HEADS + row(1))
     hand.modifier(imgui.Key.mod_alt, False)
     assert [(layer.enabled, layer.solo) for layer in layers(hand)] == [(True, False), (True, True)]
 
@@ -211,7 +218,7 @@ def test_a_locked_slider_does_not_move(hand: Rig) -> None:
     toggle(hand, "lock", 0)
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
     assert hand.strengths == [0.5, 0.5]
-    click(hand, POINTS[0] - 40, HEADS)
+    click(hand, POINTS[0] - 40, HEADS + row(0))
     hand.frame(2)
     assert not imgui.get_io().want_text_input
 
@@ -219,17 +226,16 @@ def test_a_locked_slider_does_not_move(hand: Rig) -> None:
 def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> None:
     toggle(hand, "fold", 1)
     before = hand.stage.engine.gaussians(hand.stage.work.view).sh0.clone()
-    y = 249.0 + CARD_PX  # the first gain
+    y = 249.0 + row(1)  # the first gain
     hand.drag((POINTS[0] - 76, y), (LEFT + 90, y))
     assert layers(hand)[1].gains == Gains(geometry=0.0)
     assert len(hand.stage.work.past.past) == 1
     after = hand.stage.engine.gaussians(hand.stage.work.view)
     assert torch.equal(after.sh0, before)
     assert torch.equal(after.means, bear().scene.means)
-    hand.move(LEFT + 150, y)
-    hand.press(1)
-    hand.release(1)
-    assert layers(hand)[1].gains == Gains(), "a right click brings all of it back"
+    hand.frame(30)
+    hand.double_click(LEFT + 150, y)
+    assert layers(hand)[1].gains == Gains(), "a double click brings all of it back"
 
 
 def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
@@ -240,11 +246,11 @@ def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
         assert names(hand) == ["scarf", "ears"], "the order changes with the release"
     hand.release()
     assert names(hand) == ["ears", "scarf"]
-    assert hand.stage.work.focus == 1
+    assert hand.stage.work.focus == 0
     assert len(hand.stage.work.past.past) == 1
     hand.key("Ctrl+Z")
     assert names(hand) == ["scarf", "ears"]
-    assert hand.stage.work.focus == 0
+    assert hand.stage.work.focus == 1
 
 
 def test_a_name_dragged_and_brought_back_changes_nothing(hand: Rig) -> None:
@@ -253,7 +259,7 @@ def test_a_name_dragged_and_brought_back_changes_nothing(hand: Rig) -> None:
 
 
 def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
-    hand.double_click(LEFT + 100, HEADS + CARD_PX)
+    hand.double_click(LEFT + 100, HEADS + row(1))
     type_name(hand, "golden ears")
     assert names(hand) == ["scarf", "golden ears"]
     assert len(hand.stage.work.past.past) == 1
@@ -262,6 +268,7 @@ def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
 
 
 def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None:
+    hand.key("2")
     hand.key("Enter")
     type_name(hand, "nothing", imgui.Key.escape)
     assert names(hand) == ["scarf", "ears"]
@@ -274,6 +281,7 @@ def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None
 def test_a_click_on_a_splat_focuses_its_layer_and_a_drag_does_not(hand: Rig) -> None:
     places = bear().scene.means[bear().gdfs[1].region.members]
     ear = places[places[:, 0] > 0].mean(0)
+    hand.key("2")
     at = on_screen(hand, ear)
     hand.drag(at, (at[0] + 40, at[1]))
     assert hand.stage.work.focus == 0
@@ -378,3 +386,84 @@ def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
     edits = ("bear.ply", "scarf.gdf", "ears.gdf", "--solo", "ears")
     assert main(["render", *edits, "--sweep", "scarf", "-o", "a.gif"]) == 2
     assert "ears is shown alone and hides it; show scarf alone too" in capsys.readouterr().err
+
+
+def menu(hand: Rig, layer: int, item: int) -> None:
+    """A right click on a layer's card, then one of Rename, Duplicate, Replace and Delete."""
+    hand.frame(30)
+    hand.move(LEFT + 150, HEADS + row(layer))
+    hand.press(1)
+    hand.release(1)
+    click(hand, LEFT + 180, HEADS + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 3 else 0.0))
+
+
+def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
+    """As the rule "over" has it: the last of the layers, and the first card."""
+    click(hand, LEFT + 150, HEADS)
+    assert hand.stage.work.focus == 1
+    hand.key("2")
+    assert hand.stage.work.focus == 0
+    hand.key("Alt+Up")
+    assert names(hand) == ["ears", "scarf"]
+    hand.stage.change(stack.added(hand.stage.work.view, 0, "new"))
+    hand.settle()
+    click(hand, LEFT + 150, HEADS)
+    assert layers(hand)[hand.stage.work.focus or 0].name == "new"
+
+
+def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> None:
+    before, picture = hand.stage.work.view, hand.picture()
+    menu(hand, 1, 3)
+    assert names(hand) == ["scarf"]
+    assert hand.stage.work.focus == 0
+    assert not np.array_equal(hand.picture(), picture)
+    hand.key("Ctrl+Z")
+    assert hand.stage.work.view.layers == before.layers
+    assert np.array_equal(hand.picture(), picture)
+    hand.key("1")
+    hand.key("Ctrl+Delete")
+    hand.key("Ctrl+Delete")
+    assert names(hand) == []
+    assert hand.stage.work.focus is None
+    hand.key("Ctrl+Delete")
+
+
+def test_the_menu_renames_and_asks_the_window_for_the_rest(hand: Rig) -> None:
+    menu(hand, 0, 0)
+    type_name(hand, "shawl")
+    assert names(hand) == ["shawl", "ears"]
+    menu(hand, 0, 1)
+    menu(hand, 1, 2)
+    assert hand.stage.take_requests() == ("duplicate:0", "replace:1")
+    toggle(hand, "menu", 0)
+    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+    hand.modifier(imgui.Key.escape)
+    hand.frame(2)
+    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+
+
+def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
+    hand.double_click(*hand.slider(1, 0.5))
+    assert hand.strengths == [0.5, 0.0]
+    assert len(hand.stage.work.past.past) == 1, "on the handle it is one step"
+    lens = (LEFT + 210, 396.0)
+    hand.frame(30)
+    click(hand, *lens)
+    assert hand.stage.work.view.camera.fov_y != 45.0
+    hand.frame(30)
+    hand.double_click(*lens)
+    hand.frame(3)
+    assert hand.stage.work.view.camera.fov_y == 45.0
+
+
+def test_a_replaced_layer_keeps_its_place_strength_and_keys(hand: Rig) -> None:
+    view = stack.changed(hand.stage.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x"))
+    view = timeline_with_key(view)
+    after = stack.replaced(view, 0, 7, "ears")
+    assert after.layers[0] == LayerState(7, "ears-2", 0.3)
+    assert after.layers[1] == view.layers[1]
+    assert dict(after.timeline.keys[0].strengths) == {7: 0.3, 1: 0.5}
+
+
+def timeline_with_key(view: ViewState) -> ViewState:
+    return replace(view, timeline=timeline.with_key(view.timeline, 0, view))

@@ -97,8 +97,8 @@ def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
 
 LEFT = SIZE[0] - panel.WIDTH_PX
 START, SPAN = LEFT + 12 + 10 + 7, panel.WIDTH_PX - 2 * (12 + 10 + 7)
-TRACKS = (136.0, 233.0)  # heights of the two sliders' tracks
-EYES = (109.0, 206.0)
+TRACKS = (233.0, 136.0)  # heights of the two sliders' tracks: the last layer lies on top
+EYES = (206.0, 109.0)
 
 
 def at(strength: float) -> float:
@@ -210,7 +210,7 @@ def test_escape_leaves_the_typed_value_out(hand: Hand) -> None:
 def test_looking_at_a_value_without_changing_it_does_not_round_it() -> None:
     view = ViewState(layers=(LayerState(0, "scarf", 0.123456),))
     hand = hand_on(view)
-    hand.click(SIZE[0] - 40, EYES[0])
+    hand.click(SIZE[0] - 40, EYES[1])
     hand.frame()
     assert imgui.get_io().want_text_input
     hand.click(LEFT + 150, 500)
@@ -235,9 +235,9 @@ def test_the_eye_hides_its_layer_and_nothing_else(hand: Hand) -> None:
 
 
 def test_a_click_on_a_card_focuses_it(hand: Hand) -> None:
-    assert hand.work.focus == 0
-    hand.click(LEFT + 150, EYES[1])
     assert hand.work.focus == 1
+    hand.click(LEFT + 150, EYES[0])
+    assert hand.work.focus == 0
     assert hand.work.view == STACK
 
 

@@ -62,7 +62,7 @@ def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand:
 
 
 def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
-    hand.frame()  # the one that tooltips get
+    hand.rest()  # the frames that tooltips get
     drawn, frames = hand.stage.drawn, hand.stage.frames
     assert hand.stage.patience() is None
     assert (hand.stage.drawn, hand.stage.frames) == (drawn, frames)

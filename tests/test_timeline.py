@@ -196,7 +196,7 @@ def test_a_key_is_set_at_the_playhead_with_camera_and_strengths_and_can_be_undon
 
 
 def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo() -> None:
-    work = workspace.opened(replace(view(), timeline=two_keys()))
+    work = workspace.opened(replace(view(0.0, 1.0), timeline=two_keys()))
     entries = len(work.past.past)
     for action, scarf in (("seek:20", 1.0), ("step:-20", 0.0), ("jump:1", 1.0), ("seek:10", 0.5)):
         work = act(work, action)
@@ -205,6 +205,28 @@ def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo()
     assert len(work.past.past) == entries
     edited = act(replace(work, focus=1), "nudge:0.1")
     assert [round(layer.strength, 3) for layer in act(edited, "undo").view.layers] == [0.5, 0.75]
+
+
+@pytest.mark.parametrize("leaves", [["seek:11", "seek:12", "seek:13"], ["step:1"], ["jump:1"], ["play"]])
+def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves: list[str]) -> None:
+    work = workspace.opened(replace(view(0.0, 1.0), timeline=two_keys()))
+    work = act(work, "seek:10", "focus:2", "nudge:0.3")
+    entries = len(work.past.past)
+    left = work
+    for action in leaves:  # of one drag: nothing is settled in between
+        left = workspace.perform(left, action, FACTS)
+    left = workspace.settled(workspace.played(left, 0.1))
+    assert left.view.layers != work.view.layers
+    assert len(left.past.past) == entries + 1, "one drag is one entry"
+    assert act(left, "undo").view.layers == work.view.layers
+
+
+def test_one_key_leaves_strengths_and_camera_to_the_hand() -> None:
+    work = act(workspace.opened(view(0.3)), "key", "focus:2", "nudge:0.5")
+    there = act(work, "seek:30", "seek:0")
+    assert there.view == work.view
+    only = timeline.shown_at(work.view.timeline, 0, work.view)
+    assert only.layers[0].strength == 0.3, "in a film a single key still counts"
 
 
 def test_a_gesture_under_way_is_still_one_entry_when_the_film_plays_on() -> None:
@@ -250,15 +272,14 @@ def test_one_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
 
 
 def test_undo_of_a_longer_timeline_leaves_a_playhead_that_still_works() -> None:
-    work = act(workspace.opened(replace(view(), timeline=two_keys())), "length:90", "seek:80", "undo")
+    work = act(workspace.opened(replace(view(), timeline=two_keys())), "length:90", "seek:80", "undo", "undo")
     assert work.view.timeline.length == 20
     assert act(work, "step:1").player.frame == 20
 
 
 def test_history_restores_the_timeline_with_the_rest() -> None:
     past = history.record(history.begin(view()), replace(view(), timeline=two_keys()))
-    _, back = history.undo(past, replace(view(), timeline=two_keys()))
-    assert back.timeline == Timeline()
+    assert history.undo(past).present.edit.timeline == Timeline()
 
 
 def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:

@@ -154,9 +154,10 @@ def desktop(tmp_path: Path) -> Iterator[Desktop]:
 
 
 def slider(layer: int, strength: float) -> tuple[float, float]:
+    """Of two layers the last one lies on top."""
     inset = 12 + 10 + 7
     x = WIDTH - panel.WIDTH_PX + inset + strength * (panel.WIDTH_PX - 2 * inset)
-    return x, 136.0 + 97.0 * layer
+    return x, 136.0 + 97.0 * (1 - layer)
 
 
 def changed(before: np.ndarray, after: np.ndarray, height: int = HEIGHT - 60) -> int:
@@ -217,6 +218,7 @@ def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop:
 @pytest.mark.gl
 def test_the_real_mouse_paints_and_undo_takes_the_stroke_away(desktop: Desktop) -> None:
     desktop.point(*slider(0, 0.5))  # where the brush's ring is not over the picture
+    desktop.xdotool("key", "2")  # the lower card: the scarf
     clean = desktop.shot()
     desktop.xdotool("key", "b")
     colours = desktop.rest()
@@ -297,6 +299,7 @@ def test_chords_are_named_as_in_the_table_of_bindings() -> None:
 @pytest.mark.window
 @pytest.mark.gl
 def test_closing_the_real_window_with_unsaved_changes_asks_and_saves(desktop: Desktop) -> None:
+    desktop.xdotool("key", "2")
     first = desktop.shot()
     desktop.xdotool("key", "shift+Left")
     desktop.xdotool("key", "ctrl+q")
@@ -312,3 +315,19 @@ def test_closing_the_real_window_with_unsaved_changes_asks_and_saves(desktop: De
     assert desktop.process.communicate() == ("", "")
     saved = open_session(desktop.folder / "bear.session.json")
     assert saved.view.layers[0].strength == pytest.approx(0.4)
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_what_the_real_keyboard_types_fast_arrives_whole(desktop: Desktop) -> None:
+    desktop.shot()
+    desktop.xdotool("keydown", "ctrl")
+    desktop.point(*slider(0, 0.2))
+    desktop.xdotool("click", 1)
+    desktop.xdotool("keyup", "ctrl")
+    desktop.xdotool("type", "--delay", "10", "0.1122\n")
+    desktop.shot()
+    desktop.xdotool("key", "ctrl+s", "Return")
+    path = desktop.folder / "bear.session.json"
+    desktop.until("the session", path.exists)
+    assert open_session(path).view.layers[0].strength == pytest.approx(0.1122)

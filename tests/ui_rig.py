@@ -58,6 +58,13 @@ class Rig:
         while self.stage.patience() == 0.0:
             self.frame()
 
+    def rest(self, seconds: float = 3.0) -> None:
+        """What the window's loop does for so long while nothing comes in."""
+        while seconds > 0.0 and (wait := self.stage.patience()) is not None:
+            passed = max(min(wait, seconds), STEP_S)
+            self.stage.frame(self.screen, self.pixels, passed)
+            seconds -= passed
+
     def event(self) -> None:
         """Something came in: the window wakes the stage and draws."""
         self.stage.wake()
@@ -126,10 +133,11 @@ class Rig:
         return [layer.strength for layer in self.stage.work.view.layers]
 
     def slider(self, layer: int, strength: float) -> tuple[float, float]:
-        """Where on the window (at 1×) the handle of a layer stands at a strength."""
+        """Where on the window (at 1×) the handle of a layer stands at a strength; the top one is the last."""
         inset = 12 + 10 + 7  # the panel's and the card's padding, the handle's radius
         span = panel.WIDTH_PX - 2 * inset
-        return self.points[0] - panel.WIDTH_PX + inset + strength * span, 136.0 + 97.0 * layer
+        row = len(self.stage.work.view.layers) - 1 - layer
+        return self.points[0] - panel.WIDTH_PX + inset + strength * span, 136.0 + 97.0 * row
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
+from . import workspace
 from .desk import Desk
 from .document import Document
 from .engine import Engine
@@ -50,7 +51,7 @@ def run(
     try:
         app = App(window, document, state, pictures, session, draw=draw, edit_pass=edit_pass)
         app.stage.restart(state, snapshots)
-        app.desk.mention_autosave()
+        app.desk.offer_autosave()
         try:
             with interruptible():
                 app.loop()
@@ -82,6 +83,7 @@ class App:
         self.stage = Stage(self.context, self.engine, document.facts(), state, window.ui_scale, pictures)
         self.desk = Desk(self, session, memory)
         self._left = False
+        self._title = ""
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
         self.last = time.perf_counter()
@@ -101,7 +103,8 @@ class App:
         self.window.present()
         while not self._left:
             waits = [wait for wait in self._waits() if wait is not None]
-            self.window.wait(min(waits, default=None))
+            if not self.stage.opening:  # else events wait in the window system, so that no letter is lost
+                self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
             for path in self._take_dropped():
@@ -125,6 +128,7 @@ class App:
         screen = self.context.screen
         self.stage.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
         self.window.present()
+        self._rename()
         for request in self.stage.take_requests():
             if request == "full_screen":
                 self.window.toggle_full_screen()
@@ -160,7 +164,13 @@ class App:
         self.engine.release()
         self.document, self.engine = document, engine
         self.stage.serve(engine, document.facts())
-        self.window.rename(_window_title(document.title))
+
+    def _rename(self) -> None:
+        """The title bar says what is open, and with a dot that there are unsaved changes."""
+        title = _window_title(self.document.title, self.desk.unsaved)
+        if title != self._title:
+            self.window.rename(title)
+            self._title = title
 
     def _engine(self, document: Document) -> Engine:
         return Engine(self.context, document.scene, document.gdfs, self._draw, self._edit_pass)
@@ -171,5 +181,5 @@ class App:
         self._left = True
 
 
-def _window_title(name: str) -> str:
-    return f"{name} – ProGDF Studio"
+def _window_title(name: str, unsaved: bool = False) -> str:
+    return f"{workspace.UNSAVED * unsaved}{name} – ProGDF Studio"

@@ -20,6 +20,8 @@ MOUSE_HELP = (
     ("W A S D Q E", "fly; Shift ten times faster, Alt slower"),
     ("Shift on a slider", "ten times finer"),
     ("Ctrl+click a slider", "type a value"),
+    ("Double click a slider", "back to its default"),
+    ("Right click", "menu of a layer or a snapshot"),
     ("Esc, right click", "while dragging: take it back"),
     ("\\ held", "the original"),
 )

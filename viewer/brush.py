@@ -8,7 +8,7 @@ from itertools import pairwise
 from imgui_bundle import imgui
 
 from . import paint, stack, tint
-from .state import ViewState
+from .state import Brush, ViewState
 from .ui_context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from .widgets import choice, icon_button, label, tip, value_slider
 from .widgets import section as heading
@@ -48,10 +48,12 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     if mode is not None:
         brush = replace(brush, mode=paint.MODES[mode])
     label("Radius", column)
-    radius = value_slider("##radius", brush.radius, (paint.SMALLEST_PX, paint.LARGEST_PX), "%.0f px", ui)
+    radius = value_slider(
+        "##radius", brush.radius, (paint.SMALLEST_PX, paint.LARGEST_PX), "%.0f px", Brush.radius, ui
+    )
     tip("[ ]")
     label("Softness", column)
-    softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", ui)
+    softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", Brush.softness, ui)
     tip("Shift+[ ]")
     brush = replace(brush, radius=radius, softness=softness)
     label("Acts on", column)

@@ -183,6 +183,8 @@ KEYS = (
     Key("L", "lock", "lock its strength and gains"),
     Key("G", "fold", "its gains and curve"),
     Key("Enter", "rename", "rename it (double click its name)"),
+    Key("Ctrl+D", "duplicate", "duplicate it"),
+    Key("Ctrl+Delete", "remove", "delete it"),
     Key("Alt+Up", "move:-1", ""),
     Key("Alt+Down", "move:1", "move it up or down (drag its name)"),
     Key("B", "brush", "paint its strength (left drag)"),
@@ -198,7 +200,7 @@ KEYS = (
     Key("Shift+X", "paint_feather", "feather all its paint"),
     Key("M", "blend", "next blend rule"),
     Key("O", "overshoot", "sliders to 1.2: extrapolates"),
-    Key("Escape", "unfocus", "focus no layer"),
+    Key("Escape", "unfocus", "close this list; focus no layer"),
     Key("Ctrl+Z", "undo", "undo", repeats=True),
     Key("Ctrl+Shift+Z", "redo", "redo", repeats=True),
     Key("Ctrl+Y", "redo", "", repeats=True),
@@ -233,6 +235,10 @@ KEYS = (
     Key("F12", "panel", "hide the panel"),
     Key("Ctrl+Q", "quit", "quit"),
 )
+
+
+OPENS_TEXT = ("rename", "save", "save_as", "open")
+"""Actions after which one types."""
 
 
 def drag_for(button: str, modifier: str, mode: str) -> str | None:

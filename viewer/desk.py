@@ -7,30 +7,29 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from progdf.camera_files import load_cameras
-from progdf.checkpoint import load_gdf
+from progdf.checkpoint import Gdf, load_gdf
 from progdf.errors import ProgdfError
 from progdf.info import kind_of
 from progdf.session_file import SUFFIX
 
+from . import autosave as autosaves
 from . import document as documents
-from . import native, recent, saved_files, session, timeline_file, workspace
+from . import native, recent, saved_files, session, stack, timeline_file, workspace
+from .autosave import Autosave
 from .document import Document
 from .playback import Player
 from .session import Session
 from .stage import Stage
-from .state import LayerState, Timeline
+from .state import Timeline, ViewState
 from .threads import all_threads
 from .turntable import first_camera, from_camera, to_camera
 from .upright import up_of
 from .workspace import Dialog
-
-AUTOSAVE_S = 20.0
-"""Seconds from a change to its autosave."""
 
 
 class Shown(Protocol):
@@ -46,14 +45,6 @@ class Shown(Protocol):
         """Close the window, without a question."""
 
 
-@dataclass(frozen=True)
-class _Due:
-    """An autosave to come: when, in seconds of the caller's clock, and of what."""
-
-    at: float
-    kept: object
-
-
 class Desk:
     """Opens, saves and asks, for one window.
 
@@ -65,8 +56,8 @@ class Desk:
 
     def __init__(self, app: Shown, path: Path | None = None, memory: Path | None = None) -> None:
         self._app, self.path, self._memory = app, path, memory
-        self._due: _Due | None = None
-        self._autosaved: object = None  # what the autosave file holds
+        self._autosave = Autosave()
+        self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
         self._browser = native.Browser()
         opened = app.document
         files = (*opened.gdf_paths, *((opened.path,) if opened.path else ()), *((path,) if path else ()))
@@ -80,6 +71,9 @@ class Desk:
         elif name == "save_to":
             asked = self._app.stage.work.dialog
             self._save_to(argument, asked.then if asked else "")
+        elif name == "overwrite":
+            asked = self._app.stage.work.dialog
+            self._save_to(argument, asked.then if asked else "", overwrite=True)
         elif name == "open":
             self._app.stage.ask(Dialog("open"))
         elif name == "browse":
@@ -89,7 +83,18 @@ class Desk:
         elif name == "camera":
             self._told(self._keep_camera)
         elif name == "discard":
-            self._app.stage.work = workspace.as_saved(self._app.stage.work)
+            self._told(self._discard)
+        elif name == "restore_autosave":
+            self.open(Path(argument))
+        elif name == "discard_autosave":
+            self._told(lambda: self._discard_autosave(Path(argument)))
+        elif name == "duplicate":
+            self._told(lambda: self._duplicate(self._layer(argument)))
+        elif name == "replace":
+            self._app.stage.ask(Dialog("replace", then=argument))
+        elif name == "replace_by":
+            index, _, path = argument.partition(":")
+            self._told(lambda: self._replace(self._layer(index), _typed(path)))
         elif name == "quit":
             self._leave()
 
@@ -121,11 +126,11 @@ class Desk:
             ProgdfError: see `session.save`.
             OSError: it cannot be written.
         """
-        path = path if path.suffix == ".json" else path.with_name(path.name + SUFFIX)
+        path = _session_file(path)
         if path != self.path and path.is_file() and kind_of(path) != "session":
             raise ProgdfError(f"{path} is another file, no session; choose another name")
-        session.save(path, self._session())
-        self._drop_autosave()
+        self._write(path)
+        self._autosave.drop()
         self.path = path
         stage = self._app.stage
         stage.work = workspace.as_saved(stage.work)
@@ -141,24 +146,22 @@ class Desk:
         Returns:
             Seconds until it has to be called again; None if nothing waits.
         """
-        kept = workspace.worth_saving(self._app.stage.work)
-        if not self.unsaved or kept == self._autosaved:
-            self._due = None
+        if not self.unsaved:
+            self._autosave.stop()
             return None
-        if self._due is None:
-            self._due = _Due(now + AUTOSAVE_S, kept)
-        if now < self._due.at:
-            return self._due.at - now
-        self._due, self._autosaved = None, kept
+        kept, before = workspace.worth_saving(self._app.stage.work), self._autosave.path
         try:
-            session.save(self._autosave_path(), self._session())
+            wait = self._autosave.wait(now, kept, self._beside, self._write)
         except (ProgdfError, OSError) as error:
             self._app.stage.tell(f"there is no autosave: {error}", error=True)
-        return None
+            return None
+        if self._autosave.path is not None and self._autosave.path != before:
+            self._app.stage.recent = self._remember(self._autosave.path)
+        return wait or None
 
     def closed(self) -> None:
         """The window closes, and nothing is lost: the autosave has done its work."""
-        self._drop_autosave()
+        self._autosave.drop()
 
     def release(self) -> None:
         """Take away what of the desktop's is still on screen."""
@@ -192,44 +195,104 @@ class Desk:
 
     def _open_session(self, path: Path) -> None:
         opened = session.open_session(path)
-        self._drop_autosave()
+        self._autosave.drop()
         self._app.show(opened.document)
         stage = self._app.stage
         stage.restart(opened.view, opened.snapshots)
-        name = path.name.removesuffix(session.AUTOSAVE + SUFFIX)
-        if name != path.name:  # an autosave is unsaved work of the session beside it
-            self.path = path.with_name(name + SUFFIX)
-            stage.work = replace(stage.work, saved=None)
+        beside = autosaves.session_of(path)
+        if beside is None:
+            self.path = path
+            self.offer_autosave()
             return
-        self.path = path
-        self.mention_autosave()
+        stage.work = replace(stage.work, saved=None)
+        discarded = autosaves.is_discarded(path)
+        # what was never saved, or was discarded, never takes the place of a session unasked
+        self.path = beside if beside.is_file() and not discarded else None
+        if not discarded:
+            self._autosave.goes_on(path)
+            stage.tell(f"Restored the unsaved work of {beside.name}")
 
-    def mention_autosave(self) -> None:
-        """Say so where work was left unsaved the last time."""
-        left = self._autosave_path()
-        if self._app.document.path is not None and left.is_file():
-            self._app.stage.tell(f"Unsaved work was kept in {left.name}; Ctrl+O opens it")
+    def offer_autosave(self) -> None:
+        """Ask what becomes of work that was left unsaved the last time, of the latest first."""
+        if self._app.document.path is None:
+            return
+        found = autosaves.left(self._named(), numbered=self.path is None)
+        left = [path for path in found if path != self._autosave.path and path not in self._put_off]
+        if left:
+            self._put_off.add(left[0])  # if it is not decided now
+            self._app.stage.recent = self._remember(*reversed(left))
+            self._app.stage.ask(Dialog("restore", str(left[0])))
+
+    def _discard(self) -> None:
+        """Unsaved work is given up; its autosave stays under another name."""
+        self._app.stage.work = workspace.as_saved(self._app.stage.work)
+        aside = self._autosave.discard()
+        if aside is not None:
+            self._app.stage.recent = self._remember(aside)
+
+    def _discard_autosave(self, path: Path) -> None:
+        aside = autosaves.put_aside(path)
+        self._app.stage.recent = self._remember(aside)
+        self._app.stage.tell(f"Discarded; it stays in {aside.name} for a while")
+        self.offer_autosave()
 
     def _open_scene(self, path: Path) -> None:
         opened = documents.load(path)
-        self._drop_autosave()
+        self._autosave.drop()
         self._app.show(opened)
         self.path = None
         stage = self._app.stage
         camera = first_camera(opened.scene, up=up_of(opened.scene, path=path))
         stage.restart(replace(stage.work.view, camera=camera, layers=(), timeline=Timeline()))
+        self.offer_autosave()
 
     def _add_edit(self, path: Path) -> None:
         """On top, at full strength, so that one sees what came; undo takes it off again."""
-        opened = self._app.document
+        gdf = self._loaded(path)
+        view = self._app.stage.work.view
+        view = stack.added(view, self._with_edit(gdf, path), gdf.name)
+        self._changed(view, len(view.layers) - 1)
+
+    def _duplicate(self, index: int) -> None:
+        """A copy of a layer above it, with an edit of its own: the timeline and undo tell edits apart."""
+        opened, view = self._app.document, self._app.stage.work.view
+        gdf = view.layers[index].gdf
+        path = opened.gdf_paths[gdf] if gdf < len(opened.gdf_paths) else None
+        self._changed(stack.duplicated(view, index, self._with_edit(opened.gdfs[gdf], path)), index + 1)
+
+    def _replace(self, index: int, path: Path) -> None:
+        """Another edit in a layer's place; undo brings the first one back."""
+        gdf = self._loaded(path)
+        view = self._app.stage.work.view
+        self._changed(stack.replaced(view, index, self._with_edit(gdf, path), gdf.name), index)
+        self._app.stage.recent = self._remember(path)
+
+    def _loaded(self, path: Path) -> Gdf:
         with all_threads():
-            gdf = load_gdf(path, opened.scene)
-        layer = LayerState(len(opened.gdfs), opened.free_name(gdf.name), strength=1.0)
-        paths = (*opened.gdf_paths, path) if len(opened.gdf_paths) == len(opened.gdfs) else ()
-        gdfs = (*opened.gdfs, replace(gdf, name=layer.name))
-        self._app.show(replace(opened, gdfs=gdfs, gdf_paths=paths))
+            return load_gdf(path, self._app.document.scene)
+
+    def _with_edit(self, gdf: Gdf, path: Path | None) -> int:
+        """Have one more edit open; its index."""
+        opened = self._app.document
+        own = replace(gdf, name=opened.free_name(gdf.name))
+        known = path is not None and len(opened.gdf_paths) == len(opened.gdfs)
+        paths = (*opened.gdf_paths, path) if known and path is not None else ()
+        self._app.show(replace(opened, gdfs=(*opened.gdfs, own), gdf_paths=paths))
+        return len(opened.gdfs)
+
+    def _changed(self, view: ViewState, focus: int) -> None:
+        """A change of the stack, which undo takes back, and the layer that it is about."""
         stage = self._app.stage
-        stage.change(replace(stage.work.view, layers=(*stage.work.view.layers, layer)))
+        stage.change(view)
+        stage.work = replace(stage.work, focus=focus)
+
+    def _layer(self, index: str) -> int:
+        """The layer that a request is about: the focused one where none is named."""
+        work = self._app.stage.work
+        found = int(index) if index else work.focus
+        if found is None or not 0 <= found < len(work.view.layers):
+            raise ProgdfError("no layer is selected; click one first")
+        return found
 
     def _look_through(self, path: Path) -> None:
         stage = self._app.stage
@@ -245,20 +308,28 @@ class Desk:
         path, count = saved_files.camera(place, to_camera(stage.work.view.camera, *stage.picture_size))
         stage.tell(f"Kept as camera {count} of {path.resolve()}; progdf train … --cameras {path.name}")
 
+    def _write(self, path: Path) -> None:
+        session.save(path, self._session())
+
     def _session(self) -> Session:
         work = self._app.stage.work
         return Session(self._app.document, work.view, work.snapshots)
 
     def _save_where(self, then: str, ask: bool) -> None:
         if self.path is None or ask:
-            path = self.path or session.default_path(self._app.document)
-            self._app.stage.ask(Dialog("save", str(path), then))
+            self._app.stage.ask(Dialog("save", str(self._beside()), then))
             return
         self._save_to(str(self.path), then)
 
-    def _save_to(self, path: str, then: str) -> None:
-        """Save there, then do what was put off; where that fails, ask for another place and say why."""
-        stage = self._app.stage
+    def _save_to(self, path: str, then: str, overwrite: bool = False) -> None:
+        """Save there, then do what was put off; where that fails, ask for another place and say why.
+
+        A file that is not this session's own is replaced only where the person says so.
+        """
+        stage, file = self._app.stage, _session_file(_typed(path))
+        if not overwrite and file != self.path and file.is_file() and kind_of(file) == "session":
+            stage.ask(Dialog("overwrite", path, then))
+            return
         error = _failure(lambda: self.save(_typed(path)))
         if error:
             stage.ask(Dialog("save", path, then, error=error))
@@ -281,26 +352,30 @@ class Desk:
             self._app.leave()
 
     def _leaving(self, then: str) -> Dialog:
-        return Dialog("leave", str(self.path or session.default_path(self._app.document)), then)
+        return Dialog("leave", str(self._beside()), then)
 
     def _told(self, act: Callable[[], None]) -> None:
         """Do it; what goes wrong is a line in the window."""
         if error := _failure(act):
             self._app.stage.tell(error, error=True)
 
-    def _autosave_path(self) -> Path:
-        return session.autosave_path(self.path, self._app.document)
+    def _named(self) -> Path:
+        """The session's file, or what it is called where it never had one."""
+        return self.path or session.default_path(self._app.document)
 
-    def _drop_autosave(self) -> None:
-        """Take away what this window has autosaved."""
-        if self._autosaved is not None:
-            self._autosave_path().unlink(missing_ok=True)
-        self._autosaved, self._due = None, None
+    def _beside(self) -> Path:
+        """The session's file; where it never had one, a name that nothing has."""
+        return self.path or autosaves.free_session(self._named(), self._autosave.path)
 
     def _remember(self, *paths: Path) -> tuple[Path, ...]:
         if not paths:
             return recent.read(self._memory)
         return recent.remember(paths, self._memory)
+
+
+def _session_file(path: Path) -> Path:
+    """A path as a session's file is called."""
+    return path if path.suffix == ".json" else path.with_name(path.name + SUFFIX)
 
 
 def _typed(path: str) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from progdf.checkpoint import Gdf
@@ -13,7 +13,7 @@ from progdf.gaussians import Gaussians
 from . import arguments
 from .layer_rows import layer_rows
 from .recordings import Recording, found
-from .turntable import bounds_of, fit_all
+from .turntable import bounds_of, first_camera, fit_all
 from .workspace import SceneFacts
 
 
@@ -45,6 +45,9 @@ class Document:
             rows=rows,
             recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, scene, aspect),
+            home=lambda camera, aspect: replace(
+                first_camera(scene, (), aspect, camera.fov_y, camera.up), mode=camera.mode
+            ),
         )
 
     def recordings(self) -> tuple[Recording, ...]:

@@ -165,7 +165,7 @@ def _focus_picked(work: Workspace, sight: Sight) -> Workspace:
     camera = sight.camera(work.view.camera)
     seen = seen_at(engine.gaussians(view), camera, *sight.cursor, engine.near)
     layer = None if seen is None else layer_at(view, engine.gdfs, seen)
-    return work if layer is None else workspace.perform(work, f"focus:{layer + 1}", sight.facts)
+    return work if layer is None else workspace.focused(work, layer)
 
 
 def _pivot_picked(camera: ViewCamera, sight: Sight) -> ViewCamera:

@@ -1,8 +1,9 @@
-"""Undo and redo: one entry per gesture, of what is edited (layers, blend), never of where one looks from."""
+"""Undo and redo: one entry per gesture, of what is edited and of snapshots, never of where one looks from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from .state import LayerState, Timeline, ViewState
 
@@ -20,32 +21,45 @@ class Edit:
 
 
 @dataclass(frozen=True)
+class Step:
+    """What one entry brings back.
+
+    Args:
+        edit: the part of the state
+        snapshots: those there were, see snapshots.py, which is built on this module
+    """
+
+    edit: Edit
+    snapshots: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True)
 class History:
     """Entries before and after the present one."""
 
-    present: Edit
-    past: tuple[Edit, ...] = ()
-    future: tuple[Edit, ...] = ()
+    present: Step
+    past: tuple[Step, ...] = ()
+    future: tuple[Step, ...] = ()
 
 
 def edit_of(state: ViewState) -> Edit:
     return Edit(state.layers, state.blend, state.overshoot, state.timeline)
 
 
-def begin(state: ViewState) -> History:
-    """A history whose present is `state` and that has nothing to undo."""
-    return History(edit_of(state))
+def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
+    """A history whose present is `state` with these snapshots, and that has nothing to undo."""
+    return History(Step(edit_of(state), snapshots))
 
 
-def record(history: History, state: ViewState) -> History:
+def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
     """Call whenever no gesture is under way: what a press, move and release changed becomes one entry.
 
     A gesture that ends where it began leaves no entry.
     """
-    edit = edit_of(state)
-    if edit == history.present:
+    step = Step(edit_of(state), snapshots)
+    if step == history.present:
         return history
-    return History(edit, (*history.past, history.present)[-LONGEST:])
+    return History(step, (*history.past, history.present)[-LONGEST:])
 
 
 def followed(history: History, before: ViewState, after: ViewState) -> History:
@@ -54,26 +68,25 @@ def followed(history: History, before: ViewState, after: ViewState) -> History:
         return history
     was = {layer.gdf: layer.strength for layer in before.layers}
     went = {layer.gdf: layer.strength for layer in after.layers if layer.strength != was.get(layer.gdf)}
-    layers = tuple(
-        replace(layer, strength=went.get(layer.gdf, layer.strength)) for layer in history.present.layers
-    )
-    return replace(history, present=replace(history.present, layers=layers))
+    edit = history.present.edit
+    layers = tuple(replace(layer, strength=went.get(layer.gdf, layer.strength)) for layer in edit.layers)
+    return replace(history, present=replace(history.present, edit=replace(edit, layers=layers)))
 
 
-def undo(history: History, state: ViewState) -> tuple[History, ViewState]:
+def undo(history: History) -> History:
     """One entry back; unchanged where there is none."""
     if not history.past:
-        return history, state
+        return history
     *past, back = history.past
-    return History(back, tuple(past), (history.present, *history.future)), restored(state, back)
+    return History(back, tuple(past), (history.present, *history.future))
 
 
-def redo(history: History, state: ViewState) -> tuple[History, ViewState]:
+def redo(history: History) -> History:
     """One entry forward; unchanged where there is none."""
     if not history.future:
-        return history, state
+        return history
     ahead, *future = history.future
-    return History(ahead, (*history.past, history.present), tuple(future)), restored(state, ahead)
+    return History(ahead, (*history.past, history.present), tuple(future))
 
 
 def restored(state: ViewState, edit: Edit) -> ViewState:

@@ -14,10 +14,17 @@ _BUTTONS = (("left", 0), ("right", 1), ("middle", 2))
 
 @dataclass(frozen=True)
 class Press:
-    """A key that went down, with the modifiers that were held just then; `again` while it is held."""
+    """A key that went down, with the modifiers that were held just then.
+
+    Args:
+        chord: as in `controls.KEYS`
+        again: it went down before and is held
+        event_id: the place of this key among imgui's input events (see `heard`); −1 is before all of them
+    """
 
     chord: str
     again: bool = False
+    event_id: int = -1
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,31 @@ class Keys:
 
 
 NO_KEYS = Keys()
+
+
+def heard(press: Press) -> bool:
+    """Whether imgui, which takes text and keys in over several frames, has come to this key.
+
+    A key that comes before its time would overtake what was typed before it.
+    """
+    waiting = imgui.get_current_context().input_events_queue
+    return waiting.empty() or waiting[0].event_id > press.event_id
+
+
+def opens_text(press: Press) -> bool:
+    """Whether a key asks for a text field: it needs some frames until it has the keyboard."""
+    opens = any(key.chord == press.chord and key.action in controls.OPENS_TEXT for key in controls.KEYS)
+    return opens and not imgui.get_io().want_text_input
+
+
+def waiting() -> bool:
+    """Whether imgui still holds input that its next frames take in."""
+    return not imgui.get_current_context().input_events_queue.empty()
+
+
+def next_event_id() -> int:
+    """The place that the next event takes among imgui's input events."""
+    return int(imgui.get_current_context().input_events_next_event_id)
 
 
 def actions_pressed(keys: Keys) -> list[str]:

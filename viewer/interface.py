@@ -25,7 +25,7 @@ def panels(work: Workspace, sight: Sight, cards: tuple[SnapshotCard, ...], revea
     """
     facts, past = sight.facts, work.past
     shown = panel.PanelInput(
-        facts.title,
+        workspace.UNSAVED * workspace.unsaved(work) + facts.title,
         facts.count,
         facts.rows,
         work.focus,
@@ -75,7 +75,7 @@ def over_picture(
         overlay.table(figures, ui)
     closed, free = False, imgui.get_io().display_size
     if work.message is not None:
-        bar = timeline_bar.height(work.player, ui) if view.panel else 0.0
+        bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
         closed, top = overlay.message(work.message, replace(area, height=area.height - bar), ui)
         closed, free = closed or sight.now >= work.message.until, imgui.ImVec2(free.x, top)
     if work.help:

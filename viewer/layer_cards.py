@@ -1,4 +1,7 @@
-"""The stack of edits in the panel: one card per layer, dragged into their order, and the rule of blending."""
+"""The stack of edits in the panel: one card per layer, the top one first, and the rule of blending.
+
+Cards are dragged into their order. What takes a layer away or adds one is an action, for after the drawing.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +14,35 @@ from progdf.compose import BLENDS
 
 from . import layer_fold, stack, strength_slider
 from .layer_rows import LayerRow
-from .state import LayerState, ViewState
+from .state import ViewState
 from .ui_context import PALETTE, Icon, Rgba, UiContext, u32
-from .widgets import elided, grouped, icon_button, let_go, right_edge, section, small, small_toggle, tip
+from .widgets import (
+    elided,
+    grouped,
+    icon_button,
+    let_go,
+    menu,
+    right_edge,
+    section,
+    small,
+    small_toggle,
+    tip,
+    typed_name,
+)
 
 BLEND_HELP = {
     "normalised": "Overlapping edits share a Gaussian by their weights; never more than a full edit.",
     "sum": "Overlapping edits add up.",
-    "over": "An edit covers the lower ones where it changes something itself, as far as its strength goes.",
+    "over": "An edit covers those below it in the list, where and as far as it changes something.",
 }
 TOGGLE_PX, GRIP_PX = 24.0, 4.0
+_MENU = "menu of a layer"
+_MENU_ITEMS = (
+    ("Rename…", "Enter", "rename"),
+    ("Duplicate", "Ctrl+D", "duplicate"),
+    ("Replace…", "", "replace"),
+    ("Delete", "Ctrl+Del", "remove"),
+)
 
 
 @dataclass(frozen=True)
@@ -44,12 +66,16 @@ class Cards:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What became of the state: the focused layer, the one being renamed, the one asked about."""
+    """What became of the state: the focused layer, the one being renamed, the one asked about.
+
+    `actions`: those of the cards' menus, as in `workspace.perform`.
+    """
 
     state: ViewState
     focus: int | None
     renaming: int | None = None
     overlap: int | None = None
+    actions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -61,6 +87,7 @@ class _Card:
     renaming: bool = False
     drag: str = ""
     overlap: bool = False
+    action: str = ""
 
 
 def heading(state: ViewState, ui: UiContext) -> ViewState:
@@ -111,10 +138,12 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> Drawn:
         imgui.text_disabled("No edits are loaded. Drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
     focus, renaming, overlap = cards.focus, None, None
-    dragged: int | None = None
+    actions: list[str] = []
+    dragged: int | None = None  # rows, as seen: the top layer, which is the last one, is row 0
     dropped = False
     spans: list[tuple[float, float]] = []
-    for i in range(len(state.layers)):
+    for at in range(len(state.layers)):
+        i = stack.index_of(state, at)
         top = imgui.get_cursor_screen_pos().y
         card = _card(state, i, cards, ui)
         state = card.state
@@ -124,19 +153,21 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> Drawn:
         focus = i if card.touched else focus
         renaming = i if card.renaming else renaming
         overlap = i if card.overlap else overlap
+        actions += [card.action] if card.action else []
         if card.drag:
-            dragged, dropped = i, card.drag == "dropped"
+            dragged, dropped = at, card.drag == "dropped"
     if dragged is not None:
         to = _place(dragged, spans, imgui.get_mouse_pos().y)
         if dropped:
-            state, focus = stack.moved(state, dragged, to), to
+            was, focus = stack.index_of(state, dragged), stack.index_of(state, to)
+            state = stack.moved(state, was, focus)
         else:
             _show_place(dragged, to, spans, ui)
-    return Drawn(state, focus, renaming, overlap)
+    return Drawn(state, focus, renaming, overlap, tuple(actions))
 
 
 def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:
-    """Where in the stack the dragged card would lie: past each card over whose middle the hand is."""
+    """The row where the dragged card would lie: past each card over whose middle the hand is."""
     return sum(y > (top + bottom) / 2 for i, (top, bottom) in enumerate(spans) if i != dragged)
 
 
@@ -202,6 +233,11 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
         card = replace(card, state=stack.changed(card.state, index, lambda _: unfolded))
     over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
     pressed = over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value)
+    held = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button calls its drag off
+    if over and not held and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
+        pressed = True
+        imgui.open_popup(_MENU)
+    card = replace(card, action=_menu(index, ui))
     if focused:
         _focus_bar(clip, scale)
     imgui.end_child()
@@ -209,6 +245,18 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
     imgui.pop_style_color()
     imgui.pop_id()
     return replace(card, touched=card.touched or touched or pressed)
+
+
+def _menu(index: int, ui: UiContext) -> str:
+    """What can be done with a layer as a whole; the action that was chosen, "" for none."""
+    chosen = ""
+    with menu(_MENU, ui) as is_open:
+        for name, keys, action in _MENU_ITEMS if is_open else ():
+            if name == "Delete":
+                imgui.separator()
+            if imgui.menu_item(name, keys, False)[0]:
+                chosen = f"{action}:{index}"
+    return chosen
 
 
 def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], scale: float) -> None:
@@ -255,7 +303,7 @@ def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui
     """The name: dragged it moves the card, double-clicked it becomes a text field."""
     layer = card.state.layers[index]
     if renaming:
-        text = _typed_name(layer, room)
+        text = typed_name(layer.name, room)
         return replace(card, renaming=text is None, state=stack.renamed(card.state, index, text or ""))
     x, y = imgui.get_cursor_screen_pos()
     imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
@@ -274,23 +322,8 @@ def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui
     return card
 
 
-def _typed_name(layer: LayerState, room: float) -> str | None:
-    """The text field of a name; None while it is open, "" where it was left as it was."""
-    storage, slot = imgui.get_state_storage(), int(imgui.get_id("name/focused"))
-    if not storage.get_bool(slot):
-        imgui.set_keyboard_focus_here()
-        storage.set_bool(slot, True)
-    imgui.set_next_item_width(room)
-    flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
-    entered, text = imgui.input_text("##name", layer.name, flags)
-    if not (entered or imgui.is_item_deactivated()):
-        return None
-    storage.set_bool(slot, False)
-    return text if entered or imgui.is_item_deactivated_after_edit() else ""
-
-
 def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
-    """Count, overlap and instruction; at the right alone, lock and the fold."""
+    """Count, overlap and instruction; at the right alone, lock, the fold and the menu."""
     state = card.state
     layer, wide = state.layers[index], TOGGLE_PX * ui.scale
     right, left = right_edge(), imgui.get_cursor_pos_x()
@@ -307,23 +340,27 @@ def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
         note += f"  ·  overlaps {len(overlaps)} layers"
     elif row.instruction:
         note += f"  ·  {row.instruction}"
-    small(note, PALETTE.dim, right - left - 3 * wide - 6.0 * ui.scale)
+    small(note, PALETTE.dim, right - left - 4 * wide - 6.0 * ui.scale)
     asked = bool(overlaps) and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
     shared = [f"{grouped(count)} of its splats are also in {name}" for name, count in overlaps]
     shared += ["The picture shows them in pink"] if overlaps else []
     tip("\n".join((f"{grouped(row.count)} splats", *filter(None, [row.instruction]), *shared)))
-    imgui.same_line(right - 3 * wide)
+    imgui.same_line(right - 4 * wide)
     if small_toggle("solo", "S", layer.solo, wide, ui):
         state = stack.soloed(state, index)
     tip("Show this edit alone, and others that are alone (Shift+H)")
-    imgui.same_line(right - 2 * wide)
+    imgui.same_line(right - 3 * wide)
     if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
         state = stack.changed(state, index, lambda old: replace(old, locked=not old.locked))
     tip("Lock strength, gains and paint (L)")
-    imgui.same_line(right - wide)
+    imgui.same_line(right - 2 * wide)
     if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
         state = stack.folded(state, index)
     tip("Gains, and the curve of visible change (G)")
+    imgui.same_line(right - wide)
+    if small_toggle("menu", Icon.MENU, False, wide, ui):
+        imgui.open_popup(_MENU)
+    tip("Rename, duplicate, replace or delete this edit (right click)")
     return replace(card, state=state, overlap=asked)
 
 

@@ -36,7 +36,7 @@ def draw(layer: LayerState, row: LayerRow, dial: str | None, most: float, ui: Ui
 
 
 def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContext) -> LayerState:
-    """One gain: a slider as the others of the panel; a right click brings it back to 1."""
+    """One gain: a slider as the others of the panel."""
     if dialled:
         imgui.push_style_color(imgui.Col_.text_disabled, imgui.ImVec4(*PALETTE.accent))
     label(kind.capitalize(), 84.0 * ui.scale)
@@ -44,13 +44,10 @@ def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContex
         imgui.pop_style_color()
     imgui.begin_disabled(not moves)
     value = stack.dial_value(layer, kind)
-    new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", ui)
-    held = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button calls its drag off
-    if imgui.is_item_clicked(imgui.MouseButton_.right.value) and not held:
-        new = 1.0
+    new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
     imgui.end_disabled()
     if moves:
-        tip(f"How much of the change of {kind} comes through; right click: all of it (Tab, then arrows)")
+        tip(f"How much of the change of {kind} comes through (Tab, then arrows). Double click: all of it")
     else:
         tip(f"This edit does not change the {kind}")
     return layer if new == value else stack.dialled(layer, kind, new)

@@ -54,14 +54,14 @@ class Browser:
         """The question while the desktop's dialog is shown, or with the reason why there is none.
 
         Args:
-            dialog: of the kind "open" or "save"
+            dialog: one that asks for a path
             near: a file beside which to begin where none is typed
         """
         if missing := obstacle():
             return replace(dialog, notice=missing)
         self.close()
         path = Path(dialog.text or near).expanduser().absolute()
-        if dialog.kind == "open":
+        if dialog.kind != "save":
             folder = path if path.is_dir() else path.parent
             self._shown = dialogs.open_file("Open", f"{folder}/", _OPEN)
         else:

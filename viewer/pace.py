@@ -5,28 +5,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
-LINGER_S = 0.65  # one more frame after this, for tooltips
+LINGER_S = 0.65
+"""Seconds after which a resting mouse gets its tooltip: a little more than imgui's own two delays."""
 
 
 class Pace:
-    """Counts frames since the last event."""
+    """Counts frames, and seconds of rest, since the last event."""
 
     def __init__(self) -> None:
         self._unsettled = SETTLE_FRAMES
-        self._lingers = True
+        self._rest_left: float | None = LINGER_S  # None: the tooltip has had its frames
 
     def wake(self) -> None:
         """Something happened."""
-        self._unsettled, self._lingers = SETTLE_FRAMES, True
+        self._unsettled, self._rest_left = SETTLE_FRAMES, LINGER_S
 
     def rest(self) -> None:
         """Nothing can be drawn, as the window is minimised."""
-        self._unsettled, self._lingers = 0, False
+        self._unsettled, self._rest_left = 0, None
 
-    def step(self) -> None:
-        """A frame begins."""
-        self._lingers = self._lingers and self._unsettled > 0
-        self._unsettled = max(self._unsettled - 1, 0)
+    def step(self, seconds: float) -> None:
+        """A frame begins, so long after the last one."""
+        if self._unsettled > 0:
+            self._unsettled -= 1
+        elif self._rest_left is not None:
+            self._rest_left -= seconds
+            if self._rest_left <= 0.0:
+                # imgui counts the delay up in this frame and opens the tooltip in the next one
+                self._unsettled, self._rest_left = 1, None
 
     def patience(self, others: Sequence[float]) -> float | None:
         """Seconds until the next frame is due without an event, or None: none is.
@@ -36,4 +42,5 @@ class Pace:
         """
         if self._unsettled > 0:
             return 0.0
-        return min([*others, LINGER_S] if self._lingers else others, default=None)
+        waits = [*others] if self._rest_left is None else [*others, self._rest_left]
+        return min(waits, default=None)

@@ -10,9 +10,20 @@ from imgui_bundle import imgui
 from . import brush, compare, layer_cards, snapshot_cards, turntable
 from .layer_rows import LayerRow
 from .snapshot_cards import SnapshotCard
-from .state import Comparison, Vec3, ViewState
+from .state import Comparison, Vec3, ViewCamera, ViewState
 from .ui_context import PALETTE, Icon, UiContext
-from .widgets import choice, elided, grouped, icon_button, label, right_edge, section, small, tip
+from .widgets import (
+    choice,
+    double_clicked,
+    elided,
+    grouped,
+    icon_button,
+    label,
+    right_edge,
+    section,
+    small,
+    tip,
+)
 
 WIDTH_PX = 300.0  # at 1×
 
@@ -29,7 +40,7 @@ class PanelInput:
     """What the panel shows besides the state.
 
     Args:
-        title: the scene's name
+        title: the scene's name, after a dot where there are unsaved changes
         count: Gaussians in the scene
         rows: one per .gdf, indexed by `LayerState.gdf`
         focus: the focused layer, an index into `state.layers`, or None
@@ -98,6 +109,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
     drawn = layer_cards.draw(state, cards, ui)
     state, focus = drawn.state, drawn.focus
+    actions += drawn.actions
     if state.brush.active:
         state, asked = brush.section(state, focus, ui)
         actions += [asked] if asked else []
@@ -164,8 +176,10 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     label("Lens", column)
     imgui.set_next_item_width(-1.0)
     changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
+    if double_clicked():
+        changed, fov_y = True, ViewCamera.fov_y
     camera = replace(camera, fov_y=fov_y) if changed else camera  # unchanged, imgui still rounds to float32
-    tip("Vertical field of view")
+    tip(f"Vertical field of view. Double click: back to {ViewCamera.fov_y:g}°")
     label("Background", column)
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
@@ -205,8 +219,10 @@ def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext
         changed, times = imgui.slider_float(
             "##amplify", shown.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
         )
+        if double_clicked():
+            changed, times = True, Comparison.amplify
         shown = replace(shown, amplify=float(round(times))) if changed else shown
-        tip("What the difference is multiplied by")
+        tip(f"What the difference is multiplied by. Double click: back to × {Comparison.amplify:g}")
     return shown
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,7 +81,10 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
     """
     visible, best, chosen = shown(view), (False, 0.0), None
     for i, layer in enumerate(view.layers):
-        own = np.isin(seen.rows, gdfs[layer.gdf].region.members.numpy(), assume_unique=True)
+        members = gdfs[layer.gdf].region.members.numpy()  # sorted
+        if not len(members):
+            continue
+        own = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
         share = float(seen.shares[own].sum())
         if share >= LEAST_SHARE and (layer in visible, share) >= best:
             best, chosen = (layer in visible, share), i
@@ -91,15 +95,18 @@ def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 
     """The Gaussians that one sees at a pixel position, None on the background; as `surface_point`."""
     rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
     fx, fy, cx, cy = _lens(camera)
-    means = scene.means.numpy()
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        local = means @ rotation.T + translation
-        depth = local[:, 2]
-        dx, dy = local[:, 0] / depth * fx + cx - x, local[:, 1] / depth * fy + cy - y
-        widest = scene.log_scales.amax(1).exp().numpy()
-        reach = 3.5 * (widest * max(fx, fy) / depth * np.hypot(1.0, np.hypot(dx / fx, dy / fy)) + 1.0)
+        # by columns: a row at a time takes many times as long
+        across, down, depth = rotation @ scene.means.numpy().T + translation[:, None]
+        dx, dy = across / depth, down / depth
+        dx += np.float32((cx - x) / fx)
+        dy += np.float32((cy - y) / fy)
+        off = dx * dx + dy * dy
+        widest = np.exp(functools.reduce(np.maximum, scene.log_scales.numpy().T))
+        # √(1 + off) ≤ 1 + off / 2: what is taken too many here, `_alphas` leaves out
+        reach = widest / depth * (max(fx, fy) / min(fx, fy) * (1.0 + 0.5 * off)) + np.float32(1 / min(fx, fy))
         sized = np.isfinite(widest) & np.isfinite(scene.logit_opacities.numpy())
-        near_ray = np.flatnonzero(sized & (depth > near) & (dx * dx + dy * dy < reach * reach))
+        near_ray = np.flatnonzero(sized & (depth > near) & (off < 3.5**2 * reach * reach))
     if not len(near_ray):
         return None
     rows, alphas = _alphas(scene, near_ray, camera, x, y, near)

@@ -11,6 +11,9 @@ from dataclasses import dataclass, replace
 from . import timeline as tl
 from .state import Timeline, ViewState
 
+LEAST_KEYS = 2
+"""What fewer keys mention does not move, and the playhead leaves it to the hand."""
+
 
 @dataclass(frozen=True)
 class Player:
@@ -57,7 +60,9 @@ def perform(view: ViewState, player: Player, action: str) -> tuple[ViewState, Pl
     timeline, after = ACTIONS[name](view, player, argument)
     after = replace(after, frame=max(0, min(after.frame, timeline.length)))
     view = replace(view, timeline=timeline)
-    return (view if after.frame == player.frame else tl.shown_at(timeline, after.frame, view)), after
+    if after.frame != player.frame:
+        view = tl.shown_at(timeline, after.frame, view, LEAST_KEYS)
+    return view, after
 
 
 def _stepped(timeline: Timeline, frame: int, backwards: bool, steps: int) -> tuple[int, bool]:

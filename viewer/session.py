@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,8 @@ from .history import Edit
 from .plain import NotPlainError
 from .snapshots import Snapshot
 from .stack import OVERSHOOT
-from .state import ViewCamera, ViewState
+from .state import LayerState, ViewCamera, ViewState
 from .turntable import FARTHEST
-
-AUTOSAVE = ".autosave"
 
 
 @dataclass(frozen=True)
@@ -40,15 +38,15 @@ def save(path: Path, session: Session) -> None:
     Raises:
         ProgdfError: the scene or an edit has no file, a file cannot be read, or the folder does not exist.
     """
-    opened = session.document
-    if opened.path is None or len(opened.gdf_paths) != len(opened.gdfs):
-        raise ProgdfError(f"{opened.title} was not opened from files; save the scene first")
+    if session.document.path is None or len(session.document.gdf_paths) != len(session.document.gdfs):
+        raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
+    scene, session = session.document.path, pruned(session)
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; make it first")
     folder = path.parent
     state = SessionFile(
-        reference(opened.path, folder),
-        tuple(reference(gdf, folder) for gdf in opened.gdf_paths),
+        reference(scene, folder),
+        tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
         plain.plain(session.view),
         tuple(plain.plain(snapshot) for snapshot in session.snapshots),
     )
@@ -72,16 +70,42 @@ def open_session(path: Path) -> Session:
 
 
 def default_path(opened: Document) -> Path:
-    """Where a session of it is saved if nobody says otherwise: beside the scene."""
+    """What a session of it is called if nobody says otherwise: as the scene, and beside it."""
     scene = opened.path or Path(opened.title)
     return scene.with_name(scene.stem + SUFFIX)
 
 
-def autosave_path(session: Path | None, opened: Document) -> Path:
-    """Where unsaved work is kept: beside the session, or beside where it would be."""
-    path = session or default_path(opened)
-    name = path.name.removesuffix(SUFFIX) if path.name.endswith(SUFFIX) else path.stem
-    return path.with_name(f"{name}{AUTOSAVE}{SUFFIX}")
+def pruned(session: Session) -> Session:
+    """Without the edits that no layer shows any more, in the view or in a snapshot."""
+    view, snapshots = session.view, session.snapshots
+    stacks = (view.layers, *(kept.edit.layers for kept in snapshots))
+    used = sorted({layer.gdf for layers in stacks for layer in layers})
+    places = {gdf: i for i, gdf in enumerate(used)}
+
+    def moved(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
+        return tuple(replace(layer, gdf=places[layer.gdf]) for layer in layers)
+
+    opened = session.document
+    if len(used) == len(opened.gdfs):
+        return session
+    keys = tuple(
+        replace(key, strengths=tuple((places[gdf], s) for gdf, s in key.strengths if gdf in places))
+        for key in view.timeline.keys
+    )
+    return Session(
+        replace(
+            opened,
+            gdfs=tuple(opened.gdfs[gdf] for gdf in used),
+            gdf_paths=tuple(opened.gdf_paths[gdf] for gdf in used),
+        ),
+        replace(
+            view,
+            layers=moved(view.layers),
+            timeline=replace(view.timeline, keys=keys),
+            unfolded=tuple(places[gdf] for gdf in view.unfolded if gdf in places),
+        ),
+        tuple(replace(kept, edit=replace(kept.edit, layers=moved(kept.edit.layers))) for kept in snapshots),
+    )
 
 
 def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ...]]:

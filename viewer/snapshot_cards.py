@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from imgui_bundle import imgui
 
 from .ui_context import PALETTE, SMALL_PX, UiContext, u32
-from .widgets import elided, right_edge, section, tip
+from .widgets import elided, menu, right_edge, section, tip, typed_name
 
 COLUMNS = 3
+_MENU = "menu of a snapshot"
+_ITEMS = ("Rename…", "Delete")
 
 
 @dataclass(frozen=True)
@@ -40,14 +42,20 @@ def draw(cards: tuple[SnapshotCard, ...], ui: UiContext, actions: list[str]) -> 
 
 
 def _card(index: int, card: SnapshotCard, wide: float, ui: UiContext, actions: list[str]) -> None:
+    imgui.push_id(index)
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
     tall = 0.75 * wide
     if imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall)):
         actions.append(f"restore:{index}")
     hovered = imgui.is_item_hovered()
-    tip("Back to this; right click forgets it" if index else "Back to the original, all sliders at 0")
+    tip("Back to this (right click: rename, delete)" if index else "Back to the original, all sliders at 0")
     if index and imgui.is_item_clicked(imgui.MouseButton_.right.value):
+        imgui.open_popup(_MENU)
+    item, renaming = _menu(ui), imgui.get_id("renaming")
+    if item == "Rename…":
+        imgui.get_state_storage().set_bool(renaming, True)
+    elif item == "Delete":
         actions.append(f"forget:{index}")
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
     if card.texture:
@@ -60,6 +68,19 @@ def _card(index: int, card: SnapshotCard, wide: float, ui: UiContext, actions: l
     if hovered:
         canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
     imgui.push_font(None, SMALL_PX)
-    imgui.text_disabled(elided(card.name, wide))
+    if imgui.get_state_storage().get_bool(renaming):
+        name = typed_name(card.name, wide)
+        imgui.get_state_storage().set_bool(renaming, name is None)
+        actions += [f"name_snapshot:{index}:{name}"] if name else []
+    else:
+        imgui.text_disabled(elided(card.name, wide))
     imgui.pop_font()
     imgui.end_group()
+    imgui.pop_id()
+
+
+def _menu(ui: UiContext) -> str:
+    """The item that was chosen, "" for none."""
+    with menu(_MENU, ui) as is_open:
+        chosen = [name for name in _ITEMS if is_open and imgui.menu_item(name, "", False)[0]]
+    return chosen[0] if chosen else ""

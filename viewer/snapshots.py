@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from . import history
 from .history import Edit
+from .stack import LONGEST_NAME
 from .state import Timeline, ViewCamera, ViewState
 
 MOST = 200
@@ -37,6 +38,14 @@ def taken(snapshots: Sequence[Snapshot], view: ViewState) -> tuple[Snapshot, ...
 def without(snapshots: Sequence[Snapshot], index: int) -> tuple[Snapshot, ...]:
     """All but one."""
     return (*snapshots[:index], *snapshots[index + 1 :])
+
+
+def renamed(snapshots: Sequence[Snapshot], index: int, name: str) -> tuple[Snapshot, ...]:
+    """One under another name, on one line; no name changes nothing."""
+    name = " ".join(name.split())[:LONGEST_NAME]
+    kept = list(snapshots)
+    kept[index] = replace(kept[index], name=name or kept[index].name)
+    return tuple(kept)
 
 
 def shown(snapshots: Sequence[Snapshot], view: ViewState) -> tuple[Snapshot, ...]:

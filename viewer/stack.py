@@ -1,4 +1,7 @@
-"""The stack of layers as pure functions: which of them show, their order, names, and what a lock keeps."""
+"""The stack of layers as pure functions: which of them show, their order, names, and what a lock keeps.
+
+`ViewState.layers` begins with the lowest layer; the panel shows the last one, which lies on top, at the top.
+"""
 
 from __future__ import annotations
 
@@ -75,13 +78,55 @@ def moved(view: ViewState, index: int, to: int) -> ViewState:
 def renamed(view: ViewState, index: int, text: str) -> ViewState:
     """The layer under another name, on one line; a name that is taken gets a number; none changes nothing."""
     name = " ".join(text.split())[:LONGEST_NAME]
-    taken = {layer.name for i, layer in enumerate(view.layers) if i != index}
     if not name:
         return view
-    free, number = name, 2
+    free = free_name(replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :])), name)
+    return changed(view, index, lambda layer: replace(layer, name=free))
+
+
+def free_name(view: ViewState, name: str) -> str:
+    """A name for one more layer, with a number where a layer has it."""
+    taken, free, number = {layer.name for layer in view.layers}, name, 2
     while free in taken:
         free, number = f"{name}-{number}", number + 1
-    return changed(view, index, lambda layer: replace(layer, name=free))
+    return free
+
+
+def added(view: ViewState, gdf: int, name: str) -> ViewState:
+    """An edit of its own on top of the others, at full strength, so that one sees what came."""
+    layer = LayerState(gdf, free_name(view, name), strength=1.0)
+    return replace(view, layers=(*view.layers, layer))
+
+
+def removed(view: ViewState, index: int) -> ViewState:
+    """Without one layer; as it was where there is no such layer."""
+    if not 0 <= index < len(view.layers):
+        return view
+    return replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :]))
+
+
+def duplicated(view: ViewState, index: int, gdf: int) -> ViewState:
+    """A copy of one layer just above it, which shows `gdf`: the same edit under an index of its own."""
+    layer = view.layers[index]
+    copy = replace(layer, gdf=gdf, name=free_name(view, layer.name))
+    return replace(view, layers=(*view.layers[: index + 1], copy, *view.layers[index + 1 :]))
+
+
+def replaced(view: ViewState, index: int, gdf: int, name: str) -> ViewState:
+    """One layer with another edit, on the timeline too: place, strength and gains stay, its paint goes."""
+    old = view.layers[index].gdf
+    keys = tuple(
+        replace(key, strengths=tuple((gdf if g == old else g, s) for g, s in key.strengths))
+        for key in view.timeline.keys
+    )
+    view = replace(view, timeline=replace(view.timeline, keys=keys))
+    view = changed(view, index, lambda layer: replace(layer, gdf=gdf, paint=""))
+    return renamed(view, index, name)
+
+
+def index_of(view: ViewState, row: int) -> int:
+    """The layer in a row of the panel, counted from 0 at the top: the top one is the last of `layers`."""
+    return len(view.layers) - 1 - row
 
 
 def soloed(view: ViewState, index: int) -> ViewState:

@@ -5,6 +5,7 @@ The window (app.py) and the tests feed imgui's io and call `frame`: a scripted m
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from dataclasses import replace
@@ -21,7 +22,7 @@ from .compare_labels import labelled
 from .engine import Engine, FrameTimings, drawn_size
 from .gl.screen import read_rgb
 from .hand import Hand, Sight
-from .inputs import NO_KEYS, Keys
+from .inputs import NO_KEYS, Keys, Press
 from .pace import Pace
 from .snapshots import Snapshot
 from .state import ViewState
@@ -29,6 +30,8 @@ from .ui_context import UiContext
 from .workspace import Dialog, SceneFacts
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
+OPENING_FRAMES = 4
+"""From the wish for a text field until imgui gives it the keyboard."""
 
 
 class Stage:
@@ -64,8 +67,16 @@ class Stage:
         self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
+        self._waiting: tuple[Press, ...] = ()  # keys that imgui has not come to yet
+        self._asked_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
+        self._resting = False
         self._pace = Pace()
-        self.wake, self.rest = self._pace.wake, self._pace.rest
+        self.wake = self._pace.wake
+
+    def rest(self) -> None:
+        """Nothing can be drawn until the next frame, as the window is minimised."""
+        self._pace.rest()
+        self._resting = True
 
     def close(self) -> None:
         """Free what the stage made; the engine and the context are the caller's."""
@@ -94,6 +105,8 @@ class Stage:
     def patience(self) -> float | None:
         """Seconds the window may wait for an event before the next `frame`; None: for ever."""
         self.ui.make_current()
+        if not self._resting and (inputs.waiting() or self.opening):
+            return 0.0
         waits = [FLIGHT_S] if inputs.flying(self._keys) else []
         if imgui.get_io().want_text_input:
             waits.append(BLINK_S)
@@ -141,12 +154,13 @@ class Stage:
         self.ui.make_current()
         imgui.get_io().delta_time = max(seconds, 1e-5)
         self._clock += max(seconds, 0.0)
-        self._pace.step()
+        self._pace.step(seconds)
+        self._resting = False
         self.work = workspace.played(self.work, seconds)
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
-        self._keys = keys
+        self._keys = self._heard(keys)
         self._handle_input(seconds)
         if not imgui.is_any_item_active() and self._hand.drag is None and not inputs.repeating(keys):
             self.work = workspace.settled(self.work)
@@ -165,6 +179,22 @@ class Stage:
             self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
         self._save_files(screen, size)
 
+    def _heard(self, keys: Keys) -> Keys:
+        """The keys that imgui has come to by now; while a text field opens they wait for it."""
+        pressed = (*self._waiting, *keys.pressed)
+        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(inputs.heard, pressed))
+        opener = next((i for i, press in enumerate(pressed[:count]) if inputs.opens_text(press)), None)
+        if opener is not None:
+            count, self._asked_at = opener + 1, self.frames + 1
+        self._waiting = pressed[count:]
+        return replace(keys, pressed=pressed[:count])
+
+    @property
+    def opening(self) -> bool:
+        """Whether a text field was asked for and has no keyboard yet: what is typed now would be lost."""
+        lately = self.frames - self._asked_at < OPENING_FRAMES and not self._resting
+        return lately and not imgui.get_io().want_text_input
+
     def _area(self) -> overlay.Area:
         """The part of the window that shows the picture."""
         display = imgui.get_io().display_size
@@ -175,8 +205,9 @@ class Stage:
         off = inputs.calls_off(self._keys, self._hand.drag)
         if off:
             self._call_off()
+        asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
         for action in inputs.actions_pressed(self._keys):
-            if self.work.dialog is None or action in ("picture", "window_picture"):
+            if not asks or action in ("picture", "window_picture"):
                 self._perform(action)
         if inputs.flying(self._keys):
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)

@@ -1,7 +1,8 @@
 """The strength slider: 0 is the original, 1 the full edit; ticks where the trajectory was recorded.
 
 Press on the track jumps there, press on the handle grabs it, Shift drags ten times finer, Ctrl+click (or a
-click on the number) types a value. Where overshoot is on it goes beyond 1, on a ground that warns.
+click on the number) types a value, a double click goes back to 0. Where overshoot is on it goes beyond 1,
+on a ground that warns.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from .ui_context import PALETTE, Rgba, u32
-from .widgets import let_go
+from .widgets import let_go, tip
 
 HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one types
 FINE = 0.1
+DEFAULT = 0.0
+"""The original; where a double click goes."""
+TIP = "Double click: back to 0, the original. Ctrl+click: type a value. Shift: drag ten times finer."
 
 
 def parse_strength(text: str, most: float = 1.0) -> float | None:
@@ -63,9 +67,11 @@ def draw(
     if imgui.is_item_activated():
         if imgui.get_io().key_ctrl:
             start_typing(label)
-            return value
+            imgui.set_cursor_screen_pos(imgui.ImVec2(left, top))
+            return _typed(label, value, width, most)  # at once: what is typed next is not lost
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
+        value = DEFAULT if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
         _anchor(label, mouse, value)
     elif held or let_go():  # a slow frame may hold the last move and the release
         was_fine = storage.get_bool(_slot(label, "fine"))
@@ -73,6 +79,8 @@ def draw(
         value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
         if was_fine != imgui.get_io().key_shift:
             _anchor(label, mouse, value)  # after the move: a slow frame holds both
+    if not held:
+        tip(TIP)
     colour = fill if active else PALETTE.faint
     _paint(start, top, span, radius, value, ticks, scale, colour, hovered or held, most)
     return value

@@ -82,12 +82,12 @@ def film_frames(timeline: Timeline) -> Iterator[int]:
         yield from range(timeline.length - 1, 0, -1)
 
 
-def shown_at(timeline: Timeline, frame: float, view: ViewState) -> ViewState:
-    """`view` with the camera and the strengths of a frame; what no key mentions stays as it is.
+def shown_at(timeline: Timeline, frame: float, view: ViewState, least: int = 1) -> ViewState:
+    """`view` with the camera and strengths of a frame; what fewer than `least` keys mention stays as it is.
 
     Before the first key and after the last everything rests.
     """
-    camera, strengths = camera_at(timeline, frame), strengths_at(timeline, frame)
+    camera, strengths = camera_at(timeline, frame, least), strengths_at(timeline, frame, least)
     layers = tuple(
         replace(layer, strength=strengths[layer.gdf])
         if strengths.get(layer.gdf, layer.strength) != layer.strength
@@ -98,19 +98,19 @@ def shown_at(timeline: Timeline, frame: float, view: ViewState) -> ViewState:
     return replace(view, layers=layers, camera=camera)
 
 
-def camera_at(timeline: Timeline, frame: float) -> ViewCamera | None:
-    """The camera of a frame, or None where no key has one."""
+def camera_at(timeline: Timeline, frame: float, least: int = 1) -> ViewCamera | None:
+    """The camera of a frame, or None where fewer than `least` keys have one."""
     keys = [(key.frame, key.easing, key.camera) for key in timeline.keys if key.camera is not None]
-    return tween.camera(keys, frame) if keys else None
+    return tween.camera(keys, frame) if len(keys) >= least else None
 
 
-def strengths_at(timeline: Timeline, frame: float) -> dict[int, float]:
-    """The strength of each edit that any key mentions, by `LayerState.gdf`."""
+def strengths_at(timeline: Timeline, frame: float, least: int = 1) -> dict[int, float]:
+    """The strength of each edit that at least `least` keys mention, by `LayerState.gdf`."""
     tracks: dict[int, list[tween.Point]] = {}
     for key in timeline.keys:
         for gdf, strength in key.strengths:
             tracks.setdefault(gdf, []).append((key.frame, key.easing, strength))
-    return {gdf: tween.value(points, frame) for gdf, points in tracks.items()}
+    return {gdf: tween.value(points, frame) for gdf, points in tracks.items() if len(points) >= least}
 
 
 def _with(timeline: Timeline, key: Keyframe) -> Timeline:

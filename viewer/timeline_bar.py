@@ -17,16 +17,24 @@ from .state import Timeline
 from .ui_context import PALETTE, SMALL_PX, UiContext, u32
 from .widgets import icon_button, let_go, tip
 
-HEIGHT_PX = 46.0  # at 1×
-ROOMY_PX = 520.0  # narrower, only what moves the playhead is shown
+HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
+ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
 _SETTINGS_PX = 262.0
 _KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
-def height(player: Player, ui: UiContext) -> float:
+def height(player: Player, area: Area, ui: UiContext) -> float:
     """How much of the picture it covers, window pixels."""
-    return HEIGHT_PX * ui.scale if player.shown else 0.0
+    return _tall(area, ui) if player.shown else 0.0
+
+
+def _roomy(area: Area, ui: UiContext) -> bool:
+    return area.width >= ROOMY_PX * ui.scale
+
+
+def _tall(area: Area, ui: UiContext) -> float:
+    return (HEIGHT_PX if _roomy(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
 
 
 def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple[str, ...]:
@@ -35,7 +43,7 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
     Returns:
         What was asked for: actions of the workspace.
     """
-    tall = HEIGHT_PX * ui.scale
+    tall, roomy = _tall(area, ui), _roomy(area, ui)
     imgui.set_next_window_pos(imgui.ImVec2(0.0, area.height - tall))
     imgui.set_next_window_size(imgui.ImVec2(area.width, tall))
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
@@ -44,12 +52,12 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
     actions: list[str] = []
     frame = min(player.frame, timeline.length)
     _buttons(timeline, player, frame, actions, ui)
-    roomy = area.width >= ROOMY_PX * ui.scale
     settings = _SETTINGS_PX * ui.scale if roomy else 0.0
     wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
     _ruler(timeline, frame, wide, actions, ui)
     if roomy:
-        _settings(timeline, frame, actions, ui)
+        imgui.same_line(0.0, 12.0 * ui.scale)
+    _settings(timeline, frame, actions, ui)
     imgui.end()
     imgui.pop_style_var()
     imgui.pop_style_color()
@@ -91,7 +99,6 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
 
 def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext) -> None:
     gap = 4.0 * ui.scale
-    imgui.same_line(0.0, 12.0 * ui.scale)
     imgui.begin_disabled(not timeline.keys)
     easing = tl.before(timeline, frame).easing if timeline.keys else tl.EASINGS[0]
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):

@@ -60,6 +60,7 @@ class Icon:
     LOCKED = icons.ICON_FA_LOCK
     UNLOCKED = icons.ICON_FA_LOCK_OPEN
     GAINS = icons.ICON_FA_SLIDERS
+    MENU = icons.ICON_FA_ELLIPSIS_VERTICAL
     BRUSH = icons.ICON_FA_PAINTBRUSH
 
 

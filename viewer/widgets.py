@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from imgui_bundle import imgui
 
@@ -58,6 +59,36 @@ def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
     return bool(pressed)
 
 
+def typed_name(name: str, room: float) -> str | None:
+    """The text field of a name; None while it is open, "" where it was left as it was."""
+    storage, slot = imgui.get_state_storage(), int(imgui.get_id("name/focused"))
+    if not storage.get_bool(slot):
+        imgui.set_keyboard_focus_here()
+        storage.set_bool(slot, True)
+    imgui.set_next_item_width(room)
+    flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
+    entered, text = imgui.input_text("##name", name, flags)
+    if not (entered or imgui.is_item_deactivated()):
+        return None
+    storage.set_bool(slot, False)
+    return text if entered or imgui.is_item_deactivated_after_edit() else ""
+
+
+@contextmanager
+def menu(name: str, ui: UiContext) -> Iterator[bool]:
+    """A context menu that `imgui.open_popup(name)` opens; whether it is open. Escape closes it."""
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(8.0 * ui.scale, 8.0 * ui.scale))
+    is_open = imgui.begin_popup(name)
+    imgui.pop_style_var()
+    try:
+        yield bool(is_open)
+    finally:
+        if is_open:
+            if imgui.is_key_pressed(imgui.Key.escape):
+                imgui.close_current_popup()
+            imgui.end_popup()
+
+
 def let_go() -> bool:
     """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
     return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
@@ -79,10 +110,25 @@ def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -
     return pressed
 
 
-def value_slider(name: str, value: float, ends: tuple[float, float], form: str, ui: UiContext) -> float:
-    """A slider to the end of the line, its number beside it where no handle hides it; Ctrl+click types.
+def double_clicked() -> bool:
+    """Whether the last item, a slider, was double-clicked, which takes it back to its default.
 
-    A range over orders of magnitude is logarithmic. The value is as before, or what the number shows.
+    It lets go of the slider, which would follow the mouse again in the next frame.
+    """
+    left = imgui.MouseButton_.left.value
+    if not (imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left)):
+        return False
+    imgui.internal.clear_active_id()
+    return True
+
+
+def value_slider(
+    name: str, value: float, ends: tuple[float, float], form: str, default: float, ui: UiContext
+) -> float:
+    """A slider to the end of the line, its number beside it where no handle hides it.
+
+    Ctrl+click types, a double click goes back to `default`. A range over orders of magnitude is logarithmic.
+    The value is as before, or what the number shows.
     """
     room = 44.0 * ui.scale
     imgui.set_next_item_width(imgui.get_content_region_avail().x - room)
@@ -93,6 +139,8 @@ def value_slider(name: str, value: float, ends: tuple[float, float], form: str, 
     imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.text[:3], alpha))
     changed, new = imgui.slider_float(name, value, *ends, form, flags)
     imgui.pop_style_color()
+    if double_clicked():
+        changed, new = True, default
     low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
     number = form % (new if changed else value)
     wide = imgui.calc_text_size(number).x
@@ -113,16 +161,19 @@ def choice(
     for i, option in enumerate(options):
         if i:
             imgui.same_line(0.0, gap)
-        colour = PALETTE.accent_dark if i == current else PALETTE.field
-        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*colour))
+        for slot in _BUTTON_COLOURS if i == current else ():
+            imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.accent_dark))
         imgui.begin_disabled(usable is not None and i >= usable)
         if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
             pressed = i
         imgui.end_disabled()
-        imgui.pop_style_color()
+        imgui.pop_style_color(len(_BUTTON_COLOURS) if i == current else 0)
     imgui.pop_style_var()
     imgui.end_group()
     return pressed
+
+
+_BUTTON_COLOURS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
 
 
 def grouped(count: int) -> str:

@@ -21,7 +21,7 @@ import moderngl
 from progdf.errors import ProgdfError
 
 from . import controls
-from .inputs import Keys, Press
+from .inputs import Keys, Press, next_event_id
 
 LEAST = (640, 400)
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
@@ -175,7 +175,8 @@ class Window:
             return
         name = key_name(key, scancode)
         self._down[key] = name
-        self._pressed.append(Press(chord(name, mods), action == glfw.REPEAT))
+        # imgui adds its own event after this one
+        self._pressed.append(Press(chord(name, mods), action == glfw.REPEAT, next_event_id()))
 
     def present(self) -> None:
         glfw.swap_buffers(self.handle)

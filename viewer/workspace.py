@@ -24,6 +24,8 @@ from .state import Comparison, ViewCamera, ViewState
 from .turntable import FARTHEST, Bounds, Fit, unmoved
 
 MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
+UNSAVED = "• "
+"""Before the scene's name where there are unsaved changes."""
 FEATHER = 0.1
 """How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
 
@@ -39,6 +41,7 @@ class SceneFacts:
         rows: one per .gdf, indexed by `LayerState.gdf`
         recordings: where each .gdf was recorded, in the same order
         fit: gives the camera that `frame` takes with no layer focused
+        home: gives the first camera for another up axis, which is the given camera's
     """
 
     title: str
@@ -47,6 +50,7 @@ class SceneFacts:
     rows: Sequence[LayerRow]
     recordings: Sequence[Recording] = ()
     fit: Fit = unmoved
+    home: Fit = unmoved
 
 
 @dataclass(frozen=True)
@@ -63,9 +67,9 @@ class Dialog:
     """A question that is being asked.
 
     Args:
-        kind: "save", "open" or "leave"
-        text: what stands in the path field; for "leave" the session's file
-        then: the request that was put off for this, "" for none
+        kind: of `dialogs.TITLES`
+        text: what stands in the path field; where there is none, the file that the question is about
+        then: the request that was put off for this, "" for none; for "replace" the layer's index
         notice: a line about the desktop's own dialog, "" for none
         choosing: that dialog is on screen
         chosen: the file that was chosen in it
@@ -119,8 +123,8 @@ class Workspace:
 
 
 def opened(view: ViewState, kept: tuple[Snapshot, ...] = ()) -> Workspace:
-    """A workspace on a fresh state; the first layer is focused."""
-    past, focus = history.begin(view), 0 if view.layers else None
+    """A workspace on a fresh state; the top layer is focused."""
+    past, focus = history.begin(view, kept), len(view.layers) - 1 if view.layers else None
     return as_saved(Workspace(view, past, view.camera, focus, snapshots=kept))
 
 
@@ -153,24 +157,35 @@ def told(workspace: Workspace, text: str, now: float, error: bool = False) -> Wo
 
 def settled(workspace: Workspace) -> Workspace:
     """Call when no gesture is under way: what it changed becomes one undo entry."""
-    past = history.record(workspace.past, workspace.view)
+    past = history.record(workspace.past, workspace.view, workspace.snapshots)
     return workspace if past is workspace.past else replace(workspace, past=past)
 
 
 def called_off(workspace: Workspace) -> Workspace:
     """As it was before the gesture under way."""
-    return replace(workspace, view=history.restored(workspace.view, workspace.past.present))
+    return replace(workspace, view=history.restored(workspace.view, workspace.past.present.edit))
 
 
 def played(workspace: Workspace, seconds: float) -> Workspace:
     """After so much time; the film goes on where it is playing."""
     if not workspace.player.playing:
         return workspace
-    player = playback.advanced(workspace.player, workspace.view.timeline, seconds)
     view = workspace.view
-    view = timeline.shown_at(view.timeline, player.frame, view)
-    past = history.followed(workspace.past, workspace.view, view)
+    player = playback.advanced(workspace.player, view.timeline, seconds)
+    view = timeline.shown_at(view.timeline, player.frame, view, playback.LEAST_KEYS)
+    if _loses_strengths(workspace, view):
+        past = history.record(workspace.past, view, workspace.snapshots)
+    else:
+        past = history.followed(workspace.past, workspace.view, view)
     return replace(workspace, view=view, player=player, past=past)
+
+
+def _loses_strengths(workspace: Workspace, after: ViewState) -> bool:
+    """Whether a playhead that leaves its frame takes strengths away that nobody set a key for."""
+    before, frame = workspace.view, workspace.player.frame
+    if after.layers == before.layers or history.edit_of(before) != workspace.past.present.edit:
+        return False
+    return timeline.shown_at(before.timeline, frame, before, playback.LEAST_KEYS).layers != before.layers
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
@@ -188,7 +203,7 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     if name in REQUESTS:
         return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
-        return _framed(workspace, facts, aspect) if name == "frame" else _home(workspace)
+        return (_framed if name == "frame" else _home)(workspace, facts, aspect)
     if name in ("paint_clear", "paint_fill"):
         return _repainted(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
     if name == "paint_feather":
@@ -211,26 +226,36 @@ def _framed(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace
     return with_camera(workspace, fit(workspace.view.camera, aspect))
 
 
-def _home(workspace: Workspace) -> Workspace:
-    """The first view; the up axis and the mode chosen since then stay."""
+def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
+    """The first view; under another up axis than then, what would be the first view with that one."""
     camera = workspace.view.camera
-    return with_camera(workspace, replace(workspace.home, up=camera.up, mode=camera.mode))
+    home = replace(workspace.home, up=camera.up, mode=camera.mode)
+    if camera.up != workspace.home.up:
+        home = facts.home(home, aspect)
+    return with_camera(workspace, home)
+
+
+def focused(workspace: Workspace, index: int) -> Workspace:
+    """With another layer focused; as it was where there is no such layer."""
+    return replace(workspace, focus=index) if 0 <= index < len(workspace.view.layers) else workspace
 
 
 def _focus(workspace: Workspace, number: str) -> Workspace:
-    index = int(number) - 1
-    return replace(workspace, focus=index) if index < len(workspace.view.layers) else workspace
+    """By its number, counted from 1 at the top of the panel's list."""
+    return focused(workspace, stack.index_of(workspace.view, int(number) - 1))
+
+
+def _shown_or_hidden(view: ViewState, index: int) -> ViewState:
+    return stack.changed(view, index, lambda layer: replace(layer, enabled=not layer.enabled))
 
 
 def _toggle(workspace: Workspace, number: str) -> Workspace:
-    view = stack.changed(
-        workspace.view, int(number) - 1, lambda layer: replace(layer, enabled=not layer.enabled)
-    )
-    return replace(workspace, view=view)
+    index = stack.index_of(workspace.view, int(number) - 1)
+    return replace(workspace, view=_shown_or_hidden(workspace.view, index))
 
 
 def _hide(workspace: Workspace, _: str) -> Workspace:
-    return workspace if workspace.focus is None else _toggle(workspace, str(workspace.focus + 1))
+    return _on_focused(workspace, _shown_or_hidden)
 
 
 def _nudge(workspace: Workspace, by: str) -> Workspace:
@@ -251,11 +276,26 @@ def _dialled(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
 
 
 def _move(workspace: Workspace, by: str) -> Workspace:
-    """The focused layer up or down in the list; the focus goes with it."""
+    """The focused layer up (−1) or down in the panel's list; the focus goes with it."""
     if workspace.focus is None:
         return workspace
-    to = max(0, min(workspace.focus + int(by), len(workspace.view.layers) - 1))
+    to = max(0, min(workspace.focus - int(by), len(workspace.view.layers) - 1))
     return replace(workspace, view=stack.moved(workspace.view, workspace.focus, to), focus=to)
+
+
+def _remove(workspace: Workspace, index: str) -> Workspace:
+    """A layer, or the focused one, is taken out of the stack; the one below it is focused."""
+    at = int(index) if index else workspace.focus
+    if at is None or not 0 <= at < len(workspace.view.layers):
+        return workspace
+    view = stack.removed(workspace.view, at)
+    focus = max(at - 1, 0) if view.layers else None
+    return replace(workspace, view=view, focus=focus, renaming=None, overlap=None)
+
+
+def _rename(workspace: Workspace, index: str) -> Workspace:
+    """The name of a layer, or of the focused one, becomes a text field."""
+    return replace(workspace, renaming=int(index) if index else workspace.focus)
 
 
 def _lock(workspace: Workspace, _: str) -> Workspace:
@@ -304,13 +344,19 @@ def _on_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewSta
 
 
 def _undo(workspace: Workspace, _: str) -> Workspace:
-    past, view = history.undo(workspace.past, workspace.view)
-    return _with_layers_of(replace(workspace, past=past), view)
+    return _back(workspace, history.undo(workspace.past))
 
 
 def _redo(workspace: Workspace, _: str) -> Workspace:
-    past, view = history.redo(workspace.past, workspace.view)
-    return _with_layers_of(replace(workspace, past=past), view)
+    return _back(workspace, history.redo(workspace.past))
+
+
+def _back(workspace: Workspace, past: History) -> Workspace:
+    if past is workspace.past:
+        return workspace
+    kept = past.present
+    workspace = replace(workspace, past=past, snapshots=kept.snapshots, renaming=None)
+    return _with_layers_of(workspace, history.restored(workspace.view, kept.edit))
 
 
 def _with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
@@ -331,7 +377,11 @@ def _timed(name: str) -> Callable[[Workspace, str], Workspace]:
 
     def act(workspace: Workspace, argument: str) -> Workspace:
         view, player = playback.perform(workspace.view, workspace.player, f"{name}:{argument}")
-        past = history.followed(workspace.past, workspace.view, view)
+        past = workspace.past
+        if _loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
+            past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
+        elif past.present.edit.layers == workspace.view.layers:
+            past = history.followed(past, workspace.view, view)
         return replace(workspace, view=view, player=player, past=past)
 
     return act
@@ -349,6 +399,12 @@ def _forget(workspace: Workspace, index: str) -> Workspace:
     return replace(workspace, snapshots=snapshots.without(workspace.snapshots, int(index) - 1))
 
 
+def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
+    """`INDEX:NAME`"""
+    index, _, name = argument.partition(":")
+    return replace(workspace, snapshots=snapshots.renamed(workspace.snapshots, int(index) - 1, name))
+
+
 def _snapshot(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, snapshots=snapshots.taken(workspace.snapshots, workspace.view))
 
@@ -356,12 +412,14 @@ def _snapshot(workspace: Workspace, _: str) -> Workspace:
 REQUESTS = (
     *("picture", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
+    *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
 )
-"""What only the window can do: `save_to:PATH`, `open_file:PATH`; `save:THEN` asks for THEN afterwards;
-`browse` shows the desktop's own dialog beside the question that is open."""
+"""What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
+afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
+layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`."""
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
-    "unfocus": lambda workspace, _: replace(workspace, focus=None),
+    "unfocus": lambda w, _: replace(w, help=False) if w.help else replace(w, focus=None),
     "toggle": _toggle,
     "hide": _hide,
     "nudge": _nudge,
@@ -370,7 +428,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "show_all": lambda w, _: replace(w, view=stack.all_shown(w.view)),
     "lock": _lock,
     "fold": lambda workspace, _: _on_focused(workspace, stack.folded),
-    "rename": lambda workspace, _: replace(workspace, renaming=workspace.focus),
+    "rename": _rename,
+    "remove": _remove,
     "blend": _blend,
     "brush": lambda w, _: _brushed(w, active=not w.view.brush.active),
     "brush_mode": lambda w, _: _brushed(w, mode=paint.next_mode(w.view.brush.mode)),
@@ -382,6 +441,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "snapshot": _snapshot,
     "restore": _restore,
     "forget": _forget,
+    "name_snapshot": _name_snapshot,
     "undo": _undo,
     "redo": _redo,
     "fly": _fly,
