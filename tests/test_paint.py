@@ -35,6 +35,7 @@ ERASE = Brush(active=True, radius=20.0, softness=0.5)
 @pytest.fixture
 def hand() -> Iterator[Rig]:
     with rig(replace(first_view(bear(), 1.0, 1.0), brush=ERASE), POINTS) as made:
+        made.key("2")  # the lower layer, the scarf
         yield made
 
 
@@ -242,7 +243,7 @@ def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
     assert weights(hand).max() == 0.0
     hand.key("Shift+Backspace")
     assert hand.stage.work.view.layers[0].paint == paint.FULL
-    assert hand.stage.work.past.past[0].layers[0].paint == paint.FULL
+    assert hand.stage.work.past.past[0].edit.layers[0].paint == paint.FULL
 
 
 def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) -> None:

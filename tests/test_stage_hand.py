@@ -141,7 +141,7 @@ def test_holding_backslash_shows_the_original_and_letting_go_brings_the_edit_bac
     ],
 )
 def test_arrows_step_the_focused_strength(hand: Rig, chord: str, change: float) -> None:
-    hand.key("2")
+    hand.key("1")  # the top card: the last layer
     hand.key(chord)
     assert hand.strengths == pytest.approx([0.5, 0.5 + change], abs=1e-9)
     assert len(hand.stage.work.past.past) == 1
@@ -153,7 +153,7 @@ def test_a_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
         hand.frame(keys=Keys(held=frozenset({"Right"})))
     assert hand.stage.work.past.past == ()
     hand.frame()
-    assert hand.strengths[0] == pytest.approx(0.54)
+    assert hand.strengths[1] == pytest.approx(0.54)
     assert len(hand.stage.work.past.past) == 1
 
 
@@ -164,9 +164,9 @@ def test_a_held_letter_does_not_switch_to_and_fro(hand: Rig) -> None:
 
 
 def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
-    hand.key("2")
-    assert hand.stage.work.focus == 1
-    hand.key("Shift+1")
+    hand.key("1")
+    assert hand.stage.work.focus == 1, "the numbers go down the list, and the last layer is at its top"
+    hand.key("Shift+2")
     assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, True]
     hand.key("9")
     assert hand.stage.work.focus == 1, "there is no ninth layer"
@@ -183,7 +183,7 @@ def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
         edge = np.abs(hand.image()[60:480, 353] - accent).max(axis=-1) <= 2
         assert edge.sum() > 80, "the whole card of the focused layer is in sight"
         hand.key("Shift+9")
-        assert not hand.stage.work.view.layers[8].enabled
+        assert not hand.stage.work.view.layers[0].enabled
 
 
 def test_a_text_field_owns_the_keys(hand: Rig) -> None:
