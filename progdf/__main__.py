@@ -31,6 +31,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "ablate": ("trainer.cli:ablate", "train a run again without each part of the method: one table"),
     "view": ("viewer.cli:view", "open the window: splats, layers, sliders"),
     "render": ("viewer.render:render", "write a picture, a sweep or a contact sheet without a window"),
+    "rebind": ("progdf.rebind:main", "carry an edit over to the same scene in another file or format"),
     "export": ("viewer.cli:export", "write the edited scene as a 3DGS .ply file"),
     "check": ("progdf.check:main", "report what a scene holds and what had to be repaired"),
     "info": ("progdf.info:main", "tell what a scene or a .gdf holds, with its error report"),

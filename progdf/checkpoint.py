@@ -114,12 +114,14 @@ def _verify_channels(gdf: Gdf, scene: Gaussians, name: str, scene_name: str) -> 
 
 def _verify(made_for: SceneFingerprint, scene: Gaussians, name: str, scene_name: str) -> None:
     other = f"{name} was made for another scene"
+    carry = (
+        f"if it is the same in another format, progdf rebind {name} --from SCENE --to {scene_name} -o NEW.gdf"
+    )
     if made_for.count != len(scene):
-        raise ProgdfError(
-            f"{other}: it has {_grouped(made_for.count)} Gaussians, {scene_name} has {_grouped(len(scene))}"
-        )
+        counts = f"it has {_grouped(made_for.count)} Gaussians, {scene_name} has {_grouped(len(scene))}"
+        raise ProgdfError(f"{other}: {counts}; {carry}")
     if made_for.means_sha256 != fingerprint(scene).means_sha256:
-        raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other places")
+        raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other places; {carry}")
 
 
 def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
