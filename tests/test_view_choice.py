@@ -163,7 +163,7 @@ def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     stand = make_stand(replace(options, cameras=tmp_path / "c.json"), demo.gaussians, region)
     assert len(stand.train) + len(stand.held_out) == 6
     assert "6 of 32 cameras" in stand.notes[0]
-    assert "photographs:DIR" in stand.notes[1]
+    assert "photographs:EDITED,ORIGINALS" in stand.notes[1]
 
 
 def picked(likeness: Tensor, held_out: int) -> list[int]:

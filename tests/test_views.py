@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from progdf.errors import ProgdfError
 from progdf.framing import scene_sphere
 from progdf.lens import Lens, straightened
 from progdf.pictures import write_image
@@ -16,7 +17,8 @@ from progdf.rasterize import render
 from progdf.region import from_mask
 from tests.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.trained import small
-from trainer.editors import make_editor
+from trainer.editors import check_new_editor, make_editor
+from trainer.editors.folder import FolderEditor
 from trainer.views import fit_size, make_view, named, region_box, region_rig, seen_colors
 
 
@@ -75,6 +77,51 @@ def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: P
     plain = replace(view, camera=replace(view.camera, lens=None))
     editor = make_editor(f"photographs:{tmp_path / 'p'}", case.scene, case.region, [plain])
     assert torch.equal(editor.edit(plain, 1.0), raw)
+
+
+def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path: Path) -> None:
+    case = small()
+    view = case.views[0]
+    sharp = (
+        view.image + 0.2 * torch.rand(view.image.shape, generator=torch.Generator().manual_seed(0))
+    ) / 1.2
+    painted = sharp.clone()
+    painted[20:40, 30:50] = torch.tensor([0.1, 0.3, 0.9])
+    for folder, picture in (("before", sharp), ("after", painted)):
+        write_image(tmp_path / folder / f"{view.camera.name}.png", picture)
+    spec = f"photographs:{tmp_path / 'after'},{tmp_path / 'before'}"
+    editor = make_editor(spec, case.scene, case.region, [view])
+    made = editor.edit(view, 1.0)
+    untouched = torch.ones(made.shape[:2], dtype=torch.bool)
+    untouched[20:40, 30:50] = False
+    torch.testing.assert_close(made[untouched], view.image[untouched], atol=1e-6, rtol=0)
+    expected = (view.image + painted - sharp).clamp(0, 1)
+    torch.testing.assert_close(made, expected, atol=1.5 / 255, rtol=0)  # both files are rounded to 8 bits
+    alone = make_editor(f"photographs:{tmp_path / 'after'}", case.scene, case.region, [view])
+    torch.testing.assert_close(alone.edit(view, 1.0), painted, atol=0.6 / 255, rtol=0)
+    assert isinstance(editor, FolderEditor)
+    assert isinstance(alone, FolderEditor)
+    assert editor.warning is None
+    assert alone.warning is not None
+    assert "photographs:EDITED,ORIGINALS" in alone.warning
+
+
+@pytest.mark.parametrize(
+    "spec", ["photographs:", "photographs:{0},", "photographs:{0},{0}/no", "photographs:{0}/no"]
+)
+def test_photographs_that_are_not_there_are_refused_in_one_line(tmp_path: Path, spec: str) -> None:
+    with pytest.raises(ProgdfError, match="; ") as told:
+        check_new_editor(spec.format(tmp_path))
+    assert "\n" not in str(told.value)
+
+
+def test_an_original_photograph_that_is_missing_is_refused_before_training(tmp_path: Path) -> None:
+    case = small(count=3)
+    (tmp_path / "before").mkdir()
+    for view in case.views:
+        write_image(tmp_path / f"{view.camera.name}.png", view.image)
+    with pytest.raises(ProgdfError, match=r"before has no picture .*; put the photographs there"):
+        make_editor(f"photographs:{tmp_path},{tmp_path / 'before'}", case.scene, case.region, case.views)
 
 
 def test_what_is_put_in_place_of_the_inside_is_mixed_as_the_original_was() -> None:

@@ -61,6 +61,8 @@ def run_options(run: FinishedRun) -> TrainOptions:
     """The options of a finished run; what it does not know, as it is older, is as by default."""
     known = {field.name for field in fields(TrainOptions)}
     given = {name: value for name, value in run.about["options"].items() if name in known}
+    if given.get("group_steps") is None:
+        given["group_steps"] = run.about.get("group_steps")
     paths = {name: Path(given[name]) for name in ("scene", "out", "cameras") if given.get(name) is not None}
     return TrainOptions(**{**given, **paths})
 

@@ -132,6 +132,8 @@ def finished(
         },
         "objective": about["objective"],
         "losses": about["losses"],
+        "kind": about.get("kind"),
+        "kind_trial": about.get("kind_trial"),
         "agreement": about.get("agreement"),
         "followed": about.get("followed", 0),
         "up": about.get("up"),

@@ -70,7 +70,8 @@ class TrainOptions:
     camera), photomasks:DIR (of photographs), text:"the man's shirt"; join by + -."""
     editor: str
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
-    style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
+    photographs:EDITED,ORIGINALS (of what the cameras took), style:N (a painting, N from 0 to 25),
+    instruct:"turn him into Batman"."""
     lift: Literal["share", "count", "paper"] = "share"
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
@@ -115,10 +116,12 @@ class TrainOptions:
     steps: int = 800
     """Optimiser steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
     kind: Literal["auto", "colour", "style", "geometry"] = "auto"
-    """What the edit moves; sets learning rates and loss weights. auto: as the editor says (folder: style)."""
-    group_steps: int = 120
+    """What the edit moves; sets learning rates and loss weights. auto: as the editor knows; for folder:,
+    photographs: and instruct: all are tried on a few small views, and the log says which was best."""
+    group_steps: int | None = None
     """geometry: first the connected parts of the region are moved as wholes, in so many steps per strength
-    or twice as many; 0: every Gaussian finds its own way, which smears what moves far."""
+    or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves far. By
+    default 120 or 0, whichever a short trial finds better."""
     follow: bool = True
     """colour: members that no training view shows take on what their neighbours along the surface do, so that
     they keep no old colour for whoever looks from elsewhere."""

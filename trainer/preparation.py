@@ -74,7 +74,7 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
     if any(view.camera.lens for view in choice.views):
         notes.append(
             "the cameras have lenses that bend photographs, the views here are straight: "
-            "edited copies of photographs go in with --editor photographs:DIR"
+            "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
         )
     return Stand(scene, region, train, held_out, background, notes, up)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -20,13 +22,15 @@ from progdf.region_spec import parse_region
 from progdf.trajectory import load_trajectory, save_trajectory
 from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
-from trainer.editors import VIEW_BY_VIEW, check_editor, check_new_editor, make_editor
+from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, check_new_editor, make_editor
 from trainer.editors.base import EditKind
+from trainer.editors.folder import FolderEditor
 from trainer.evenness import even_strengths
 from trainer.finish import RunResult, end_rows, finished, kept_judge
 from trainer.fit import without_idle_attributes
 from trainer.followers import followers_of
 from trainer.interrupts import stopping
+from trainer.kind_trial import Approach, how_to_train
 from trainer.losses import Perceptual, perceptual_loss
 from trainer.network import PART as NETWORK
 from trainer.options import (
@@ -37,6 +41,7 @@ from trainer.options import (
     check_network_options,
     settled,
 )
+from trainer.own_way import kept_way
 from trainer.preparation import (
     BACKGROUND,
     Pictures,
@@ -135,14 +140,14 @@ def _trained(
     for note in stand.notes:
         log.say(note)
     with log.stage("edit"):
-        edited, kind = _edited(options, stand, folder, log)
+        edited, approach, trial = _edited(options, stand, folder, log)
         train_edits = {s: pictures[: len(stand.train)] for s, pictures in edited.items()}
         stand = widened(stand, train_edits)
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
-            agreement = _agreement(options, stand, edited, kind, log)
-        _record(options, stand, train_edits, kind, perceptual, folder, log, agreement)
+            agreement = _agreement(options, stand, edited, approach.kind, log)
+        _record(options, stand, train_edits, approach, trial, perceptual, folder, log, agreement)
         folder.state.save("recorded", {}, log.saved().values)
     else:
         log.restore(recorded)
@@ -168,8 +173,10 @@ def _looked_at(options: TrainOptions, scene: Gaussians, region: Region, folder: 
 
 def _edited(
     options: TrainOptions, stand: Stand, folder: RunFolder, log: RunLog
-) -> tuple[dict[float, list[Tensor]], EditKind]:
-    """What the editor makes of all views, by strength, and what the edit moves; read where it is on disk."""
+) -> tuple[dict[float, list[Tensor]], Approach, dict[str, Any] | None]:
+    """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
+    what a trial of that found.
+    """
     views = [*stand.train, *stand.held_out]
     names = [view.camera.name for view in views]
     done = folder.state.load("edited")
@@ -177,11 +184,14 @@ def _edited(
         try:
             edited = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
             log.say("the edited views are on disk")
-            return edited, done.values["kind"]
+            return edited, Approach(done.values["kind"], done.values["group_steps"]), done.values["trial"]
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
-    kind: EditKind = editor.kind if options.kind == "auto" else options.kind
+    if isinstance(editor, FolderEditor) and editor.warning is not None:
+        log.say(editor.warning)
+    approach, trial = how_to_train(options, stand, editor, log)
+    kind = approach.kind
     strengths = strengths_to_ask(editor, stages_to_ask(options, kind))
     if slider_meant(options.slider, options.editor, strengths) == "even":
         strengths = even_strengths(editor, options.editor, views, strengths)
@@ -195,8 +205,9 @@ def _edited(
             f"{options.editor} changes none of the views; check the region and what the editor is asked for"
         )
     log.say(f"{options.editor}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-    folder.state.save("edited", {}, {"strengths": list(edited), "kind": kind})
-    return edited, kind
+    saved = {"strengths": list(edited), "kind": kind, "group_steps": approach.group_steps, "trial": trial}
+    folder.state.save("edited", {}, saved)
+    return edited, approach, trial
 
 
 def _agreement(
@@ -215,13 +226,15 @@ def _record(
     options: TrainOptions,
     stand: Stand,
     edited: Pictures,
-    kind: EditKind,
+    approach: Approach,
+    trial: Mapping[str, Any] | None,
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
     agreement: Agreement | None,
 ) -> None:
     """Optimise, and write the trajectory and the finished edit's views."""
+    kind, scene, region = approach.kind, stand.scene, stand.region
     objective = loss_weights(options, kind).described(perceptual.name)
     log.say(f"loss: {objective}")
     with log.stage("optimise"):
@@ -230,23 +243,46 @@ def _record(
         if followers.places.numel():
             log.say(f"{len(followers.places)} members that no view shows follow their neighbours")
         trajectory, losses = trained(
-            options, stand, edited, kind, perceptual, folder.state, log, renewal, followers
+            replace(options, group_steps=approach.group_steps),
+            stand,
+            edited,
+            kind,
+            perceptual,
+            folder.state,
+            log,
+            renewal,
+            followers,
         )
     with log.stage("retime"):
         channels = trajectory.end.shape[1]
         judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
         trajectory, costs = without_idle_attributes(trajectory, judge)
         recorded = len(trajectory)
-        trajectory = retimed(trajectory, stand, options)
+        way = ""
+        if options.recording == "smooth" and options.field != "neural" and len(edited) == 1:
+            editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
+            if check_editor(options.editor)[0] not in GIVEN:
+                views = [*stand.train, *stand.held_out]
+                editor = make_editor(options.editor, scene, region, views, editor_settings(options, folder))
+            in_parts = bool(approach.group_steps)
+            trajectory, way = kept_way(
+                trajectory, stand, editor, in_parts, lambda t: retimed(t, stand, options)
+            )
+        else:
+            trajectory = retimed(trajectory, stand, options)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
+    if way:
+        log.say(f"between original and edit: {way}")
     about = {
         "scene": str(options.scene.resolve()),
         "held_out": [view.camera.name for view in stand.held_out],
         "background": list(BACKGROUND),
         "options": plain_options(options),
         "kind": kind,
+        "group_steps": approach.group_steps,
+        "kind_trial": trial,
         "objective": objective,
         "losses": losses,
         "attribute_worth_db": costs,
@@ -254,7 +290,6 @@ def _record(
         "followed": len(followers.places),
         "up": stand.up.saved() if stand.up is not None else None,
     }
-    scene, region = stand.scene, stand.region
     save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(stand, trajectory))

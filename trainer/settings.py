@@ -49,6 +49,7 @@ from trainer.trajectory import Slider
 PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"colour": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: dict[EditKind, Sharpness] = {"colour": "off", "style": "hinge", "geometry": "off"}
 SHARPNESS_WEIGHT: dict[Sharpness, float] = {"hinge": 0.1, "paper": 1.0, "off": 0.0}
+GROUP_STEPS = 120
 STAGES: dict[EditKind, int] = {"colour": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
 
 
@@ -70,6 +71,12 @@ def slider_meant(slider: Slider, editor: str, strengths: Sequence[float]) -> Sli
     if slider != "auto":
         return slider
     return "stages" if len(strengths) > 1 and editor.partition(":")[0] in GIVEN else "even"
+
+
+def group_steps(options: TrainOptions, kind: EditKind) -> int:
+    """Steps of the group stage per strength; 0 where there is none."""
+    wanted = GROUP_STEPS if options.group_steps is None else options.group_steps
+    return wanted if kind == "geometry" else 0
 
 
 def loss_weights(options: TrainOptions, kind: EditKind) -> LossWeights:
@@ -123,6 +130,6 @@ def pgs_settings(
         fall=1.0 if stages == 1 else 0.35,
         smoothing=smoothing,
         every=every,
-        growth=GROWTH if kind == "geometry" and options.group_steps else math.inf,
+        growth=GROWTH if group_steps(options, kind) else math.inf,
         seed=options.seed,
     )

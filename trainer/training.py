@@ -26,7 +26,7 @@ from trainer.options import TrainOptions
 from trainer.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
-from trainer.settings import loss_weights, pgs_settings, slider_meant
+from trainer.settings import group_steps, loss_weights, pgs_settings, slider_meant
 from trainer.sheen import NEEDED, view_dependence
 from trainer.state import Autosave, Resumable, Saved, StateFolder
 from trainer.trajectory import record, retime, straightened
@@ -129,7 +129,7 @@ def trained(
         for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
     ]
     groups = None
-    if kind == "geometry" and options.group_steps:
+    if group_steps(options, kind):
         groups = _groups(options, original, crops, [stage.targets for stage in stages], folder, log)
         stages = groups.staged(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
@@ -216,13 +216,14 @@ def _groups(
     done = folder.load("groups")
     if done is not None:
         return restored_groups(original, done.tensors)
+    steps = group_steps(options, "geometry")
     try:
-        with log.steps("move parts", options.group_steps * len(targets)) as advance:
+        with log.steps("move parts", steps * len(targets)) as advance:
             groups = group_stage(
                 original,
                 crops,
                 targets,
-                options.group_steps,
+                steps,
                 options.seed,
                 lambda step, loss: advance(step, f"loss {loss:.4f}"),
             )

@@ -9,7 +9,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.editors.base import EditorSettings, ImageEditor, Painter
-from trainer.editors.folder import folder, folder_of, photographs
+from trainer.editors.folder import folder, folder_of, photograph_folders, photographs
 from trainer.editors.instruct import instruct
 from trainer.editors.procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
 from trainer.editors.style import style, style_number
@@ -37,6 +37,9 @@ VIEW_BY_VIEW = ("folder", "photographs", "style", "instruct")
 GIVEN = ("folder", "photographs")
 """Kinds whose pictures were made elsewhere, at the strengths that they were made at."""
 
+UNTOLD = ("folder", "photographs", "instruct")
+"""Kinds that do not know what their pictures move."""
+
 COSTLY_DIAL = ("instruct",)
 """Kinds that paint every strength anew: what a model takes its time for is not done to look around."""
 
@@ -47,7 +50,7 @@ EXAMPLES = (
     "darken:0.7",
     "night",
     "folder:DIR",
-    "photographs:DIR",
+    "photographs:EDITED,ORIGINALS",
     "style:14",
 )
 
@@ -59,7 +62,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "darken": partial(stops_of, editor="darken"),
     "night": partial(stops_of, editor="night"),
     "folder": folder_of,
-    "photographs": folder_of,
+    "photographs": photograph_folders,
     "style": style_number,
 }
 """Kind of editor → what tells, by itself, whether what stands behind the colon can be."""
@@ -96,6 +99,7 @@ __all__ = [
     "COSTLY_DIAL",
     "EDITORS",
     "GIVEN",
+    "UNTOLD",
     "VIEW_BY_VIEW",
     "EditorSettings",
     "ImageEditor",

@@ -4,8 +4,11 @@
                    DIR/0.25/view_000.png … DIR/0.5/… further strengths, a subfolder each
 
 Files are named as the run names its views (see RUN/views/original); another size is scaled to the view's.
-`photographs:DIR` is the same with edited copies of the photographs that the cameras took, named as these;
-what the lenses bent is straightened first, as the views are straight.
+`photographs:EDITED,ORIGINALS` is the same with edited copies of the photographs that the cameras took, and
+these photographs themselves, under the same names; what the lenses bent is straightened first, as the views
+are straight. A scene is never as sharp as its photographs: what is trained towards is the render plus the
+change of the photograph, or all that the reconstruction missed would be taken for the edit. Without the
+originals the two cannot be told apart.
 """
 
 from __future__ import annotations
@@ -25,7 +28,8 @@ from trainer.editors.base import EditKind, EditorSettings
 from trainer.pictures import read_picture
 from trainer.views import View
 
-_REMEDY = "put the edited copies of RUN/views/original/*.png there, under the same names"
+_EDITED = "put the edited copies of RUN/views/original/*.png there, under the same names"
+_TAKEN = "put the photographs there, under the names that the cameras have"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -37,6 +41,8 @@ class FolderEditor:
         folders: strength → folder
         stages: the strengths, ascending
         bent: the pictures were taken through the views' lenses and are to be straightened
+        originals: where the unedited photographs lie, if the views are to be changed as these were; else the
+            pictures are taken as they are
     """
 
     folders: dict[float, Path]
@@ -44,6 +50,17 @@ class FolderEditor:
     kind: EditKind = "style"
     confined: bool = False
     bent: bool = False
+    originals: Path | None = None
+
+    @property
+    def warning(self) -> str | None:
+        """What the person should know before training, if anything."""
+        if not self.bent or self.originals is not None:
+            return None
+        return (
+            "photographs: without the unedited photographs, what the scene shows otherwise than they do is "
+            "trained as part of the edit; name their folder too, photographs:EDITED,ORIGINALS"
+        )
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
@@ -51,13 +68,18 @@ class FolderEditor:
             return view.image
         if strength not in self.folders:
             raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
+        picture, shown = self._seen(self.folders[strength], view)
+        if self.originals is not None:
+            picture = (view.image + picture - self._seen(self.originals, view)[0]).clamp(0.0, 1.0)
+        return torch.where(shown[..., None], picture, view.image)
+
+    def _seen(self, where: Path, view: View) -> tuple[Tensor, Tensor]:
+        """A picture at its view's size, straight, and which of its pixels were taken. [H,W,3], [H,W] bool"""
         camera = view.camera
-        path = _picture(self.folders[strength], camera.name)
-        picture = read_picture(path, size=(camera.width, camera.height))
+        picture = read_picture(_picture(where, camera.name, self.bent), size=(camera.width, camera.height))
         if not self.bent or camera.lens is None:
-            return picture
-        straight, shown = straightened(picture, camera.K, camera.lens)
-        return torch.where(shown[..., None], straight, view.image)
+            return picture, torch.ones_like(picture[..., 0], dtype=torch.bool)
+        return straightened(picture, camera.K, camera.lens)
 
 
 def folder_of(what: str) -> Path:
@@ -66,15 +88,31 @@ def folder_of(what: str) -> Path:
         raise ProgdfError("folder: names no folder; write folder:DIR with the edited views in DIR")
     root = Path(what).expanduser()
     if not root.is_dir():
-        raise ProgdfError(f"{root} is not a folder; {_REMEDY}")
+        raise ProgdfError(f"{root} is not a folder; {_EDITED}")
     return root
+
+
+def photograph_folders(what: str) -> tuple[Path, Path | None]:
+    """EDITED and ORIGINALS of `photographs:EDITED,ORIGINALS`; ProgdfError where one is no folder."""
+    edited, comma, originals = what.rpartition(",")
+    names = [edited, originals] if comma and not Path(what).expanduser().is_dir() else [what]
+    roots = [Path(name).expanduser() for name in names]
+    for name, root in zip(names, roots, strict=True):
+        if not name:
+            raise ProgdfError("photographs: names no folder; write photographs:EDITED,ORIGINALS")
+        if not root.is_dir():
+            raise ProgdfError(f"{root} is not a folder; {_TAKEN}")
+    return roots[0], roots[1] if len(roots) > 1 else None
 
 
 def folder(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> FolderEditor:
     """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
-    root = folder_of(what)
+    return _editor_of(folder_of(what), views)
+
+
+def _editor_of(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
     folders: dict[float, Path] = {}
     for child in sorted(root.iterdir()):
         strength = _strength(child.name)
@@ -84,18 +122,22 @@ def folder(
             folders[strength] = child
     if 1.0 not in folders:
         folders[1.0] = root
-    editor = FolderEditor(folders, tuple(sorted(folders)))
+    editor = FolderEditor(folders, tuple(sorted(folders)), bent=bent)
     for strength in editor.stages:
         for view in views:
-            _picture(folders[strength], view.camera.name)
+            _picture(folders[strength], view.camera.name, bent)
     return editor
 
 
 def photographs(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> FolderEditor:
-    """`photographs:DIR`: see the module's head."""
-    return replace(folder(what, scene, region, views, settings), bent=True)
+    """`photographs:EDITED,ORIGINALS` or `photographs:EDITED`: see the module's head."""
+    edited, originals = photograph_folders(what)
+    if originals is not None:
+        for view in views:
+            _picture(originals, view.camera.name, bent=True)
+    return replace(_editor_of(edited, views, bent=True), originals=originals)
 
 
 def _strength(name: str) -> float | None:
@@ -106,8 +148,8 @@ def _strength(name: str) -> float | None:
     return value if torch.isfinite(torch.tensor(value)) else None
 
 
-def _picture(where: Path, name: str) -> Path:
+def _picture(where: Path, name: str, bent: bool) -> Path:
     for suffix in SUFFIXES:
         if (where / f"{name}{suffix}").is_file():
             return where / f"{name}{suffix}"
-    raise ProgdfError(f"{where} has no picture {name}.png; {_REMEDY}")
+    raise ProgdfError(f"{where} has no picture {name}.png; {_TAKEN if bent else _EDITED}")
