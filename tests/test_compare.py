@@ -91,6 +91,7 @@ def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
     hand.drag((170.0, 300.0), (120.0, 300.0))
     left, right = beside_line(hand.picture(), 120)
     for _ in range(8):
+        hand.key("2")  # the lower layer, the scarf
         hand.key("Shift+Left")
     now_left, now_right = beside_line(hand.picture(), 120)
     assert np.array_equal(left, now_left)

@@ -165,6 +165,7 @@ def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_
     before, psnr_before = hand.picture(), hand.stage.canvas.comparer.psnr
     hand.key("Y")
     for _ in range(5):
+        hand.key("2")  # the lower layer, the scarf
         hand.key("Shift+Right")
     hand.key("Shift+Y")
     assert not np.array_equal(hand.picture()[BANNER:], before[BANNER:])
