@@ -16,10 +16,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -39,7 +41,11 @@ from progdf.region import (
 Kind = Callable[[str, Gaussians], Region]
 """Makes a region from what stands behind `KIND:`."""
 
+Check = Callable[[str], object]
+"""Raises ProgdfError where what stands behind `KIND:` cannot be, whatever the scene."""
+
 _NOTHING: Mapping[str, Kind] = {}
+_UNCHECKED: Mapping[str, Check] = {}
 
 
 def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str, Kind] = _NOTHING) -> Region:
@@ -62,12 +68,38 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
         elif colon and kind in known:
             found = known[kind](rest, scene)
         else:
-            choice = ", ".join(["all", *(f"{word}:…" for word in known)])
-            raise ProgdfError(f"region '{part}' is of no known kind; write {choice}")
+            raise _unknown(part, known)
         region = (union if sign == "+" else without)(region, found)
     if not len(region):
         raise ProgdfError(f"region '{spec}' holds no Gaussian; the scene reaches {_extent(scene)}")
     return Region(name or spec.strip(), region.members, region.score)
+
+
+def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
+    """ProgdfError if no scene can have this region: all that is to be known before one is loaded.
+
+    Args:
+        spec: see the head of this file
+        checks: of further kinds by name
+    """
+    known: dict[str, Check] = {
+        "labels": _check_labels,
+        "box": _corners,
+        "sphere": _ball,
+        "file": _check_file,
+        **checks,
+    }
+    for _, part in split_spec(spec, tuple(known)):
+        kind, colon, rest = part.partition(":")
+        if colon and kind in known:
+            known[kind](rest)
+        elif part != "all":
+            raise _unknown(part, known)
+
+
+def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
+    choice = ", ".join(["all", *(f"{word}:…" for word in known)])
+    return ProgdfError(f"region '{part}' is of no known kind; write {choice}")
 
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
@@ -86,9 +118,7 @@ def read_labels(path: str, count: int) -> Tensor:
     Raises:
         ProgdfError: no such file, no .npy, not integers, or not one per Gaussian.
     """
-    labels = open_npy(path, "labels, which are integers")
-    if labels.dtype.kind not in "iub":
-        raise ProgdfError(f"{path} holds {labels.dtype} numbers; integer labels would be right")
+    labels = _open_labels(path)
     if labels.shape not in ((count,), (count, 1)):
         shape = "x".join(str(side) for side in labels.shape) or "1"
         raise ProgdfError(
@@ -103,7 +133,7 @@ def read_members(path: str, count: int) -> Tensor:
     Raises:
         ProgdfError: no such file, no .npy, of another kind, or rows that the scene does not have.
     """
-    stored = open_npy(path, "rows, as progdf region … -o FILE.npy writes them")
+    stored = _open_members(path)
     if stored.dtype.kind == "b":
         if stored.shape != (count,):
             shape = "x".join(str(side) for side in stored.shape) or "1"
@@ -122,24 +152,49 @@ def read_members(path: str, count: int) -> Tensor:
     return torch.from_numpy(np.unique(stored).astype(np.int64))
 
 
-def _file(rest: str, scene: Gaussians) -> Region:
+def _open_members(path: str) -> NDArray[Any]:
+    return open_npy(path, "rows, as progdf region … -o FILE.npy writes them")
+
+
+def _check_file(rest: str) -> None:
     if not rest:
         raise ProgdfError("file: names no file; write file:MEMBERS.npy, as progdf region … -o writes it")
+    _open_members(rest)
+
+
+def _file(rest: str, scene: Gaussians) -> Region:
+    _check_file(rest)
     mask = torch.zeros(len(scene), dtype=torch.bool)
     mask[read_members(rest, len(scene))] = True
     return from_mask(f"file:{rest}", mask)
 
 
-def _labels(rest: str, scene: Gaussians) -> Region:
+def _open_labels(path: str) -> NDArray[Any]:
+    labels = open_npy(path, "labels, which are integers")
+    if labels.dtype.kind not in "iub":
+        raise ProgdfError(f"{path} holds {labels.dtype} numbers; integer labels would be right")
+    return labels
+
+
+def _check_labels(rest: str) -> None:
+    _open_labels(_labels_wanted(rest)[0])
+
+
+def _labels_wanted(rest: str) -> tuple[str, list[int]]:
+    """The file and the labels of FILE.npy:ID[,ID…]."""
     path, colon, ids = rest.rpartition(":")
     if not colon or not path:
         raise ProgdfError(f"region 'labels:{rest}' names no label; write labels:FILE.npy:ID[,ID…]")
     try:
-        wanted = [int(word) for word in ids.split(",")]
+        return path, [int(word) for word in ids.split(",")]
     except ValueError:
         raise ProgdfError(
             f"'{ids}' in region 'labels:{rest}' is no list of integers; write labels:FILE.npy:ID[,ID…]"
         ) from None
+
+
+def _labels(rest: str, scene: Gaussians) -> Region:
+    path, wanted = _labels_wanted(rest)
     labels = read_labels(path, len(scene))
     present = torch.unique(labels).tolist()
     absent = [wanted_id for wanted_id in wanted if wanted_id not in present]
@@ -149,15 +204,24 @@ def _labels(rest: str, scene: Gaussians) -> Region:
     return from_labels(f"labels:{rest}", labels, wanted)
 
 
+def _corners(rest: str) -> list[float]:
+    return _numbers("box", rest, "x0,y0,z0,x1,y1,z1")
+
+
 def _box(rest: str, scene: Gaussians) -> Region:
-    numbers = torch.tensor(_numbers("box", rest, "x0,y0,z0,x1,y1,z1"))
+    numbers = torch.tensor(_corners(rest))
     return inside_box(f"box:{rest}", scene, numbers[:3], numbers[3:])
 
 
-def _sphere(rest: str, scene: Gaussians) -> Region:
+def _ball(rest: str) -> list[float]:
     numbers = _numbers("sphere", rest, "x,y,z,r")
     if numbers[3] <= 0:
         raise ProgdfError(f"the radius in region 'sphere:{rest}' is {numbers[3]:g}; it must be positive")
+    return numbers
+
+
+def _sphere(rest: str, scene: Gaussians) -> Region:
+    numbers = _ball(rest)
     return inside_sphere(f"sphere:{rest}", scene, torch.tensor(numbers[:3]), numbers[3])
 
 

@@ -181,6 +181,7 @@ def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
     kinds: dict[str, Callable[[SegmenterSettings], object]] = {"text": lambda _: segment}
     monkeypatch.setattr(segmenters, "SEGMENTERS", kinds)
     monkeypatch.setattr("trainer.regions.SEGMENTERS", kinds)
+    monkeypatch.setattr("trainer.regions.SEGMENTER_CHECKS", {"text": lambda settings: None})
     return asked
 
 

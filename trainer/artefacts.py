@@ -94,15 +94,15 @@ class RunFolder:
         return (folder if strength == 1.0 else folder / f"{strength:g}") / f"{name}.png"
 
 
-def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
-    """Make the run's folder, or take over that of an earlier run of the same edit.
+def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
+    """The run's folder, if a run of this edit may be put there; nothing is made.
 
     Args:
         root: the folder
         edit: what identifies the edit (scene, region, editor)
 
     Raises:
-        ProgdfError: it is a file, or holds no run, or the run of another edit. Nothing is touched.
+        ProgdfError: it is a file, or holds no run, or the run of another edit.
     """
     if root.exists() and not root.is_dir():
         raise ProgdfError(f"{root} is a file; give --out a folder")
@@ -124,6 +124,12 @@ def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
                     f"{root} holds a run with another {what} ({earlier.get(what)}); "
                     "give --out another folder, or delete this one"
                 )
+    return folder
+
+
+def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
+    """Make the run's folder, or take over that of an earlier run of the same edit; see `check_folder`."""
+    folder = check_folder(root, edit)
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -18,14 +18,14 @@ from progdf.errors import ProgdfError
 from progdf.framing import is_surrounding
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from progdf.region_spec import Kind
+from progdf.region_spec import Check, Kind
 from progdf.up_axis import UpChoice, find_up
 from trainer.artefacts import claim
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.lift import Rule, lift_masks
 from trainer.options import TrainOptions
 from trainer.preparation import BACKGROUND, INSIDE
-from trainer.segmenters import SEGMENTERS, Segmenter, SegmenterSettings
+from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
 from trainer.views import fit_size, named, near_enough, pictured, region_rig
 
@@ -103,15 +103,8 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
 
     def from_folder(rest: str, scene: Gaussians, bent: bool) -> Region:
         kind = "photomasks" if bent else "masks"
-        if not rest:
-            raise ProgdfError(f"{kind}: names no folder; write {kind}:DIR with a mask for each camera in DIR")
-        folder = Path(rest).expanduser()
-        own = folder / "cameras.json"
-        if not own.is_file() and settings.cameras is None and folder.is_dir():
-            raise ProgdfError(
-                f"the masks in {folder} have no cameras; give --cameras, or put a cameras.json beside them"
-            )
-        cameras = _cameras(own if own.is_file() or settings.cameras is None else settings.cameras)
+        folder, file = _mask_folder(kind, rest, settings)
+        cameras = _cameras(file)
         masks = read_masks(folder, cameras, bent)
         told = sum(mask is not None for mask in masks)
         if settings.say is not None and told < len(masks):
@@ -119,9 +112,7 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         return _lifted(scene, cameras, masks, f"{kind}:{rest}", settings)
 
     def from_text(rest: str, scene: Gaussians) -> Region:
-        prompt = rest.strip().strip("\"'“”").strip()
-        if not prompt:
-            raise ProgdfError('text: names nothing; write text:"the man\'s shirt"')
+        prompt = _prompt(rest)
         folder = settings.kept() / _slug(prompt)
         cameras = _segmented_cameras(scene, settings)
         masks = _segmented(scene, cameras, prompt, folder, settings)
@@ -142,6 +133,44 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         "photomasks": lambda rest, scene: from_folder(rest, scene, bent=True),
         "text": from_text,
     }
+
+
+def region_checks(settings: RegionSettings) -> dict[str, Check]:
+    """What is to be known of these kinds before the scene is loaded, for `check_region`."""
+
+    def of_text(rest: str) -> None:
+        _prompt(rest)
+        SEGMENTER_CHECKS["text"](settings.segmenter)
+
+    return {
+        "masks": lambda rest: load_cameras(_mask_folder("masks", rest, settings)[1]),
+        "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, settings)[1]),
+        "text": of_text,
+    }
+
+
+def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, Path]:
+    """The folder of masks, and the file of their cameras."""
+    if not rest:
+        raise ProgdfError(f"{kind}: names no folder; write {kind}:DIR with a mask for each camera in DIR")
+    folder = Path(rest).expanduser()
+    if not folder.is_dir():
+        raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
+    own = folder / "cameras.json"
+    if own.is_file():
+        return folder, own
+    if settings.cameras is None:
+        raise ProgdfError(
+            f"the masks in {folder} have no cameras; give --cameras, or put a cameras.json beside them"
+        )
+    return folder, settings.cameras
+
+
+def _prompt(rest: str) -> str:
+    prompt = rest.strip().strip("\"'“”").strip()
+    if not prompt:
+        raise ProgdfError('text: names nothing; write text:"the man\'s shirt"')
+    return prompt
 
 
 def _lifted(

@@ -22,7 +22,7 @@ from progdf.region_spec import parse_region
 from progdf.trajectory import load_trajectory, save_trajectory
 from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
-from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, check_new_editor, make_editor
+from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor
 from trainer.evenness import even_strengths
@@ -42,6 +42,7 @@ from trainer.options import (
     settled,
 )
 from trainer.own_way import kept_way
+from trainer.preflight import check_command
 from trainer.preparation import (
     BACKGROUND,
     Pictures,
@@ -79,12 +80,10 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
         KeyboardInterrupt: interrupted; the message says how to go on. No .gdf is touched.
     """
     options = settled(options)
-    check_editor(options.editor)
-    if not options.out.is_dir() or not any(options.out.iterdir()):
-        check_new_editor(options.editor)
+    edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
+    check_command(options, edit)
     use_threads(options.threads)
     scene = load_scene(options.scene)
-    edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
     region, notes = kept_region(options), list[str]()
     if region is None:
         kinds = region_kinds(region_settings(options, edit, quiet, notes.append))

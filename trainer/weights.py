@@ -1,8 +1,47 @@
-"""What goes wrong when a pretrained network is read from this machine."""
+"""Pretrained networks on this machine: where they lie, whether they are whole, what goes wrong with them."""
 
 from __future__ import annotations
 
-from safetensors import SafetensorError
+import json
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
 
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
 """What transformers and diffusers raise for a model that is not there, not whole, or another's."""
+
+
+def folder_of_model(model: str, file: str) -> Path:
+    """Where a model lies that has this file.
+
+    Args:
+        model: a folder, or an id on the Hugging Face hub
+        file: relative to the model
+
+    Raises:
+        one of `BROKEN`: it is not on this machine.
+    """
+    if Path(model).is_dir():
+        return Path(model)
+    from huggingface_hub import try_to_load_from_cache
+
+    found = try_to_load_from_cache(model, file)
+    if not isinstance(found, str):
+        raise OSError(f"{model} is not on this machine")
+    return Path(found).parent
+
+
+def check_weights_here(folder: Path) -> None:
+    """Read the heads of a network's weights.
+
+    Raises:
+        one of `BROKEN`: there are none, one of several files is missing, or one is cut short.
+    """
+    files = set(folder.glob("*.safetensors"))
+    for index in folder.glob("*.safetensors.index.json"):
+        files |= {folder / name for name in json.loads(index.read_bytes())["weight_map"].values()}
+    if not files:
+        raise OSError(f"{folder} holds no weights")
+    for file in files:
+        with safe_open(file, framework="pt"):
+            pass

@@ -10,9 +10,9 @@ from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.editors.base import EditorSettings, ImageEditor, Painter
 from trainer.editors.folder import folder, folder_of, photograph_folders, photographs
-from trainer.editors.instruct import instruct
+from trainer.editors.instruct import check_instruct, instruct
 from trainer.editors.procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
-from trainer.editors.style import style, style_number
+from trainer.editors.style import check_style, style
 from trainer.views import View
 
 Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorSettings], ImageEditor]
@@ -63,7 +63,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "night": partial(stops_of, editor="night"),
     "folder": folder_of,
     "photographs": photograph_folders,
-    "style": style_number,
+    "style": check_style,
 }
 """Kind of editor → what tells, by itself, whether what stands behind the colon can be."""
 
@@ -76,9 +76,11 @@ def check_editor(spec: str) -> tuple[str, str]:
     return kind, what
 
 
-def check_new_editor(spec: str) -> None:
+def check_new_editor(spec: str, settings: EditorSettings) -> None:
     """ProgdfError if no run can begin with `spec`; one that has begun keeps its views, its folder may go."""
     kind, what = check_editor(spec)
+    if kind == "instruct":
+        check_instruct(what, settings)
     if kind in CHECKS:
         CHECKS[kind](what)
 

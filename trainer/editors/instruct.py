@@ -11,6 +11,7 @@ views for each.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ from trainer.editors.adapters import ADAPTERS, DEFAULT_MODEL, Adapter
 from trainer.editors.base import EditKind, EditorSettings
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.views import View
-from trainer.weights import BROKEN
+from trainer.weights import BROKEN, check_weights_here, folder_of_model
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
 
@@ -95,12 +96,8 @@ def instruct(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    prompt = what.strip().strip("\"'").strip()
-    if not prompt:
-        raise ProgdfError('instruct: says nothing; write instruct:"turn him into Batman"')
-    model = settings.model or DEFAULT_MODEL
-    kind = pipeline_class(model)
-    asked = _asked(prompt, model, kind, settings)
+    model, kind, asked = _understood(what, settings)
+    prompt = asked.prompt
 
     @cache
     def pipeline() -> Any:
@@ -123,6 +120,36 @@ def instruct(
         KeptPictures(settings.kept),
         stages=() if dial else (1.0,),
     )
+
+
+def check_instruct(what: str, settings: EditorSettings) -> None:
+    """What `instruct` and its pipeline would raise, as far as it is to be known without loading a network.
+
+    Raises:
+        ProgdfError: nothing is said, a package or weights are missing or cut short, an option is not known.
+    """
+    model, kind, _ = _understood(what, settings)
+    try:
+        folder = folder_of_model(model, "model_index.json")
+        parts = json.loads((folder / "model_index.json").read_bytes())
+        for name, made in parts.items():
+            wanted = isinstance(made, list) and made[0] and name not in ADAPTERS[kind].loading
+            if wanted and not (folder / name).is_dir():
+                raise OSError(f"{folder} has no {name}")
+            if wanted and (folder / name / "config.json").is_file():
+                check_weights_here(folder / name)
+    except BROKEN as error:
+        raise _missing(model) from error
+
+
+def _understood(what: str, settings: EditorSettings) -> tuple[str, str, _Asked]:
+    """The model, its pipeline's class, and what it will be asked."""
+    prompt = what.strip().strip("\"'").strip()
+    if not prompt:
+        raise ProgdfError('instruct: says nothing; write instruct:"turn him into Batman"')
+    model = settings.model or DEFAULT_MODEL
+    kind = pipeline_class(model)
+    return model, kind, _asked(prompt, model, kind, settings)
 
 
 def pipeline_class(model: str) -> str:

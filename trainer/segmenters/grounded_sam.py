@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.pictures import to_picture
 from trainer.options import DETECTOR, OUTLINER
 from trainer.segmenters.base import SegmenterSettings
-from trainer.weights import BROKEN
+from trainer.weights import BROKEN, check_weights_here, folder_of_model
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,7 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
         )
         from transformers.utils import logging as speaks
     except ImportError as error:
-        raise ProgdfError(
-            f"text: needs the package transformers ({error}); pip install progdf-studio[segment]"
-        ) from error
+        raise _without_transformers(error) from error
     # it warns on stderr of every optional package that it can do without
     speaks.set_verbosity(logging.ERROR)
     speaks.disable_progress_bar()
@@ -101,9 +99,7 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
         model: str, kind: str, option: str, usual: str, network: Any, processor: Any
     ) -> tuple[Any, Any]:
         try:
-            found = AutoConfig.from_pretrained(model, local_files_only=True).model_type
-            if found != kind:
-                raise ProgdfError(f"{model} is a {found} model, no {kind}; give {option} {usual}")
+            _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
             return (
                 network.from_pretrained(model, local_files_only=True, use_safetensors=True).float().eval(),
                 processor.from_pretrained(model, local_files_only=True),
@@ -123,6 +119,36 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
     )
     outliner = loaded(settings.outliner, "sam", "--outliner", OUTLINER, SamModel, SamProcessor)
     return GroundedSam(*finder, *outliner, settings.least)
+
+
+def check_grounded_sam(settings: SegmenterSettings) -> None:
+    """What `grounded_sam` would raise, as far as it is to be known without loading a network.
+
+    Raises:
+        ProgdfError: see `grounded_sam`.
+    """
+    try:
+        from transformers import AutoConfig
+    except ImportError as error:
+        raise _without_transformers(error) from error
+    for model, kind, option, usual in (
+        (settings.detector, "grounding-dino", "--detector", DETECTOR),
+        (settings.outliner, "sam", "--outliner", OUTLINER),
+    ):
+        try:
+            _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
+            check_weights_here(folder_of_model(model, "config.json"))
+        except BROKEN as error:
+            raise ProgdfError(_missing(model, option)) from error
+
+
+def _check_kind(config: Any, model: str, kind: str, option: str, usual: str) -> None:
+    if config.model_type != kind:
+        raise ProgdfError(f"{model} is a {config.model_type} model, no {kind}; give {option} {usual}")
+
+
+def _without_transformers(error: ImportError) -> ProgdfError:
+    return ProgdfError(f"text: needs the package transformers ({error}); pip install progdf-studio[segment]")
 
 
 def _missing(model: str, option: str) -> str:
