@@ -31,8 +31,9 @@ class Pace:
         elif self._rest_left is not None:
             self._rest_left -= seconds
             if self._rest_left <= 0.0:
-                # imgui counts the delay up in this frame and opens the tooltip in the next one
-                self._unsettled, self._rest_left = 1, None
+                # imgui counts the delay up in this frame, opens the tooltip unseen in the next one to measure
+                # it, and shows it in the one after
+                self._unsettled, self._rest_left = SETTLE_FRAMES, None
 
     def patience(self, others: Sequence[float]) -> float | None:
         """Seconds until the next frame is due without an event, or None: none is.
