@@ -109,6 +109,7 @@ def words(bear_folder: Path, *more: str) -> list[str]:
     """The command line of `small_run`."""
     options = small_run(bear_folder)
     names = ("region", "editor", "views", "image_size", "steps", "stages", "field", "threads")
+    names = (*names, "perceptual_weight")
     pairs = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in names]
     return ["train", str(options.scene), "--out=run", *pairs, *more]
 

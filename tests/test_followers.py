@@ -8,13 +8,16 @@ import pytest
 import torch
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, pack
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
+from trainer.crops import crop_scene, render_all
 from trainer.editors.base import EditKind
-from trainer.followers import find_followers, followers_of
+from trainer.followers import Followers, find_followers, followers_of, least_shown
 from trainer.options import TrainOptions
+from trainer.pgs import Stage
 from trainer.preparation import Stand
+from trainer.training import no_worse
 from trainer.views import View, make_view
 
 WHITE = torch.ones(3)
@@ -86,7 +89,8 @@ def test_where_all_is_seen_or_nothing_nobody_follows() -> None:
     alone[seen.places] = False
     members = alone.nonzero()[:, 0]
     assert not len(find_followers(scene, members, views).places)
-    assert not len(find_followers(scene, seen.places, views).places)
+    hidden = (scene.means[:, 0] > 0.5).nonzero()[:, 0]
+    assert not len(find_followers(scene, hidden, views).places)
     offsets = torch.ones(len(members), 14)
     assert find_followers(scene, members, views).led(offsets) is offsets
 
@@ -103,3 +107,32 @@ def test_only_edits_of_colours_are_followed_and_only_if_asked(
     stand = Stand(scene, region, views, [], WHITE)
     options = TrainOptions(tmp_path / "s.ply", tmp_path, region="all", editor="night", follow=follow)
     assert bool(len(followers_of(options, stand, kind).places)) == followed
+
+
+def test_what_counts_as_unseen_follows_the_density() -> None:
+    """A region of large members has 3 pixels, one in which each has a tenth of a pixel far less."""
+    large = torch.tensor([400.0] * 90 + [2.0] * 10)
+    assert least_shown(large) == 3.0
+    dense = torch.rand(10_000, generator=torch.Generator().manual_seed(1)) * 0.2
+    assert float((dense < least_shown(dense)).float().mean()) < 0.02
+    assert least_shown(torch.cat([dense, torch.zeros(10_000)])) == pytest.approx(least_shown(dense))
+
+
+def test_following_that_makes_the_loss_worse_is_undone() -> None:
+    """Members in plain sight of colors of their own are made to follow their neighbors."""
+    scene = two_boards()
+    _, views = half_seen(scene)
+    members = torch.arange(SIDE * SIDE)
+    crops = [crop_scene(scene, members, views[0].camera, views[0].box, WHITE, still=True)]
+    original = pack(scene[members], with_shN=False)
+    end = torch.zeros_like(original)
+    end[:, 11:] = torch.randn(len(members), 3, generator=torch.Generator().manual_seed(2))
+    targets = render_all(crops, original + end)
+    in_sight = (scene.means[:, :2] - torch.tensor([-0.6, 0.0])).abs().amax(dim=1)[members] < 0.3
+    places = in_sight.nonzero()[:, 0]
+    sources = places.roll(3)[:, None]
+    wrong = Followers(places, sources, torch.ones(len(places), 1))
+    stages = [Stage(1.0, targets, 1)]
+    assert not no_worse(wrong, end, original, crops, stages)
+    right = Followers(places, places[:, None], torch.ones(len(places), 1))
+    assert no_worse(right, end, original, crops, stages)

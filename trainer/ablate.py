@@ -40,7 +40,7 @@ from trainer.progress import RunLog
 from trainer.reopen import reopened
 from trainer.report import SHOWN, best_view, editor_strip, strip
 from trainer.run import use_threads
-from trainer.settings import loss_weights, slider_meant
+from trainer.settings import objective_line, slider_meant
 from trainer.state import StateFolder
 from trainer.training import retimed, trained
 from trainer.variants import Variant, chosen, sensible
@@ -117,7 +117,7 @@ def _do(root: Path, variant: Variant, ground: Ground, quiet: bool) -> None:
     options = replace(ground.options, **variant.changes)
     measure, _ = perceptual_loss()
     perceptual = perceptual_loss(options.perceptual)[0]
-    objective = loss_weights(options, ground.kind).described(perceptual.name)
+    objective = objective_line(options, ground.kind, perceptual.name)
     outcome = Outcome(variant.name, variant.what, objective=objective)
     log = RunLog(folder / "log.txt", quiet)
     try:

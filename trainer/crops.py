@@ -115,6 +115,9 @@ class CropScene:
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
 """Attributes that decide which pixels a Gaussian contributes to."""
 
+COLORS = ("sh0", "shN")
+"""The others."""
+
 
 def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
     """SH colours seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]

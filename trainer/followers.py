@@ -22,11 +22,11 @@ from trainer.preparation import Stand
 from trainer.views import View
 
 _SEEN = 3.0
-"""Σ αT over all pixels and views, in pixels: a member with less got next to no gradient.
+"""Σ αT over all pixels and views, in pixels: a member of a sparse region with less got next to nothing."""
 
-The demo's room in another tint, 30 views from its walls, PSNR of the finished edit in 16 views that look
-elsewhere, as onto the ceiling: nobody follows 20.8 dB, below .5 pixels 28.8, below 3 pixels 37.1.
-"""
+_SHARE = 0.01
+"""Of the visible weight of a typical member. Where members are dense nearly all have less than `_SEEN`, and
+their own pixels still tell them their colors (`color_solver`)."""
 
 _SOURCES = 6
 
@@ -83,7 +83,18 @@ def find_followers(scene: Gaussians, members: Tensor, views: Sequence[View]) -> 
         shown += alpha_weights(scene, camera, torch.ones_like(view.mask), near=camera.near)[
             members, 2
         ].float()
-    return _following(scene[members], shown >= _SEEN)
+    return _following(scene[members], shown >= least_shown(shown))
+
+
+def least_shown(shown: Tensor) -> float:
+    """Visible weight below which a member counts as unseen: a share of what the member behind an average
+    visible pixel gets (Σ w² / Σ w, which members that hardly show do not change), at most `_SEEN`.
+
+    Args:
+        shown: Σ αT of each member over all pixels and views, in pixels. [M]
+    """
+    own = float(shown.square().sum() / shown.sum().clamp_min(1e-12))
+    return min(_SEEN, _SHARE * own)
 
 
 def _following(region: Gaussians, seen: Tensor) -> Followers:

@@ -51,6 +51,8 @@ STAGE_STEPS = 40
 one is met. `QUICK_STAGES` are asked for then. Room's walls, 200 steps, PSNR on held-out views at .25, .5, .75
 and 1: 8 stages 38.6 37.1 34.2 39.7, the same with steps twice as long 43.1 40.9 36.5 39.6, 4 stages 41.7 40.9
 37.9 41.0."""
+SMALLEST_VIEW = 32
+"""Pixels of a view's longer side, at least."""
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
@@ -111,8 +113,9 @@ class TrainOptions:
     """The axis of the scene that is up. auto: as the cameras are held, or as a ground lies, or −y."""
     views: int = 30
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with."""
-    image_size: int = 256
-    """Longer side of the views in pixels."""
+    image_size: int = 0
+    """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
+    dense that most have less than a pixel."""
     steps: int = 800
     """Optimiser steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
     kind: Literal["auto", "colour", "style", "geometry"] = "auto"
@@ -139,7 +142,8 @@ class TrainOptions:
     perceptual: Net = "alex"
     """LPIPS through AlexNet, or VGG16, with which a run takes more than twice as long and is no better."""
     perceptual_weight: float | None = None
-    """Weight of LPIPS beside L1; by default .1 for colour, .3 for style and geometry (paper: 1)."""
+    """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
+    for, all views at once; a weight makes it descend view by view instead."""
     perceptual_every: int = 2
     """LPIPS is paid for every so many steps (paper: 1)."""
     progressive: Progressive = "off"
@@ -286,7 +290,7 @@ def settled(options: TrainOptions) -> TrainOptions:
         raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
     check_ranges(
         ("--views", options.views, 3, 96),
-        ("--image-size", options.image_size, 32, 2048),
+        ("--image-size", options.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
         ("--stages", options.stages, 0, 16),
         ("--group-steps", options.group_steps, 0, 10_000),
         ("--seed", options.seed, 0, LARGEST_SEED),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.camera_files import load_cameras
 from progdf.errors import ProgdfError
 from progdf.framing import is_surrounding
@@ -20,6 +21,7 @@ from trainer.editors import EditorSettings, ImageEditor
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.progress import Advance
+from trainer.resolution import sized
 from trainer.view_choice import choose_views, split_views
 from trainer.views import View, fit_size, named, near_enough, region_rig
 
@@ -58,18 +60,22 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
     background = torch.tensor(BACKGROUND)
     given = [] if options.cameras is None else load_cameras(options.cameras)
     up = find_up(scene, given, options.up)
-    if options.cameras is not None:
-        cameras = [fit_size(camera, options.image_size) for camera in given]
-    elif is_surrounding(scene, up.direction):
+    if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"{options.scene} {INSIDE}")
-    else:
-        # half as many again, as some will find the region hidden
-        count = options.views + options.views // 2
-        cameras = region_rig(scene, region, count, options.image_size, up.direction)
-    cameras = near_enough(named(cameras), scene)
+
+    def cameras_of(image_size: int) -> list[Camera]:
+        if options.cameras is not None:
+            found = [fit_size(camera, image_size) for camera in given]
+        else:  # half as many again, as some will find the region hidden
+            count = options.views + options.views // 2
+            found = region_rig(scene, region, count, image_size, up.direction)
+        return near_enough(named(found), scene)
+
+    cameras, unresolved = sized(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, options.views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [f"up is {up.name}, {up.reason}"]
+    notes += [unresolved] if unresolved else []
     notes += [choice.line()] if len(choice.views) < choice.offered else []
     if any(view.camera.lens for view in choice.views):
         notes.append(

@@ -60,7 +60,7 @@ from trainer.reedit import reedit
 from trainer.regions import region_kinds, region_settings
 from trainer.reopen import its_views, reopened
 from trainer.resume import kept_region, one_line, open_session, plain_options, still_there
-from trainer.settings import loss_weights, slider_meant, stages_to_ask
+from trainer.settings import objective_line, slider_meant, stages_to_ask
 from trainer.training import retimed, trained
 from trainer.trajectory import before_fit
 from trainer.views import pictured
@@ -234,13 +234,11 @@ def _record(
 ) -> None:
     """Optimise, and write the trajectory and the finished edit's views."""
     kind, scene, region = approach.kind, stand.scene, stand.region
-    objective = loss_weights(options, kind).described(perceptual.name)
+    objective = objective_line(options, kind, perceptual.name)
     log.say(f"loss: {objective}")
     with log.stage("optimise"):
         renewal = reedit(options, stand, kind, folder, log)
         followers = followers_of(options, stand, kind)
-        if followers.places.numel():
-            log.say(f"{len(followers.places)} members that no view shows follow their neighbours")
         trajectory, losses = trained(
             replace(options, group_steps=approach.group_steps),
             stand,

@@ -79,6 +79,28 @@ def group_steps(options: TrainOptions, kind: EditKind) -> int:
     return wanted if kind == "geometry" else 0
 
 
+def solves_colors(options: TrainOptions, kind: EditKind) -> bool:
+    """Whether the edit is solved for (`color_solver`): colors alone change, and nothing is asked for that
+    only a descent view by view has."""
+    return (
+        kind == "colour"
+        and options.rates == "kind"
+        and options.progressive == "off"
+        and options.sharpness in ("auto", "off")
+        and not options.perceptual_weight
+        and options.recording == "smooth"
+        and options.fit == "after"
+        and not options.reedit_every
+    )
+
+
+def objective_line(options: TrainOptions, kind: EditKind, perceptual: str) -> str:
+    """What a run minimises, for log and report. `perceptual`: the name of the distance that is used."""
+    if solves_colors(options, kind):
+        return "squared error, all views at once"
+    return loss_weights(options, kind).described(perceptual)
+
+
 def loss_weights(options: TrainOptions, kind: EditKind) -> LossWeights:
     """Which loss terms a run pays for."""
     sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness

@@ -13,7 +13,8 @@ from progdf.errors import ProgdfError
 from progdf.framing import scene_sphere
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.trajectory import Trajectory
-from trainer.crops import GEOMETRY, CropScene, crop_scene, moving_attributes, render_all
+from trainer.color_solver import iterations, make_solver, solve
+from trainer.crops import COLORS, GEOMETRY, CropScene, crop_scene, moving_attributes, render_all
 from trainer.descent import PgsState
 from trainer.editors.base import EditKind
 from trainer.followers import Followers
@@ -26,7 +27,7 @@ from trainer.options import TrainOptions
 from trainer.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
 from trainer.preparation import Pictures, Stand, probes
 from trainer.progress import RunLog
-from trainer.settings import group_steps, loss_weights, pgs_settings, slider_meant
+from trainer.settings import group_steps, loss_weights, pgs_settings, slider_meant, solves_colors
 from trainer.sheen import NEEDED, view_dependence
 from trainer.state import Autosave, Resumable, Saved, StateFolder
 from trainer.trajectory import record, retime, straightened
@@ -124,9 +125,11 @@ def trained(
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = not moving_attributes(learning_rates(kind, original.shape[1], 1.0, options.rates)[None], GEOMETRY)
     crops = [crop_scene(scene, members, v.camera, v.box, stand.background, still) for v in stand.train]
+    steps = iterations(options.steps) if solves_colors(options, kind) else options.steps
+    steps = max(steps, len(edited) + 1)  # each stage is to have one
     stages = [
         Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
-        for (s, pictures), steps in zip(edited.items(), _shared(options.steps, len(edited)), strict=True)
+        for (s, pictures), steps in zip(edited.items(), _shared(steps, len(edited)), strict=True)
     ]
     groups = None
     if group_steps(options, kind):
@@ -136,6 +139,10 @@ def trained(
     settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
     inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
     objective = Objective(perceptual, loss_weights(options, kind), inside)
+    solver = None
+    if solves_colors(options, kind):
+        with log.stage("weights"):
+            solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder)
     beside = begin_alongside(options, stand, settings.rates, stages)
@@ -144,8 +151,8 @@ def trained(
     if kept.restore():
         if beside is not None:
             beside.refill([(made.step, made.offsets) for made in recordings.made])
-        log.say(f"going on at step {state.step} of {options.steps}, with {len(recordings.made)} recordings")
-    with log.steps("optimise", options.steps) as advance, held() as stopped:
+        log.say(f"going on at step {state.step} of {steps}, with {len(recordings.made)} recordings")
+    with log.steps("optimise", steps) as advance, held() as stopped:
 
         def step_done(step: int, left: float) -> None:
             if beside is not None:
@@ -156,15 +163,18 @@ def trained(
                 raise KeyboardInterrupt
             kept.step_done()
 
-        try:
-            for found in optimise(
+        way_there = (
+            solve(original, solver, stages, state, step_done)
+            if solver is not None
+            else optimise(
                 original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
-            ):
-                if followers is not None:
-                    found = replace(found, offsets=followers.led(found.offsets))
+            )
+        )
+        try:
+            for found in way_there:
                 recordings.add(found)
                 if beside is not None:
-                    beside.add(found.step, found.offsets)
+                    beside.add(found.step, followers.led(found.offsets) if followers else found.offsets)
         except FloatingPointError as error:
             kept.save()
             raise ProgdfError(
@@ -180,13 +190,36 @@ def trained(
     log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
     end = stages[-1].place(state.average).clone()
-    if followers is not None:
+    if followers is not None and len(followers.places) and no_worse(followers, end, original, crops, stages):
+        snapshots = [(step, stage, last, followers.led(made)) for step, stage, last, made in snapshots]
         end = followers.led(end)
+        log.say(f"{len(followers.places)} members that no view shows follow their neighbours")
+    elif followers is not None and len(followers.places):
+        log.say(
+            f"{len(followers.places)} members that hardly show keep what they learnt: "
+            "following their neighbours would take the training views away from the edit"
+        )
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = way(original, groups, offsets, [made.step for made in ends], settings.snapshots)
     return record(snapshots, end, list(edited)), losses
+
+
+def no_worse(
+    followers: Followers,
+    end: Tensor,
+    original: Tensor,
+    crops: Sequence[CropScene],
+    stages: Sequence[Stage],
+) -> bool:
+    """Whether the training views stay as near to the finished edit as they are, to a hundredth."""
+
+    def error(offsets: Tensor) -> float:
+        pairs = zip(render_all(crops, original + offsets, COLORS), stages[-1].targets, strict=True)
+        return sum(float((picture - target).square().sum()) for picture, target in pairs)
+
+    return error(followers.led(end)) <= 1.01 * error(end)
 
 
 def _with_bands_decided(options: TrainOptions, stand: Stand, kind: EditKind, log: RunLog) -> TrainOptions:

@@ -89,8 +89,8 @@ def rasterize(
     grad_rows: Tensor | None,
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.rasterize`."""
-    view = _view(viewmat, K, width, height, near, sh_degree, antialiased, crop)
-    inputs = [_float32(t) for t in (means, quats, scales, opacities, colors, background)]
+    view = make_view(viewmat, K, width, height, near, sh_degree, antialiased, crop)
+    inputs = [float32(t) for t in (means, quats, scales, opacities, colors, background)]
     found: list[Array] = []
     drawn = _Rasterize.apply(view, grad_rows, found, *inputs, viewmat, K)  # type: ignore[no-untyped-call]
     image, transmittance = drawn
@@ -110,23 +110,17 @@ def alpha_weights(
 ) -> Tensor:
     """See `progdf.rasterize.alpha_weights`; activated units."""
     height, width = mask.shape
-    view = _view(viewmat, K, width, height, near, None, antialiased, (0, 0, width, height))
-    gaussians = [_float32(tensor).detach().numpy() for tensor in (means, quats, scales, opacities)]
+    view = make_view(viewmat, K, width, height, near, None, antialiased, (0, 0, width, height))
+    gaussians = [float32(tensor).detach().numpy() for tensor in (means, quats, scales, opacities)]
     gaussians.append(np.zeros((len(means), 1, 3), np.float32))
     totals = np.zeros((len(means), weights.SUMS))
     with running("weights", 2) as workers:
-        team = _team(view, workers, 2)
-        lists, unplaced, _ = _list_splats(view, gaussians, team, for_gradients=True)
-        team.share(
-            list_tiles,
-            lists.splats, view.window, view.grid, unplaced.places, lists.per_splat, unplaced.tiles,
-            lists.members, lists.slots,
-        )  # fmt: skip
+        team, lists = list_view(view, gaussians, workers, 1)
         sums = np.zeros((len(lists.members), weights.SUMS))
         team.share(
             weights.weigh,
             lists.splats, lists.rgb, view.window, view.grid, lists.tile_starts, lists.members, lists.slots,
-            _float32(mask).numpy(), sums,
+            float32(mask).numpy(), sums,
         )  # fmt: skip
         weights.gather(lists.ids, lists.ranks, lists.per_splat, sums, totals)
     return torch.from_numpy(totals.astype(np.float32))
@@ -148,7 +142,7 @@ def _team(view: _View, workers: int, launches: int) -> Team:
     return Team(min(workers, 1 + view.tiles // _TILES_WORTH_A_THREAD), launches)
 
 
-def _view(
+def make_view(
     viewmat: Tensor,
     K: Tensor,
     width: int,
@@ -158,6 +152,7 @@ def _view(
     antialiased: bool,
     crop: tuple[int, int, int, int],
 ) -> _View:
+    """The camera as the kernels want it; see `progdf.rasterize.rasterize`."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     x0, y0, x1, y1 = crop
     column, row = x0 // TILE_W, y0 // TILE_H
@@ -176,10 +171,23 @@ def _view(
     )
 
 
-def _float32(tensor: Tensor) -> Tensor:
+def float32(tensor: Tensor) -> Tensor:
+    """As the kernels want it."""
     if tensor.dtype is torch.float32 and tensor.is_cpu and tensor.is_contiguous():
         return tensor
     return tensor.to("cpu", torch.float32).contiguous()
+
+
+def list_view(view: _View, gaussians: list[Array], workers: int, launches: int) -> tuple[Team, _Lists]:
+    """The tiles' lists without a picture, and the threads that made them, for so many launches more."""
+    team = _team(view, workers, 2 + launches)
+    lists, unplaced, _ = _list_splats(view, gaussians, team, for_gradients=True)
+    team.share(
+        list_tiles,
+        lists.splats, view.window, view.grid, unplaced.places, lists.per_splat, unplaced.tiles,
+        lists.members, lists.slots,
+    )  # fmt: skip
+    return team, lists
 
 
 def _list_splats(

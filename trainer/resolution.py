@@ -1,0 +1,77 @@
+"""How many pixels the views need: as many as the members' density asks for, as far as time allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.rasterize import alpha_weights
+from progdf.region import Region
+from trainer.editors import VIEW_BY_VIEW
+from trainer.options import TrainOptions
+from trainer.views import fit_size
+
+SIZES = (256, 320, 384)
+"""Longer sides that are tried, in pixels."""
+
+_WELCOME, _BEARABLE = 0.3, 0.5
+"""Share of unresolved members up to which a size will do, and above which it is said."""
+
+_LOOK, _LOOKS = 96, 4  # pixels of the views in which members are measured, and how many
+
+
+def unresolved(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], image_size: int, views: int
+) -> float:
+    """Share of the visible members that get less than a pixel, in so many views of that size together. 0..1
+
+    Args:
+        scene, region: what is looked at
+        cameras: views of it, of which a few are looked through
+        image_size: longer side in pixels
+        views: how many there will be
+    """
+    shown = torch.zeros(len(region))
+    looks = cameras[:: max(1, len(cameras) // _LOOKS)][:_LOOKS]
+    for camera in looks:
+        small = fit_size(camera, _LOOK)
+        area = (image_size / max(small.width, small.height)) ** 2
+        weights = alpha_weights(scene, small, torch.ones(small.height, small.width), near=small.near)
+        shown += area * weights[region.members, 2]
+    shown *= views / max(1, len(looks))
+    visible = shown > 0
+    return float((shown[visible] < 1.0).float().mean()) if bool(visible.any()) else 0.0
+
+
+def sized(
+    options: TrainOptions,
+    scene: Gaussians,
+    region: Region,
+    cameras_of: Callable[[int], Sequence[Camera]],
+) -> tuple[Sequence[Camera], str]:
+    """The cameras at `--image-size` or the size that the members need, and a line where that is too small.
+
+    What is painted or given picture by picture stays at the smallest size, as does a draft.
+
+    Args:
+        options: see `TrainOptions`
+        scene, region: what they look at
+        cameras_of: longer side in pixels -> cameras
+    """
+    painted = options.editor.partition(":")[0] in VIEW_BY_VIEW
+    sizes = SIZES[:1] if painted or options.quick else SIZES
+    sizes = (options.image_size,) if options.image_size else sizes
+    for size in sizes:
+        cameras = cameras_of(size)
+        count = min(options.views, len(cameras)) * 4 // 5  # every fifth is held out
+        share = unresolved(scene, region, cameras, size, count)
+        if share <= _WELCOME:
+            break
+    line = (
+        f"{share:.0%} of the region's visible Gaussians have less than a pixel in all {count} views "
+        f"of {size} pixels: what differs among neighbours is not resolved; give --image-size or --views more"
+    )
+    return cameras, line if share > _BEARABLE else ""
