@@ -239,7 +239,7 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer.training, "optimise", interrupt)
+    monkeypatch.setattr(trainer.training, "solve", interrupt)
     with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
         train(options, quiet=True)
     assert first.gdf.read_bytes() == kept
