@@ -120,7 +120,7 @@ def test_variants_of_the_slider_share_one_optimisation_and_end_alike(run: Path) 
     assert linear["between"] != base["between"]
     assert by_time["between"] == base["between"], "judged where each shows it"
     assert by_time["uniformity"] < base["uniformity"]
-    assert "going on at step 100 of 100" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
+    assert "going on at step 12 of 12" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
     assert "going on" not in (run / "ablation/one-target/log.txt").read_text(encoding="utf-8")
 
 
