@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from progdf.field import BakedField, fit_keyframes
 from progdf.gaussians import pack
+from progdf.trajectory import Trajectory
 from tests.trained import WHITE, Small, small
+from trainer.crops import moving_attributes
+from trainer.fit import without_idle_attributes
 from trainer.judge import Judge, make_judge
 from trainer.losses import GradientL1
 from trainer.measures import courses
@@ -186,3 +190,32 @@ def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None
     narrow = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
     for a, b in zip(judge.pictures(offsets), narrow.pictures(offsets), strict=True):
         assert torch.allclose(a, b, atol=1e-6)
+
+
+def test_attributes_that_show_little_each_are_not_all_left_out_where_together_they_show() -> None:
+    """Two attributes worth .07 dB each: one may go, both would cost more than what is allowed in all."""
+
+    class Judging(Judge):
+        """Each of the two that is missing takes .07 dB."""
+
+        def pictures(self, offsets: Tensor) -> list[Tensor]:
+            missing = 2 - sum(bool(offsets[:, c].any()) for c in (slice(0, 3), slice(6, 10)))
+            return [torch.full((1, 1, 3), 0.1 * 10 ** (0.07 * missing / 20))]
+
+    end = torch.zeros(2, 14)
+    end[:, [0, 6, 12]] = 1.0
+    trajectory = Trajectory(
+        torch.tensor([0.0, 1.0]),
+        torch.stack([torch.zeros(2, 14), end]).half(),
+        end,
+        torch.tensor([0, 1]),
+        (1,),
+        (1.0,),
+    )
+    pixels = [torch.ones(1, 1, dtype=torch.bool)]
+    judge = Judging(torch.zeros(2, 14), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])
+    kept, costs = without_idle_attributes(trajectory, judge)
+    assert costs == {"quats": 0.07, "means": 0.07}
+    moving = moving_attributes(kept.end)
+    assert ("means" in moving) != ("quats" in moving)
+    assert "sh0" in moving

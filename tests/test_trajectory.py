@@ -21,7 +21,7 @@ from progdf.trajectory import (
     recorded_field,
     save_trajectory,
 )
-from trainer.trajectory import record, retime, straightened
+from trainer.trajectory import Slider, record, retime, straight_recordings, with_recordings
 
 CHANNELS = 14
 
@@ -42,6 +42,16 @@ def along(progress: list[float], stage_ends: list[int] | None = None, noise: flo
 def seen(offsets: Tensor) -> Tensor:
     """What is visible of offsets here: the offsets themselves."""
     return offsets.flatten()
+
+
+def shown(trajectory: Trajectory) -> list[Tensor]:
+    return [seen(trajectory.node(i)) for i in range(len(trajectory))]
+
+
+def retimed(
+    trajectory: Trajectory, slider: Slider = "stages", passes: int = 3, samples: int = 20
+) -> Trajectory:
+    return retime(trajectory, shown(trajectory), slider, passes, samples)
 
 
 def even_chords(trajectory: Trajectory, steps: int = 20) -> Tensor:
@@ -68,7 +78,7 @@ def test_between_two_recordings_the_way_is_straight() -> None:
 def test_re_timing_makes_equal_slider_steps_change_the_picture_equally() -> None:
     progress = [1 - (1 - i / 15) ** 4 for i in range(1, 16)]  # fast at first, slow at the end
     before = even_chords(along(progress))
-    after = even_chords(retime(along(progress), seen))
+    after = even_chords(retimed(along(progress)))
     assert float(before.min() / before.max()) < 0.05
     assert float(after.min() / after.max()) > 0.95
 
@@ -77,7 +87,7 @@ def test_jitter_does_not_count_as_change() -> None:
     progress = [i / 24 for i in range(1, 25)]
     noisy = along(progress, noise=0.02)
     arc = torch.cat([torch.zeros(1), _lengths(noisy).cumsum(0)])
-    after = retime(noisy, seen)
+    after = retimed(noisy)
     straight = (after.at(0.5) - 0.5 * after.end).abs().mean()
     assert float(straight) < 0.05
     assert float(arc[-1]) > 1.2 * float(noisy.end.abs().mean()), "the jitter is there"
@@ -85,31 +95,31 @@ def test_jitter_does_not_count_as_change() -> None:
 
 def test_three_passes_are_more_even_than_one_where_recordings_jitter() -> None:
     noisy = along([1 - (1 - i / 20) ** 2 for i in range(1, 21)], noise=0.05)
-    once, thrice = (even_chords(retime(noisy, seen, passes=passes), 6) for passes in (1, 3))
+    once, thrice = (even_chords(retimed(noisy, passes=passes), 6) for passes in (1, 3))
     assert float(thrice.min() / thrice.max()) > float(once.min() / once.max()) + 0.05
 
 
 def test_chords_as_long_as_a_step_make_steps_even_where_shorter_ones_count_jitter() -> None:
     noisy = along([i / 60 for i in range(1, 61)], noise=0.02)
-    ours, fine = (even_chords(retime(noisy, seen, "even", samples=samples)) for samples in (20, 60))
+    ours, fine = (even_chords(retimed(noisy, "even", samples=samples)) for samples in (20, 60))
     assert float(ours.min() / ours.max()) > 0.7
     assert float(ours.min() / ours.max()) > float(fine.min() / fine.max()) + 0.05
 
 
 def test_stage_ends_keep_their_strengths_whatever_happens_between() -> None:
     progress = [0.01, 0.02, 0.05, 0.1, 0.3, 0.95, 1.0]
-    trajectory = retime(along(progress, [2, 4, 5, 7]), seen, "stages")
+    trajectory = retimed(along(progress, [2, 4, 5, 7]), "stages")
     assert [float(trajectory.s[end]) for end in trajectory.stage_ends] == [0.25, 0.5, 0.75, 1.0]
-    even = retime(along(progress, [2, 4, 5, 7]), seen, "even")
+    even = retimed(along(progress, [2, 4, 5, 7]), "even")
     assert float(even.s[even.stage_ends[0]]) == pytest.approx(0.02, abs=0.01)
-    time = retime(along(progress, [2, 4, 5, 7]), seen, "time")
+    time = retimed(along(progress, [2, 4, 5, 7]), "time")
     assert torch.allclose(time.s, torch.linspace(0, 1, 8), atol=1e-6)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-1.0, 2.0), min_size=1, max_size=12))
 def test_slider_values_ascend_from_zero_to_one_for_any_way(progress: list[float]) -> None:
-    trajectory = retime(along([*progress, 1.0]), seen)
+    trajectory = retimed(along([*progress, 1.0]))
     assert float(trajectory.s[0]) == 0.0
     assert float(trajectory.s[-1]) == 1.0
     assert bool((trajectory.s.diff() > 0).all())
@@ -117,7 +127,7 @@ def test_slider_values_ascend_from_zero_to_one_for_any_way(progress: list[float]
 
 def test_a_recording_that_is_a_detour_is_left_out_and_stage_ends_stay() -> None:
     trajectory = along([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0], [5, 10], noise=0.5)
-    kept = straightened(trajectory, seen)
+    kept = with_recordings(trajectory, straight_recordings(trajectory, shown(trajectory)))
     assert len(kept) == 3
     assert kept.stage_ends == (1, 2)
     assert torch.equal(kept.node(1), trajectory.node(5))
@@ -129,11 +139,11 @@ def test_a_gentle_curve_keeps_its_recordings() -> None:
     way = torch.stack([angle.sin(), 1 - angle.cos()], dim=1)[:, None, :].repeat(1, 3, 7)
     snapshots = [(i, 0, i == 11, way[i].half()) for i in range(1, 12)]
     curve = record(snapshots, way[-1], [1.0])
-    assert len(straightened(curve, seen, detour=0.1)) > 6
+    assert len(straight_recordings(curve, shown(curve), detour=0.1)) > 6
 
 
 def test_a_trajectory_round_trips_through_its_file(tmp_path: Path) -> None:
-    trajectory = retime(along([0.3, 0.6, 1.0], [1, 3]), seen)
+    trajectory = retimed(along([0.3, 0.6, 1.0], [1, 3]))
     extra = {"members": torch.tensor([3, 5, 8]), "score": torch.rand(10)}
     save_trajectory(tmp_path / "trajectory.safetensors", trajectory, extra, {"scene": "bär.ply"})
     found, tensors, about = load_trajectory(tmp_path / "trajectory.safetensors")
@@ -174,7 +184,7 @@ def test_a_file_that_lacks_a_part_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_recording_is_a_field_that_tells_the_same_at_and_between_the_snapshots() -> None:
-    trajectory = retime(along([0.2, 0.3, 0.75, 1.0], noise=0.1), seen)
+    trajectory = retimed(along([0.2, 0.3, 0.75, 1.0], noise=0.1))
     field = recorded_field(trajectory)
     assert field.recorded == tuple(trajectory.s.tolist())
     for s in trajectory.s.tolist():

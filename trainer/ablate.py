@@ -158,7 +158,7 @@ def _recorded(
     with log.stage("optimise"):
         trajectory, _ = trained(options, ground.stand, edited, ground.kind, perceptual, state, log)
     trajectory, _ = without_idle_attributes(trajectory, ground.judge)
-    return retimed(trajectory, ground.stand, options)
+    return retimed(trajectory, ground.stand, options, log)
 
 
 def _fitted(

@@ -26,8 +26,7 @@ def recorded_course(root: Path) -> KnownCourse:
     stand, trajectory = its_views(run), run.trajectory
     few = stand.train[:: max(1, len(stand.train) // LOOKED)][:LOOKED]
     look, judge = (
-        kept_judge(run.folder, stand, views, trajectory.strengths, trajectory.end.shape[1]).counted
-        for views in (few, stand.held_out[:JUDGED])
+        kept_judge(run.folder, stand, views, trajectory).counted for views in (few, stand.held_out[:JUDGED])
     )
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     return KnownCourse(

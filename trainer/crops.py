@@ -8,7 +8,9 @@ the box.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,7 +18,9 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import Crop, rasterize
-from progdf.sh import basis
+from progdf.rasterize.color_maps import ColorMap, color_map
+from progdf.rasterize.threads import threads
+from progdf.sh import C0, basis
 from trainer.losses import clamp_towards
 from trainer.tiles import live_pixels, live_tiles, reaching
 from trainer.views import seen_colors
@@ -37,6 +41,7 @@ class CropScene:
         antialiased: see `Gaussians`
         cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
             None where all are drawn
+        still: nothing but the members' colours ever differs
     """
 
     camera: Camera
@@ -51,6 +56,7 @@ class CropScene:
     background: Tensor
     antialiased: bool = False
     cached: tuple[Tensor, Tensor] | None = None
+    still: bool = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -73,21 +79,47 @@ class CropScene:
             image [h,w,3], 0..1 with the clamp's gradient kept where it points inwards; transmittance [h,w]
         """
         members = unpack(packed, self.member_shN)
+        colors = member_colors(members, self.camera.position)
 
         def put(values: Tensor, into: Tensor) -> Tensor:
             return into.index_copy(0, self.rows, values)
 
-        image, transmittance = self._draw(
-            put(members.means, self.means) if "means" in moving else self.means,
-            put(members.quats, self.quats) if "quats" in moving else self.quats,
-            put(members.scales, self.scales) if "log_scales" in moving else self.scales,
-            put(members.opacities, self.opacities) if "logit_opacities" in moving else self.opacities,
-            self.colors.index_copy(0, self.rows, member_colors(members, self.camera.position)),
-        )
+        if self.still and not colors.requires_grad:
+            weighed, others, transmittance = self._linear
+            image = others + weighed.picture(colors)
+        else:
+            image, transmittance = self._draw(
+                put(members.means, self.means) if "means" in moving else self.means,
+                put(members.quats, self.quats) if "quats" in moving else self.quats,
+                put(members.scales, self.scales) if "log_scales" in moving else self.scales,
+                put(members.opacities, self.opacities) if "logit_opacities" in moving else self.opacities,
+                put(colors, self.colors),
+            )
         if self.cached is not None:
             live, original = self.cached
             image = torch.where(live, image, original)
         return clamp_towards(image, 0.0, 1.0), transmittance
+
+    @cached_property
+    def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
+        """While nothing moves: what each member weighs in each pixel, what all others show, transmittance."""
+        camera = self.camera
+        weighed = color_map(
+            self.means,
+            self.quats,
+            self.scales,
+            self.opacities,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            camera.near,
+            self.box,
+            self.rows,
+            self.antialiased,
+        )
+        image, transmittance = self._draw(self.means, self.quats, self.scales, self.opacities, self.colors)
+        return weighed, image - weighed.picture(self.colors[self.rows]), transmittance
 
     def _draw(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
@@ -124,8 +156,10 @@ def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
 
     Directions are constants here: their share of the means' gradient is small and mostly noise.
     """
-    directions = torch.nn.functional.normalize(members.means.detach() - eye, dim=1)
     degree = min(members.sh_degree, 3)
+    if degree == 0:
+        return clamp_towards(members.sh0 * C0 + 0.5, 0.0, float("inf"))
+    directions = torch.nn.functional.normalize(members.means.detach() - eye, dim=1)
     weights = basis(degree, directions)
     raw = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
     return clamp_towards(raw, 0.0, float("inf"))
@@ -147,8 +181,8 @@ def crop_scene(
         camera: the whole view
         box: the pixels that are rendered
         background: rgb. [3]
-        still: nothing but colours will move, so only the tiles that show a member are drawn, see `tiles`;
-            transmittance is then right in these only
+        still: nothing but colours will move, so only the tiles that show a member are drawn, see `tiles`, and
+            without gradients a linear map of the members' colours; transmittance is right in these only
     """
     colors = seen_colors(scene, camera)
     _, _, seen = rasterize(
@@ -182,7 +216,7 @@ def crop_scene(
         background,
         scene.antialiased,
     )
-    return _live(whole) if still else whole
+    return _live(replace(whole, still=True)) if still else whole
 
 
 def _live(view: CropScene) -> CropScene:
@@ -215,7 +249,16 @@ def render_all(
 ) -> list[Tensor]:
     """Every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
     with torch.no_grad():
+        if len(crops) > 1 and threads() > 1 and all(crop.still for crop in crops):
+            with ThreadPoolExecutor(threads()) as pool:  # the maps work on one thread each
+                return list(pool.map(lambda crop: crop.render(packed, moving)[0].detach(), crops))
         return [crop.render(packed, moving)[0] for crop in crops]
+
+
+def only_recolors(offsets: Tensor) -> bool:
+    """Whether nothing but colours ever moves. [...,14] or [...,14+3K]"""
+    slices = attribute_slices(offsets.shape[-1])
+    return not any(bool(offsets[..., slices[name]].any()) for name in GEOMETRY)
 
 
 def moving_attributes(offsets: Tensor, among: Collection[str] = ATTRIBUTES) -> list[str]:

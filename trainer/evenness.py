@@ -17,6 +17,7 @@ over the slider. The robot recoloured and the bear's scarf repainted, held-out v
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from itertools import accumulate, pairwise
 
 import torch
@@ -25,10 +26,12 @@ from torch import Tensor
 from progdf.field import BakedField
 from progdf.field.dial import Dial, dialled, interpolated, same
 from progdf.gaussians import BASE_CHANNELS, pack
-from trainer.crops import moving_attributes, render_all
+from trainer.crops import GEOMETRY, render_all
 from trainer.editors import COSTLY_DIAL, check_editor
 from trainer.editors.base import ImageEditor
 from trainer.preparation import Stand, probes
+from trainer.progress import RunLog
+from trainer.trajectory import blended
 from trainer.views import View
 
 STEPS = 20
@@ -37,6 +40,7 @@ STEPS = 20
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
 _FINE = 2  # a step may begin at so many places per step
 _PASSES = 3
+_LOOKS = 2  # how often all places are looked at
 _JUMP = 0.7  # of the change in one step of an editor's dial: no strength between can be relied on
 
 
@@ -73,22 +77,35 @@ def even_strengths(
     return found if rises else plain
 
 
-def evened(field: BakedField, stand: Stand) -> tuple[BakedField, Dial]:
+def evened(field: BakedField, stand: Stand, log: RunLog | None = None) -> tuple[BakedField, Dial]:
     """The field with a slider whose equal steps look equally large in training views, and where it all went.
 
     A network keeps its slider.
     """
     if field.origin is not None or not field.attributes:
         return field, same()
-    small = probes(stand, _FIELD_VIEWS)
+    moving = list(field.attributes)
+    small = probes(stand, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
     rows = pack(stand.scene[stand.region.members], with_shN=field.channels > BASE_CHANNELS)
-    moving = moving_attributes(field.offsets(1.0))
+    done = 0
 
     def seen(s: float) -> Tensor:
+        nonlocal done
+        done += 1
+        advance(done, "strengths")
         return torch.cat([p.flatten() for p in render_all(small, rows + field.offsets(s), moving)])
 
-    dial = even_dial(seen)
+    with (
+        nullcontext(_silent)
+        if log is None
+        else log.steps("even the slider", _LOOKS * (STEPS * _FINE + 1)) as advance
+    ):
+        dial = even_dial(seen)
     return dialled(field, dial), dial
+
+
+def _silent(done: int, word: str) -> None:
+    pass
 
 
 def even_dial(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
@@ -98,17 +115,21 @@ def even_dial(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
     robot's .93, but .68 where they begin half a step later; with them .92 and .88).
 
     Args:
-        seen: strength -> what is seen, any fixed shape
+        seen: strength -> what is seen, any fixed shape; asked at even strengths and those found, and taken
+            to go straight between two of them
         passes: how often to spread the strengths, the best of all wins
     """
     even = torch.linspace(0, 1, STEPS * _FINE + 1, dtype=torch.float64)
-    best, places = -1.0, even
-    following = even
-    for _ in range(passes + 1):
-        current = following
-        evenness, following = _spread(current, [seen(float(s)) for s in current], _FINE)
-        if evenness > best:
-            best, places = evenness, current
+    places = even
+    for _ in range(_LOOKS):
+        looked, pictures = places, [seen(float(s)) for s in places]
+        best, following = -1.0, places
+        for _ in range(passes + 1):
+            current = following
+            shown = [blended(pictures, looked, float(s)) for s in current]
+            evenness, following = _spread(current, shown, _FINE)
+            if evenness > best:
+                best, places = evenness, current
     return Dial(places[::_FINE].contiguous(), even[::_FINE].contiguous())
 
 

@@ -19,11 +19,12 @@ from progdf.pictures import write_image
 from progdf.trajectory import Trajectory
 from trainer.active import Dropped, dropped_of
 from trainer.artefacts import RunFolder, read_views, write_json
+from trainer.crops import only_recolors
 from trainer.evenness import evened
-from trainer.fit import fit_field, judged_field, visibility
+from trainer.fit import expected_looks, fit_field, judged_field, visibility
 from trainer.judge import Judge, make_judge
 from trainer.losses import Perceptual
-from trainer.measures import Texts, clip_course, figures, measure
+from trainer.measures import Texts, clip_course, expected_measures, figures, measure
 from trainer.network import fit_network
 from trainer.options import CLIP_MODEL, FieldKind
 from trainer.preparation import Stand
@@ -70,11 +71,11 @@ def finished(
     scene, region = stand.scene, stand.region
     dropped: Dropped | None = None
     with log.stage("fit"):
-        channels = trajectory.end.shape[1]
-        judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
+        judge = kept_judge(folder, stand, stand.held_out, trajectory)
         few = stand.train[:: max(1, len(stand.train) // _RANK_VIEWS)][:_RANK_VIEWS]
-        seen = kept_judge(folder, stand, few, trajectory.strengths, channels)
-        weights = visibility(scene, region.members, stand.train)
+        seen = kept_judge(folder, stand, few, trajectory)
+        with log.looks("weigh the members", len(stand.train)) as looked:
+            weights = visibility(scene, region.members, stand.train, looked)
         if choice == "neural":
             network = fit_network(trajectory, stand, seen, judge, weights, options, perceptual, log, begun)
             fitted = judged_field(trajectory, judge, network.field, options["target_psnr"])
@@ -82,7 +83,17 @@ def finished(
             network = None
             target, budget = options["target_psnr"], options.get("bytes_budget")
             refine = options.get("refine", False)
-            fitted = fit_field(trajectory, seen, judge, weights, choice, target, budget, refine)
+            with log.looks("fit the field", expected_looks(trajectory, choice)) as looked:
+                fitted = fit_field(
+                    trajectory,
+                    replace(seen, looked=looked),
+                    replace(judge, looked=looked),
+                    weights,
+                    choice,
+                    target,
+                    budget,
+                    refine,
+                )
             if options.get("drop_invisible", False):
                 dropped = dropped_of(stand, trajectory, judge, fitted)
                 fitted = dropped.fitted
@@ -91,7 +102,7 @@ def finished(
         slider = slider_meant(options.get("slider", "stages"), options["editor"], trajectory.strengths)
         field, dial = fitted.chosen.field, same()
         if slider == "even":
-            field, dial = evened(field, stand)
+            field, dial = evened(field, stand, log)
         laid = lay_over(folder.trajectory, dial)
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
@@ -107,7 +118,9 @@ def finished(
         clip = clip_course(judge, stand.held_out, field, texts(options))
         if clip.reason and (options.get("text_before") or options.get("text_after")):
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
-        measured = measure(judge, trajectory, fitted, field, dial, perceptual, clip)
+        with log.looks("measure the edit", expected_measures(trajectory)) as looked:
+            watched = replace(judge, looked=looked)
+            measured = measure(watched, trajectory, fitted, field, dial, perceptual, clip)
         end = end_rows(stand, trajectory)
         if dropped is not None:
             region, field, end = dropped.region(region), dropped.field(field), end[dropped.kept]
@@ -162,13 +175,12 @@ def finished(
     return RunResult(folder, folder.gdf(options["name"]), report, laid)
 
 
-def kept_judge(
-    folder: RunFolder, stand: Stand, views: Sequence[View], strengths: Sequence[float], channels: int
-) -> Judge:
+def kept_judge(folder: RunFolder, stand: Stand, views: Sequence[View], trajectory: Trajectory) -> Judge:
     """Some views beside their edited pictures, as the run keeps them."""
     names = [view.camera.name for view in views]
-    edited = {s: read_views(folder, "edited", names, s) for s in strengths}
-    return make_judge(stand.scene, stand.region, views, edited, stand.background, channels)
+    edited = {s: read_views(folder, "edited", names, s) for s in trajectory.strengths}
+    channels, still = trajectory.end.shape[1], only_recolors(trajectory.offsets)
+    return make_judge(stand.scene, stand.region, views, edited, stand.background, channels, still)
 
 
 def end_rows(stand: Stand, trajectory: Trajectory) -> Tensor:

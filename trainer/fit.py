@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,9 @@ from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldJudge, choose_field, fit_keyframes
 from progdf.field.choose import Kind
+from progdf.field.judge import SAMPLES
+from progdf.field.rendered import MOST_SNAPSHOTS
+from progdf.field.separable import moving_attributes
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
 from progdf.trajectory import Trajectory
@@ -83,6 +86,15 @@ def fit_field(
     return Fitted(choice.best, choice.met, choice.tried, baselines, choice.why)
 
 
+def expected_looks(trajectory: Trajectory, kind: Kind) -> int:
+    """About how often `fit_field` looks at its views, for a progress bar."""
+    snapshots = min(len(trajectory), MOST_SNAPSHOTS)
+    moving = len(moving_attributes(trajectory.offsets))
+    ranks = snapshots if kind == "keyframes" else (1 + moving) * snapshots
+    candidates = 1 if kind == "lossless" else 6
+    return ranks + SAMPLES * (1 + candidates + len(BASELINES))
+
+
 def judged_field(trajectory: Trajectory, judge: Judge, field: BakedField, target_psnr: float) -> Fitted:
     """A field that is there already, a network's, beside the same baselines."""
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
@@ -128,7 +140,9 @@ def choice_figures(fitted: Fitted) -> dict[str, Any]:
     return {"chosen": fitted.chosen.label, "why": fitted.why, "tried": tried}
 
 
-def visibility(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Tensor:
+def visibility(
+    scene: Gaussians, members: Tensor, views: Sequence[View], looked: Callable[[], None] | None = None
+) -> Tensor:
     """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]
 
     Members are weighted by it, numbers by nothing: bases are mixed from the snapshots by what pictures show,
@@ -141,11 +155,14 @@ def visibility(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Tens
     for view in views:
         camera, everywhere = view.camera, torch.ones_like(view.mask)
         total += alpha_weights(scene, camera, everywhere, near=camera.near)[members, 2].float()
+        if looked is not None:
+            looked()
     return total / total.mean().clamp_min(1e-12) + 1e-3
 
 
 def without_idle_attributes(trajectory: Trajectory, judge: Judge) -> tuple[Trajectory, dict[str, float]]:
-    """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views.
+    """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views,
+    all that are taken out together.
 
     Returns:
         The trajectory (without the higher SH bands' columns if these go), and what leaving out each attribute
@@ -154,15 +171,17 @@ def without_idle_attributes(trajectory: Trajectory, judge: Judge) -> tuple[Traje
     offsets, end = trajectory.offsets, trajectory.end
     costs: dict[str, float] = {}
     slices = attribute_slices(end.shape[1])
+    target = judge.edited[1.0]
+    now = whole = judge.psnr(judge.pictures(end), target)
     for name in ("shN", "quats", "log_scales", "means", "logit_opacities"):
         if name not in slices or not bool(end[:, slices[name]].any()):
             continue
         tried = end.clone()
         tried[:, slices[name]] = 0.0
-        target = judge.edited[1.0]
-        cost = judge.psnr(judge.pictures(end), target) - judge.psnr(judge.pictures(tried), target)
-        costs[name] = round(cost, 3)
-        if cost < _PAYS:
+        then = judge.psnr(judge.pictures(tried), target)
+        costs[name] = round(now - then, 3)
+        if whole - then < _PAYS:
+            now = then
             offsets = offsets.clone()
             offsets[:, :, slices[name]] = 0.0
             end = tried

@@ -7,8 +7,8 @@ that show the region or that the edit changes (method.md 7).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ class Judge:
         pixels: which pixels count. [h,w] bool each
         edited: strength → the editor's pictures of the boxes
         names: the views' names
+        looked: called at every look at all views, for a progress bar
     """
 
     original: Tensor
@@ -38,13 +39,20 @@ class Judge:
     pixels: Sequence[Tensor]
     edited: Mapping[float, Sequence[Tensor]]
     names: Sequence[str]
+    looked: Callable[[], None] | None = None
 
     def pictures(self, offsets: Tensor) -> list[Tensor]:
         """Every view with these offsets. [M,C] -> [h,w,3] each"""
         if not len(offsets):  # a field that moves nothing does not know how many members it has
             offsets = torch.zeros_like(self.original)
+        if self.looked is not None:
+            self.looked()
         rows = self.original[:, : offsets.shape[1]] + offsets
         return render_all(self.crops, rows, moving_attributes(offsets))
+
+    def picture(self, offsets: Tensor, view: int) -> Tensor:
+        """One view with these offsets. [M,C] -> [h,w,3]"""
+        return replace(self, crops=[self.crops[view]]).pictures(offsets)[0]
 
     def psnr(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""
@@ -63,10 +71,13 @@ class Judge:
                 count += here
         return total / count if count else 1.0
 
-    def perceptual(self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual) -> float:
-        """Mean perceptual distance of the boxes."""
+    def perceptual(
+        self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual, key: Hashable = None
+    ) -> float:
+        """Mean perceptual distance of the boxes. `key`: of the expected pictures, see `Perceptual`"""
+        keys = [None if key is None else (key, i) for i in range(len(expected))]
         with torch.no_grad():
-            values = [float(measure(a, b)) for a, b in zip(found, expected, strict=True)]
+            values = [float(measure(a, b, k)) for a, b, k in zip(found, expected, keys, strict=True)]
         return sum(values) / max(1, len(values))
 
     def counted(self, offsets: Tensor) -> Tensor:
@@ -82,6 +93,7 @@ def make_judge(
     edited: Mapping[float, Sequence[Tensor]],
     background: Tensor,
     channels: int,
+    still: bool = False,
 ) -> Judge:
     """Prepare held-out views.
 
@@ -92,10 +104,11 @@ def make_judge(
         edited: strength → the editor's whole pictures of these views. [H,W,3]
         background: rgb. [3]
         channels: width of a packed row
+        still: nothing but colours will move, see `crop_scene`
     """
     if edited:
         views = [v.widened([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]
-    crops = [crop_scene(scene, region.members, view.camera, view.box, background) for view in views]
+    crops = [crop_scene(scene, region.members, v.camera, v.box, background, still) for v in views]
     pixels = []
     for i, view in enumerate(views):
         counts = view.mask > 0.05

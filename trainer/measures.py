@@ -25,7 +25,7 @@ COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
 
 _EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
-_NODES = 12  # recordings at which the field is looked at
+_NODES = 6  # recordings at which the field is looked at
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
 
 
@@ -137,6 +137,11 @@ def measure(
     return Measured(fitted, shown, dial, asked, slider, worst, recorded, drawn, perceptual.name, clip)
 
 
+def expected_measures(trajectory: Trajectory) -> int:
+    """About how often `measure` looks at its views, for a progress bar."""
+    return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
+
+
 def clip_course(judge: Judge, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
     """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
 
@@ -245,9 +250,10 @@ def courses(
                 (
                     judge.psnr(found, expected),
                     judge.ssim(found, expected),
-                    judge.perceptual(found, expected, perceptual),
+                    judge.perceptual(found, expected, perceptual, "measured"),
                 )
             )
+        perceptual.forget()
     return {
         name: Course(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
         for name, found in rows.items()

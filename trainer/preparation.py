@@ -150,8 +150,8 @@ def widened(stand: Stand, edited: Pictures) -> Stand:
     return replace(stand, train=views)
 
 
-def probes(stand: Stand, count: int = _PROBES) -> list[CropScene]:
-    """A few training views at half size, in which movement is measured."""
+def probes(stand: Stand, count: int = _PROBES, still: bool = False) -> list[CropScene]:
+    """A few training views at half size, in which movement is measured. `still`: see `crop_scene`"""
     chosen = stand.train[:: max(1, len(stand.train) // count)][:count]
     return [
         crop_scene(
@@ -160,6 +160,7 @@ def probes(stand: Stand, count: int = _PROBES) -> list[CropScene]:
             view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
             (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
             stand.background,
+            still,
         )
         for view in chosen
     ]

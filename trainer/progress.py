@@ -123,6 +123,19 @@ class RunLog:
 
         yield advance
 
+    @contextmanager
+    def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:
+        """The same for a stage whose work comes in about `total` equal parts: call it at each."""
+        done = 0
+        with self.steps(what, total) as advance:
+
+            def looked() -> None:
+                nonlocal done
+                done += 1
+                advance(min(done, total), "")
+
+            yield looked
+
     def close(self) -> None:
         """End the file."""
         with suppress(OSError):  # a full disk, which whoever could not write to it has told already

@@ -77,7 +77,7 @@ def columns_of(asked: Sequence[tuple[float, float]]) -> Columns:
 def strip(judge: Judge, field: BakedField, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
     """The best view at five strengths, as thumbnails of one size."""
     best = best_view(judge)
-    return [thumbnail(judge.pictures(field.offsets(s))[best], width) for s, _ in columns]
+    return [thumbnail(judge.picture(field.offsets(s), best), width) for s, _ in columns]
 
 
 def editor_strip(judge: Judge, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:

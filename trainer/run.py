@@ -14,7 +14,7 @@ from progdf.camera_files import save_cameras
 from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
 from progdf.formats import load_scene
-from progdf.gaussians import Gaussians
+from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.json_values import decode_json, typed
 from progdf.rasterize import set_threads
 from progdf.region import Region
@@ -22,6 +22,7 @@ from progdf.region_spec import parse_region
 from progdf.trajectory import load_trajectory, save_trajectory
 from trainer.agreement import Agreement, measured
 from trainer.artefacts import RunFolder, claim, locked, read_views, remove_stale_views, write_views
+from trainer.crops import only_recolors
 from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor
@@ -251,9 +252,10 @@ def _record(
             followers,
         )
     with log.stage("retime"):
-        channels = trajectory.end.shape[1]
-        judge = kept_judge(folder, stand, stand.held_out, trajectory.strengths, channels)
-        trajectory, costs = without_idle_attributes(trajectory, judge)
+        costs: dict[str, float] = {}
+        if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
+            judge = kept_judge(folder, stand, stand.held_out, trajectory)
+            trajectory, costs = without_idle_attributes(trajectory, judge)
         recorded = len(trajectory)
         way = ""
         if options.recording == "smooth" and options.field != "neural" and len(edited) == 1:
@@ -263,10 +265,10 @@ def _record(
                 editor = make_editor(options.editor, scene, region, views, editor_settings(options, folder))
             in_parts = bool(approach.group_steps)
             trajectory, way = kept_way(
-                trajectory, stand, editor, in_parts, lambda t: retimed(t, stand, options)
+                trajectory, stand, editor, in_parts, lambda t: retimed(t, stand, options, log)
             )
         else:
-            trajectory = retimed(trajectory, stand, options)
+            trajectory = retimed(trajectory, stand, options, log)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
@@ -291,7 +293,11 @@ def _record(
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(stand, trajectory))
         views = [*stand.train, *stand.held_out]
-        finals = {v.camera.name: pictured(edited_scene, v.camera, stand.background) for v in views}
+        finals = {}
+        with log.looks("picture the edit", len(views)) as looked:
+            for view in views:
+                finals[view.camera.name] = pictured(edited_scene, view.camera, stand.background)
+                looked()
         write_views(folder, "final", finals)
 
 

@@ -14,7 +14,15 @@ from progdf.framing import scene_sphere
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.trajectory import Trajectory
 from trainer.color_solver import iterations, make_solver, solve
-from trainer.crops import COLORS, GEOMETRY, CropScene, crop_scene, moving_attributes, render_all
+from trainer.crops import (
+    COLORS,
+    GEOMETRY,
+    CropScene,
+    crop_scene,
+    moving_attributes,
+    only_recolors,
+    render_all,
+)
 from trainer.descent import PgsState
 from trainer.editors.base import EditKind
 from trainer.followers import Followers
@@ -30,7 +38,7 @@ from trainer.progress import RunLog
 from trainer.settings import group_steps, loss_weights, pgs_settings, slider_meant, solves_colors
 from trainer.sheen import NEEDED, view_dependence
 from trainer.state import Autosave, Resumable, Saved, StateFolder
-from trainer.trajectory import record, retime, straightened
+from trainer.trajectory import record, retime, straight_recordings, with_recordings
 from trainer.views import crop
 
 PART = "training"
@@ -270,20 +278,22 @@ def _groups(
     return groups
 
 
-def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions) -> Trajectory:
-    """Without jitter, and at the slider values where its change is due."""
-    small = probes(stand, _TIMED_VIEWS)
-    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
-
+def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions, log: RunLog) -> Trajectory:
+    """Without jitter, and at the slider values where its change is due; every recording is rendered once."""
     moving = moving_attributes(trajectory.end)
-
-    def seen(offsets: Tensor) -> Tensor:
-        return torch.cat([picture.flatten() for picture in render_all(small, rows + offsets, moving)])
-
+    small = probes(stand, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
+    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    shown: list[Tensor] = []
+    with log.steps("time the slider", len(trajectory)) as advance:
+        for i in range(len(trajectory)):
+            images = render_all(small, rows + trajectory.node(i), moving)
+            shown.append(torch.cat([image.flatten() for image in images]))
+            advance(i + 1, "recordings")
     if options.recording == "smooth":
-        trajectory = straightened(trajectory, seen)
+        kept = straight_recordings(trajectory, shown)
+        trajectory, shown = with_recordings(trajectory, kept), [shown[i] for i in kept]
     slider = slider_meant(options.slider, options.editor, trajectory.strengths)
-    return retime(trajectory, seen, slider)
+    return retime(trajectory, shown, slider)
 
 
 def _shared(steps: int, stages: int) -> list[int]:

@@ -6,7 +6,7 @@ equally, over the whole slider or between two stages that are pinned.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -44,7 +44,7 @@ def record(
 
 def retime(
     trajectory: Trajectory,
-    render: Callable[[Tensor], Tensor],
+    pictures: Sequence[Tensor],
     slider: Slider = "stages",
     passes: int = 3,
     samples: int = 20,
@@ -59,7 +59,7 @@ def retime(
 
     Args:
         trajectory: recordings with any slider values
-        render: offsets [M,C] -> what is seen of them, any fixed shape
+        pictures: what is seen of each, any fixed shape; between two recordings it is taken to go straight
         slider: "stages": even change between the stages' pinned strengths; "even": over the whole slider,
             nothing pinned; "time": the optimiser's steps
         passes: how often to repeat
@@ -74,7 +74,7 @@ def retime(
     else:
         knots, pins = [0, len(trajectory) - 1], [0.0, 1.0]
     s = torch.zeros(len(trajectory), dtype=torch.float64)
-    chords = _chords([render(trajectory.node(i)) for i in range(len(trajectory))])
+    chords = _chords(pictures)
     segments = [
         (slice(a, b + 1), low, high)
         for a, b, low, high in zip(knots, knots[1:], pins, pins[1:], strict=False)
@@ -82,19 +82,26 @@ def retime(
     for nodes, low, high in segments:
         s[nodes] = _placed(low, high, _cumulative(chords[nodes.start : nodes.stop - 1]))
     for _ in range(passes - 1):
-        trajectory = replace(trajectory, s=s.float())
+        before = s.clone()
         for nodes, low, high in segments:
             count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
-            progress = _cumulative(_chords([render(trajectory.at(float(x))) for x in even]))
+            progress = _cumulative(_chords([blended(pictures, before, float(x)) for x in even]))
             s[nodes] = _placed(low, high, interpolated(s[nodes], even, progress))
     return replace(trajectory, s=s.float())
 
 
-def straightened(
-    trajectory: Trajectory, render: Callable[[Tensor], Tensor], detour: float = 0.15
-) -> Trajectory:
-    """Leave out recordings that are jitter: by which the way is longer than past them by more than `detour`.
+def blended(pictures: Sequence[Tensor], places: Tensor, s: float) -> Tensor:
+    """What is seen at `s`, straight between the pictures at these ascending places. [n] float64"""
+    right = int(torch.searchsorted(places, s).clamp(1, len(places) - 1))
+    low, high = float(places[right - 1]), float(places[right])
+    return torch.lerp(pictures[right - 1], pictures[right], min(max((s - low) / (high - low), 0.0), 1.0))
+
+
+def straight_recordings(
+    trajectory: Trajectory, pictures: Sequence[Tensor], detour: float = 0.15
+) -> list[int]:
+    """All but those that are jitter: by which the way is longer than past them by more than `detour`.
 
     The worst goes first and its neighbours are looked at anew; the stages' ends always stay. A gentle curve
     keeps its recordings. On a recoloured robot this is worth 0.7 dB in the mean against the editor's own
@@ -102,10 +109,9 @@ def straightened(
 
     Args:
         trajectory: as recorded
-        render: offsets [M,C] -> what is seen of them, any fixed shape
+        pictures: what is seen of each recording, any fixed shape
         detour: share of the direct way that a recording may cost, ≥ 0
     """
-    pictures = [render(trajectory.node(i)) for i in range(len(trajectory))]
     kept = list(range(len(trajectory)))
     fixed = {0, *trajectory.stage_ends}
 
@@ -126,6 +132,11 @@ def straightened(
         for near in (place - 1, place):
             if kept[near] in cost:
                 cost[kept[near]] = excess(near)
+    return kept
+
+
+def with_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory:
+    """These recordings alone; ascending, both ends and the stages' ends among them."""
     rows = torch.tensor(kept)
     return replace(
         trajectory,

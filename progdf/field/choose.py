@@ -47,6 +47,9 @@ MOST_BYTES = 400.0
 CLOSE = 0.02
 """Share of its bytes that may be saved in vain before the search for ranks goes on."""
 
+SPARE = 1.0
+"""Decibels above the target at which the search goes on all the same."""
+
 KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 
 
@@ -102,6 +105,7 @@ def choose_field(
     check_trajectory(strengths, offsets)
     judge = judge or FieldJudge(strengths, offsets, render)
     tried: list[Candidate] = []
+    gram: Tensor | None = None
     if kind == "lossless":
         everything = fit_lossless(strengths, offsets, recorded)
         found = judge.candidate(everything, f"all {len(strengths)} snapshots")
@@ -111,10 +115,11 @@ def choose_field(
     if kind in ("auto", "separable"):
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
         seen = rendered_courses(offsets, spread, render)
+        gram = seen.pictures
         tried += _grown(seen, strengths, target, budget, judge, recorded)
     if kind in ("auto", "keyframes"):
         limit = min([budget or math.inf, *(c.field.bytes_per_member for c in tried if c.worst >= target)])
-        gram = picture_gram(offsets, render)
+        gram = picture_gram(offsets, render) if gram is None else gram
         tried += _keyframes(strengths, offsets, gram, target, limit, judge, recorded, curves=kind != "auto")
     choice = _chosen(tuple(tried), target, budget)
     if not refine or choice.best.field.kind != "separable":
@@ -185,7 +190,9 @@ def _grown(
         likely = [i for i in range(low + 1, high) if expected[i] + correction >= target]
         i = likely[0] if likely else high - 1
         if high < len(path) and stored[high] - stored[i] <= CLOSE * stored[high]:
-            break
+            if look(high).worst < target + SPARE:
+                break
+            i = (low + high) // 2  # the prediction asks for too much
         found = look(i)
         correction = found.worst - expected[i]
         low, high = (low, i) if found.worst >= target else (i, high)

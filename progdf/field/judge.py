@@ -13,7 +13,7 @@ from progdf.field.baked import BakedField
 from progdf.field.ranks import decibels
 from progdf.field.rendered import Render
 
-SAMPLES = 25
+SAMPLES = 13
 
 
 class Field(Protocol):

@@ -10,8 +10,9 @@ the inner products of these rows; the errors of several attributes may add up or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -23,6 +24,9 @@ Render = Callable[[Tensor], Tensor]
 
 MOST_PIXELS = 40_000
 """Pixels kept of each render; of more, evenly spread ones."""
+
+MOST_SNAPSHOTS = 40
+"""Snapshots that are rendered; between two of them changes are taken to go straight."""
 
 UNSEEN = 0.1
 """Say of the bare numbers beside the pictures, for members that these views do not show."""
@@ -38,12 +42,14 @@ class RenderedCourses:
     Args:
         courses: by attribute
         gram: inner products of these changes over pixels and colours. [A,T,A,T] float64
+        pictures: inner products of what the snapshots change in the pictures. [T,T] float64
         values: numbers that each inner product sums over
         channels: width of a packed row
     """
 
     courses: Mapping[str, Course]
     gram: Tensor
+    pictures: Tensor
     values: int
     channels: int
 
@@ -74,40 +80,66 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
     Args:
         offsets: [T,M,C] float32, the first row 0
         weights: how much an error of each number shows, ≥ 0. [M,C]
-        render: called (1 + A)·(T − 2) times
+        render: called 2 + (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
     """
     attributes = moving_attributes(offsets)
     courses = {
         name: follow(offsets[:, :, columns], weights[:, columns]) for name, columns in attributes.items()
     }
     snapshots = len(offsets)
-    changes: list[list[Tensor]] = [[] for _ in attributes]
+    looked = _looked_at(snapshots)
     with torch.no_grad():
-        for t in range(1, snapshots - 1):
+        original = render(offsets[0])
+        stride = _stride(original)
+        still = torch.zeros_like(original[::stride].flatten())
+        seen, changes = [still], [[still] for _ in attributes]
+        for t in looked[1:-1]:
             pixels = render(offsets[t])
-            stride = _stride(pixels)
+            seen.append((pixels - original)[::stride].flatten())
             for i, (name, columns) in enumerate(attributes.items()):
                 straight = offsets[t].clone()
                 straight[:, columns] = courses[name].lead[t] * offsets[-1, :, columns]
                 changes[i].append((pixels - render(straight))[::stride].flatten())
+        seen.append((render(offsets[-1]) - original)[::stride].flatten())
+    spread = _between(looked, snapshots)
+    shown = torch.stack(seen)
+    pictures = spread @ (shown @ shown.T).double() @ spread.T
     gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
     if not attributes or snapshots < 3:
-        return RenderedCourses(courses, gram, 1, offsets.shape[2])
-    rows = torch.cat([torch.stack(own) for own in changes])
-    inner = snapshots - 2
-    products = (rows @ rows.T).double().reshape(len(attributes), inner, len(attributes), inner)
-    gram[:, 1:-1, :, 1:-1] = products
-    return RenderedCourses(courses, gram, max(1, rows.shape[1]), offsets.shape[2])
+        return RenderedCourses(courses, gram, pictures, 1, offsets.shape[2])
+    rows = torch.cat([torch.stack([*own, still]) for own in changes])
+    products = (rows @ rows.T).double().reshape(len(attributes), len(looked), len(attributes), len(looked))
+    gram = torch.einsum("ts,asbu,vu->atbv", spread, products, spread)
+    return RenderedCourses(courses, gram, pictures, max(1, rows.shape[1]), offsets.shape[2])
 
 
 def picture_gram(offsets: Tensor, render: Render) -> Tensor:
     """Inner products of what the snapshots change in the pictures. [T,M,C] -> [T,T] float64"""
+    looked = _looked_at(len(offsets))
     with torch.no_grad():
         original = render(offsets[0])
         stride = _stride(original)
-        rows = torch.stack([(render(row) - original)[::stride].flatten() for row in offsets])
-    gram: Tensor = (rows @ rows.T).double()
-    return gram
+        rows = torch.stack([(render(offsets[t]) - original)[::stride].flatten() for t in looked])
+    spread = _between(looked, len(offsets))
+    return spread @ (rows @ rows.T).double() @ spread.T
+
+
+def _looked_at(snapshots: int) -> list[int]:
+    """Snapshots that are rendered, even and both ends among them."""
+    if snapshots <= MOST_SNAPSHOTS:
+        return list(range(snapshots))
+    return [round(i * (snapshots - 1) / (MOST_SNAPSHOTS - 1)) for i in range(MOST_SNAPSHOTS)]
+
+
+def _between(looked: Sequence[int], snapshots: int) -> Tensor:
+    """How much of each snapshot that is looked at every one holds. [T,L] float64"""
+    shares = torch.zeros(snapshots, len(looked), dtype=torch.float64)
+    shares[looked, range(len(looked))] = 1.0
+    for column, (a, b) in enumerate(pairwise(looked)):
+        inner = torch.arange(a + 1, b)
+        share = (inner - a).double() / (b - a)
+        shares[inner, column], shares[inner, column + 1] = 1.0 - share, share
+    return shares
 
 
 def _stride(pixels: Tensor) -> int:
