@@ -18,6 +18,7 @@ from tests.scenes import random_gaussians
 from trainer.color_solver import make_solver, solve
 from trainer.crops import CropScene, crop_scene, render_all
 from trainer.descent import PgsState
+from trainer.followers import Followers
 from trainer.pgs import Snapshot, Stage
 from trainer.resolution import unresolved
 
@@ -147,3 +148,14 @@ def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
     with pytest.raises(FloatingPointError, match="the loss is nan at step 0"):
         list(solve(original, solver, [Stage(1.0, targets, 2)], state, lambda step, left: None))
     assert not bool(state.moved.any())
+
+
+def test_followers_are_tied_while_the_colors_are_solved_for() -> None:
+    scene = dense_ball(300)
+    crops, original = prepared(scene, orbit(3, 40))
+    targets = render_all(crops, pack(replace(scene, sh0=-scene.sh0), with_shN=False))
+    solver, state = make_solver(crops, original, trained_bands=False), PgsState(original)
+    tied = Followers(torch.tensor([4]), torch.tensor([[7, 9]]), torch.tensor([[0.25, 0.75]]))
+    end = list(solve(original, solver, [Stage(1.0, targets, 5)], state, lambda step, left: None, tied))[-1]
+    assert torch.allclose(end.offsets[4], 0.25 * end.offsets[7] + 0.75 * end.offsets[9], atol=1e-6)
+    assert bool(end.offsets[7].any())

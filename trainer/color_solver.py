@@ -24,6 +24,7 @@ from progdf.rasterize.threads import threads
 from progdf.sh import basis
 from trainer.crops import CropScene
 from trainer.descent import PgsState
+from trainer.followers import Followers
 from trainer.losses import l1
 from trainer.pgs import OnStep, Snapshot, Stage
 
@@ -217,6 +218,7 @@ def solve(
     stages: Sequence[Stage],
     state: PgsState,
     on_step: OnStep,
+    followers: Followers | None = None,
 ) -> Iterator[Snapshot]:
     """Solve for the stages in turn, each from where the last one ended, and yield each one's end.
 
@@ -226,6 +228,9 @@ def solve(
         stages: strengths ascending; a stage's steps are its iterations
         state: where to go on from, changed in place; a step is an iteration over all views
         on_step: progress; here, and only here, the state is whole and may be saved
+        followers: members that no view shows; tied to those that they follow at every step, they cost the
+            views nothing afterwards (the demo's room in another tint, PSNR where no view looks: nobody
+            follows 17.2 dB, 42.7 with them)
 
     Raises:
         FloatingPointError: the loss or where it leads is not finite; the state is that of the step before.
@@ -244,6 +249,8 @@ def solve(
             state.previous.copy_(state.moved.detach())
             with torch.no_grad():
                 state.moved[:, columns] = found.flatten(1)
+                if followers is not None:
+                    state.moved.copy_(followers.led(state.moved.detach()))
             state.means.add({"l2": squared, "left": state.running})
             state.step, state.local = state.step + 1, state.local + 1
             state.average.copy_(state.moved.detach())

@@ -172,7 +172,7 @@ def trained(
             kept.step_done()
 
         way_there = (
-            solve(original, solver, stages, state, step_done)
+            solve(original, solver, stages, state, step_done, followers)
             if solver is not None
             else optimise(
                 original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
@@ -198,15 +198,19 @@ def trained(
     log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
     end = stages[-1].place(state.average).clone()
-    if followers is not None and len(followers.places) and no_worse(followers, end, original, crops, stages):
-        snapshots = [(step, stage, last, followers.led(made)) for step, stage, last, made in snapshots]
-        end = followers.led(end)
-        log.say(f"{len(followers.places)} members that no view shows follow their neighbours")
-    elif followers is not None and len(followers.places):
-        log.say(
-            f"{len(followers.places)} members that hardly show keep what they learnt: "
-            "following their neighbours would take the training views away from the edit"
-        )
+    if followers is not None and len(followers.places):
+        count = len(followers.places)
+        if solver is not None:
+            log.say(f"{count} members that no view shows follow their neighbours")
+        elif no_worse(followers, end, original, crops, stages):
+            snapshots = [(step, stage, last, followers.led(made)) for step, stage, last, made in snapshots]
+            end = followers.led(end)
+            log.say(f"{count} members that no view shows follow their neighbours")
+        else:
+            log.say(
+                f"{count} members that hardly show keep what they learnt: "
+                "following their neighbours would take the training views away from the edit"
+            )
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
