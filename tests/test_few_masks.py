@@ -28,7 +28,9 @@ def test_what_one_of_two_masks_holds_is_no_member() -> None:
     said: list[str] = []
     kept = without_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, said.append)
     assert kept.nonzero()[:, 0].tolist() == [*range(40), *range(60, 100)]
-    assert said == ["the masks: 20 Gaussians inside one mask only, where two views see it, left out"]
+    assert said == [
+        "the masks: 20 Gaussians inside one mask only, where two views see it, left to what surrounds them"
+    ]
 
 
 def test_a_tree_behind_that_one_view_sees_is_left_out_though_it_is_larger() -> None:

@@ -51,7 +51,11 @@ def without_strays(
         [N] bool
     """
     twice = member & ((views < 2) | (views_inside >= 2))
-    _tell(say, int(member.sum()) - int(twice.sum()), "inside one mask only, where two views see it, left out")
+    _tell(
+        say,
+        int(member.sum()) - int(twice.sum()),
+        "inside one mask only, where two views see it, left to what surrounds them",
+    )
     if not bool(twice.any()):
         return twice
     rows = twice.nonzero()[:, 0]

@@ -145,8 +145,13 @@ def lift_masks(
     member = (scores >= least).index_fill(0, rows, False)
     few = len(masks) <= FEW
     if few:
+        # what rough borders cut through, and what one of two masks holds, is as its surroundings are
+        mixed = (scores > min(_DOUBTFUL[0], least)) & (scores < least)
+        single = member & (evidence.views >= 2) & (evidence.views_inside < 2)
         member = without_strays(scene, member, evidence.views, evidence.views_inside, say)
         scores = torch.where(member, scores, scores.clamp_max(_below(least)))
+        open_ = (mixed | single).index_fill(0, rows, True)
+        rows = open_.nonzero()[:, 0]
     scores[rows] = 0.0
     if bool(member.any()):
         vote = surface_vote(scene, member, rows)
