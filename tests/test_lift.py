@@ -90,7 +90,7 @@ def test_masks_over_everything_select_everything_and_over_nothing_nothing(
 
 def test_the_rules_are_the_printed_sums() -> None:
     sums = torch.tensor([[3.0, 6.0, 4.0, 10.0], [0.0, 0.0, 0.0, 0.0]])
-    evidence = Evidence(*sums.unbind(1), clearness=torch.ones(2))
+    evidence = Evidence(*sums.unbind(1), torch.ones(2), torch.ones(2), torch.ones(2))
     assert score(evidence, "share").tolist() == pytest.approx([3 / 4, 0.0])
     assert score(evidence, "count").tolist() == pytest.approx([6 / 10, 0.0])
     assert score(evidence, "paper").tolist() == pytest.approx([3 / 10, 0.0])
@@ -209,7 +209,13 @@ def test_points_in_one_place_are_neighbours_of_each_other() -> None:
 def test_the_undecided_are_the_hidden_and_the_half_hidden_of_mixed_share() -> None:
     share = torch.tensor([1.0, 0.5, 0.5, 0.9, 0.0, 0.75])
     evidence = Evidence(
-        share, share, torch.ones(6), torch.ones(6), torch.tensor([0.01, 0.2, 0.9, 0.2, 0.01, 0.2])
+        share,
+        share,
+        torch.ones(6),
+        torch.ones(6),
+        torch.tensor([0.01, 0.2, 0.9, 0.2, 0.01, 0.2]),
+        torch.ones(6),
+        torch.ones(6),
     )
     assert lift.undecided(evidence, 0.7).tolist() == [True, True, False, False, True, False]
     assert lift.undecided(evidence, 0.8).tolist() == [True, True, False, False, True, True]

@@ -14,7 +14,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.camera import Camera
-from progdf.camera_files import save_cameras
+from progdf.camera_files import read_camera, save_cameras
 from progdf.checkpoint import save_gdf
 from progdf.compose import Layer, compose
 from progdf.gaussians import ATTRIBUTES
@@ -22,7 +22,7 @@ from progdf.ply import load_ply
 from progdf.rasterize import render
 from tests.stacks import Stack, bear_stack
 from viewer import film
-from viewer.arguments import fitted, layers_of, load_edits, parse_orbit, read_camera
+from viewer.arguments import fitted, layers_of, load_edits, parse_orbit
 from viewer.state import ViewCamera
 
 SMALL = ("--size", "64x48", "--engine", "cpu")

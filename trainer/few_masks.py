@@ -18,8 +18,8 @@ from torch import Tensor
 from progdf.gaussians import Gaussians
 from progdf.load_report import counted
 
-FEW = 16
-"""Masks up to which a region is cleaned."""
+FEW = 8
+"""Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""
 
 _LINKS, _REACH = 8, 2.5
 """A member is linked to its 8 nearest that are nearer than 2.5 times what is usual for the eighth."""

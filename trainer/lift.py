@@ -143,7 +143,7 @@ def lift_masks(
     scores = score(evidence, rule)
     rows = undecided(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
-    few = len(masks) <= FEW
+    few = 2 <= len(masks) <= FEW
     if few:
         # what rough borders cut through, and what one of two masks holds, is as its surroundings are
         mixed = (scores > min(_DOUBTFUL[0], least)) & (scores < least)
