@@ -93,7 +93,7 @@ def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
 
 
 def test_the_options_of_a_run_are_read_back_as_they_were(options: TrainOptions) -> None:
-    assert run_options(reopened(options.out)) == options
+    assert run_options(reopened(options.out)) == replace(options, group_steps=0), "as the run resolved it"
 
 
 def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to_open(

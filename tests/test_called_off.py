@@ -9,13 +9,13 @@ import pytest
 
 from tests.ui_rig import Rig, bear, first_view, rig
 from viewer.state import Brush, Keyframe, Timeline
-from viewer.timeline_bar import HEIGHT_PX
+from viewer.timeline_bar import HEIGHT_PX, ROW_PX
 
 pytestmark = pytest.mark.gl
 POINTS = (700, 640)
 LEFT = POINTS[0] - 300.0
 HEADS = 112.0
-TIMELINE = round(HEIGHT_PX)
+TIMELINE = round(HEIGHT_PX + ROW_PX)
 CallOff = Callable[[Rig], None]
 
 
@@ -34,6 +34,7 @@ ways = pytest.mark.parametrize("call_off", [by_escape, by_right_click])
 @pytest.fixture
 def hand() -> Iterator[Rig]:
     with rig(replace(first_view(bear(), 0.5, 0.5), unfolded=(0,)), POINTS) as made:
+        made.key("2")  # the lower layer, the scarf
         yield made
 
 
@@ -53,7 +54,7 @@ def dragged_and_called_off(
     hand.release()
     assert hand.stage.work.view == work.view
     assert hand.stage.work.past == work.past
-    assert hand.stage.work.focus == 0
+    assert hand.stage.work.focus == work.focus
     hand.move(*start)
     assert (hand.picture() == before)[:-TIMELINE].all(), "the playhead stays where it was brought"
 
@@ -71,6 +72,7 @@ def test_a_slider_goes_back_to_where_it_was_pressed(hand: Rig, call_off: CallOff
 @ways
 def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig, call_off: CallOff) -> None:
     y = gain_row(hand)
+    hand.frame(40)  # a press soon after the last would be a double click, which resets
     hand.drag((LEFT + 218, y), (LEFT + 150, y))
     colour = hand.stage.work.view.layers[0].gains.colour
     assert 0.0 < colour < 1.0
@@ -101,6 +103,7 @@ def gain_row(hand: Rig) -> float:
 
 @ways
 def test_a_layer_stays_in_its_place(hand: Rig, call_off: CallOff) -> None:
+    hand.key("1")  # the card at the top
     dragged_and_called_off(
         hand, call_off, (LEFT + 100, HEADS), (LEFT + 100, HEADS + 60), (LEFT + 100, HEADS + 400)
     )
@@ -111,6 +114,7 @@ def test_a_stroke_is_taken_back_and_the_next_one_paints(hand: Rig, call_off: Cal
     brush = Brush(active=True, radius=60.0, softness=0.5)
     hand.stage.restart(replace(hand.stage.work.view, brush=brush))
     hand.settle()
+    hand.key("2")
     dragged_and_called_off(hand, call_off, (180, 330), (200, 330), (230, 340))
     hand.drag((180, 330), (230, 340))
     assert hand.stage.work.view.layers[0].paint
@@ -122,7 +126,7 @@ def test_a_key_of_the_timeline_goes_back(hand: Rig, call_off: CallOff) -> None:
     keys = (Keyframe(0, ((0, 0.5), (1, 0.5))), Keyframe(36, ((0, 0.5), (1, 0.5))))
     hand.stage.restart(replace(hand.stage.work.view, timeline=Timeline(keys)))
     hand.key("T")
-    y = POINTS[1] - HEIGHT_PX / 2
+    y = POINTS[1] - ROW_PX - HEIGHT_PX / 2
     at = next(x for x in range(110, 400, 4) if grips_key(hand, float(x), y))
     dragged_and_called_off(hand, call_off, (at, y), (at + 40.0, y), (at + 60.0, y))
 

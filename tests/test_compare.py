@@ -140,7 +140,7 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
 def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
     for chord in ("Y", "Shift+Y"):
         hand.key(chord)
-        hand.frame(2)
+        hand.frame(60)  # a tooltip may wait for a second of rest
         drawn = hand.stage.drawn
         hand.frame(3)
         assert hand.stage.patience() is None

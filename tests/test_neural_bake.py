@@ -8,7 +8,7 @@ from torch import Tensor
 
 from progdf.field import baked_neural
 from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
-from progdf.field.judge import FieldJudge
+from progdf.field.judge import FieldJudge, sample_strengths
 from tests.edits import curved_trajectory
 from tests.networks import FORMS, MEMBERS, baked, network, rows
 
@@ -25,7 +25,7 @@ def test_the_ends_of_a_baked_network_are_exact(form: str) -> None:
 @pytest.mark.parametrize("form", ["own", "own, hard bins"])
 def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
     field, bound = baked(form), network(form).bound(rows())
-    strengths = torch.arange(1, 26) / 26
+    strengths = sample_strengths()
     wrong = sum(float((field.offsets(float(s)) - bound.offsets(float(s))).square().sum()) for s in strengths)
     whole = sum(float(bound.offsets(float(s)).square().sum()) for s in strengths)
     assert field.origin is not None

@@ -131,7 +131,7 @@ def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None
     assert "is not a folder" in refusal(f"masks:{tmp_path}/nowhere", given)
     (masks / f"{name}.png").rename(masks / "other.png")
     Image.new("L", (SIZE, SIZE // 2)).save(masks / f"{name}.png")
-    assert "96x48 pixels, its camera 96x96" in refusal(f"masks:{masks}", told)
+    assert "96x48 pixels, its view 96x96" in refusal(f"masks:{masks}", told)
     (masks / f"{name}.png").write_bytes(b"no picture")
     assert "cannot be read as a picture" in refusal(f"masks:{masks}", told)
 

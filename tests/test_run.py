@@ -269,7 +269,7 @@ def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
         "{scene} --out r --region all --editor night --views 2",
         "{scene} --out r --region all --editor night --steps 3",
         "{scene} --out r --region all --editor night --steps many",
-        "{scene} --out r --region all --editor night --image-size 0",
+        "{scene} --out r --region all --editor night --image-size 8",
         "{scene} --out r --region all --editor night --name a/b",
         "{scene} --out r --region all --editor night --cameras nowhere.json",
         "{scene} --out {scene} --region all --editor night",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.ply import load_ply
 from progdf.scenes import DemoScene, bear, room
 from progdf.subject import fitted_eye, is_room, standpoint, subject_rows
@@ -30,9 +30,7 @@ def demo() -> DemoScene:
 
 
 def joined(*scenes: Gaussians) -> Gaussians:
-    return Gaussians(
-        *(torch.cat([getattr(scene, field.name) for scene in scenes]) for field in fields(Gaussians))
-    )
+    return Gaussians(**{name: torch.cat([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
 
 
 def shell(like: Gaussians, count: int, nearest: float, farthest: float, size: float) -> Gaussians:

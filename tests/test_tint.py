@@ -182,7 +182,7 @@ def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
         before, saved = hand.picture().astype(int), hand.stage.work.past
         hand.move(700 - 300 + 60, 166.0)
         hand.frame(60)
-        assert hand.stage.work.overlap == 0
+        assert hand.stage.work.overlap == 1, "the upper layer's card is the first"
         assert np.abs(hand.picture() - before).max() > 60
         hand.move(700 - 300 + 60, 136.0)
         hand.frame(3)

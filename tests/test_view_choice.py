@@ -162,8 +162,8 @@ def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     save_cameras(tmp_path / "c.json", [replace(c, lens=Lens(k1=0.1)) for c in demo.cameras])
     stand = make_stand(replace(options, cameras=tmp_path / "c.json"), demo.gaussians, region)
     assert len(stand.train) + len(stand.held_out) == 6
-    assert "6 of 32 cameras" in stand.notes[0]
-    assert "photographs:EDITED,ORIGINALS" in stand.notes[1]
+    assert "6 of 32 cameras" in stand.notes[1]
+    assert "photographs:EDITED,ORIGINALS" in stand.notes[2]
 
 
 def picked(likeness: Tensor, held_out: int) -> list[int]:

@@ -17,7 +17,7 @@ from progdf.rasterize import render
 from progdf.region import from_mask
 from tests.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.trained import small
-from trainer.editors import check_new_editor, make_editor
+from trainer.editors import EditorSettings, check_new_editor, make_editor
 from trainer.editors.folder import FolderEditor
 from trainer.views import fit_size, make_view, named, region_box, region_rig, seen_colors
 
@@ -111,7 +111,7 @@ def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path
 )
 def test_photographs_that_are_not_there_are_refused_in_one_line(tmp_path: Path, spec: str) -> None:
     with pytest.raises(ProgdfError, match="; ") as told:
-        check_new_editor(spec.format(tmp_path))
+        check_new_editor(spec.format(tmp_path), EditorSettings())
     assert "\n" not in str(told.value)
 
 

@@ -182,7 +182,7 @@ def trained(
             for found in way_there:
                 recordings.add(found)
                 if beside is not None:
-                    beside.add(found.step, followers.led(found.offsets) if followers else found.offsets)
+                    beside.add(found.step, found.offsets)
         except FloatingPointError as error:
             kept.save()
             raise ProgdfError(
