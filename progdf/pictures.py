@@ -165,7 +165,8 @@ def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
     """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
     make_folder(Path(path).parent)
     with written_whole(path) as beside:
-        to_picture(image).save(beside)
+        # zlib's level 2 takes half the time of Pillow's own 6 for files 5 % larger
+        to_picture(image).save(beside, compress_level=2)
 
 
 def _font(size: int) -> _Font:
