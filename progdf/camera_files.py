@@ -19,7 +19,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.colmap import find_model, load_model
 from progdf.errors import ProgdfError
-from progdf.files import open_failure, written_whole
+from progdf.files import check_regular, open_failure, written_whole
 from progdf.json_values import angle_at, decode_json, matrix_at, number_at, pixels_at, table_at
 from progdf.lens import Lens
 
@@ -110,6 +110,7 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     name = os.fspath(path)
     if Path(path).name in _MODEL_FILES and (model := find_model(Path(path).parent)):
         return load_model(model)
+    check_regular(path)
     try:
         content = decode_json(Path(path).read_bytes())
     except OSError as error:
@@ -138,6 +139,7 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
 
 def kind_of_cameras(path: str | os.PathLike[str]) -> str:
     """ "own" for a file that `save_cameras` wrote, "other" for anything else."""
+    check_regular(path)
     try:
         content = json.loads(Path(path).read_bytes())
     except OSError as error:

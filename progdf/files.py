@@ -6,6 +6,7 @@ import errno
 import os
 import platform
 import re
+import secrets
 import shutil
 import sys
 import tempfile
@@ -51,16 +52,12 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise ProgdfError(f"the folder {target.parent} does not exist; make it first")
     remove_abandoned(target.parent)
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
+    beside = target.parent / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}"
     try:
-        handle, name = tempfile.mkstemp(
-            dir=target.parent, prefix=f".progdf-{_HOST}-{os.getpid()}-", suffix=target.suffix
-        )
+        _create(beside, target.stat().st_mode & 0o777 if target.exists() else None)
     except OSError as error:
         raise unwritable(target, error) from error
-    os.close(handle)
-    beside = Path(name)
     try:
-        beside.chmod(target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~_umask())
         yield beside
         os.replace(beside, target)
     except (OSError, ProgdfError) as error:  # the latter of one within, which knows `beside` alone
@@ -70,6 +67,18 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise unwritable(target, full) from full
     finally:
         beside.unlink(missing_ok=True)
+
+
+def _create(path: Path, mode: int | None) -> None:
+    """A new empty file with these permissions; None: those of an ordinary file.
+
+    The system itself takes the umask off: to ask for the umask is to change it, for all threads.
+    """
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
+    os.close(handle)
+    if mode is not None:
+        with suppress(OSError):  # a file system without permissions
+            path.chmod(mode)
 
 
 @contextmanager
@@ -140,6 +149,16 @@ def disk_full(error: BaseException) -> OSError | None:
     return cause if isinstance(cause, OSError) and cause.errno in _FULL else None
 
 
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Refuse what can be opened but not read like a file.
+
+    Raises:
+        ProgdfError: it is a pipe, which is waited for, or a device, which may never end.
+    """
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        raise ProgdfError(f"{path} is a pipe or a device; give a file")
+
+
 def open_failure(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     """The one line for a file that cannot be opened."""
     if isinstance(error, FileNotFoundError):
@@ -147,9 +166,3 @@ def open_failure(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     if isinstance(error, IsADirectoryError) or Path(path).is_dir():
         return ProgdfError(f"{path} is a folder; give the name of a file in it")
     return ProgdfError(f"{path} cannot be read ({error.strerror or error}); check its permissions")
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask

@@ -25,7 +25,7 @@ import torch
 from progdf import gaussforge_child
 from progdf.compressed_ply import is_compressed, read_compressed_ply
 from progdf.errors import ProgdfError
-from progdf.files import open_failure
+from progdf.files import check_regular, open_failure
 from progdf.gaussians import Gaussians
 from progdf.ksplat import read_ksplat
 from progdf.load_report import LoadReport
@@ -54,6 +54,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         ProgdfError: it cannot be read.
     """
     path = scene_file(path)
+    check_regular(path)
     try:
         with path.open("rb") as file:
             start = file.read(64)

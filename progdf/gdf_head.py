@@ -18,7 +18,7 @@ import msgspec
 
 from progdf.errors import ProgdfError
 from progdf.field.neural import NeuralShape
-from progdf.files import open_failure
+from progdf.files import check_regular, open_failure
 from progdf.json_values import decode_json, typed
 
 FORMAT = 2
@@ -174,6 +174,7 @@ def read_head(path: str | os.PathLike[str]) -> GdfHead:
     Raises:
         ProgdfError: it is no .gdf, from a newer version, cut short, or its header is damaged.
     """
+    check_regular(path)
     try:
         with Path(path).open("rb") as file:
             start = file.read(9)

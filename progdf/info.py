@@ -16,7 +16,7 @@ from progdf.camera_files import load_cameras
 from progdf.checkpoint import open_gdf
 from progdf.command_line import parsed
 from progdf.errors import ProgdfError
-from progdf.files import open_failure
+from progdf.files import check_regular, open_failure
 from progdf.formats import load_scene_with_report, scene_file, scene_format
 from progdf.gdf_head import GdfHead
 from progdf.json_values import decode_json, typed
@@ -54,6 +54,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         ProgdfError: it cannot be read, or is nothing we know.
     """
     path = scene_file(path)
+    check_regular(path)
     try:
         with path.open("rb") as file:
             start = file.read(64)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
-from progdf.files import open_failure
+from progdf.files import check_regular, open_failure
 
 
 def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any]:
@@ -22,6 +22,7 @@ def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any
     Raises:
         ProgdfError: no such file, or none that `numpy.save` wrote of numbers.
     """
+    check_regular(path)
     try:
         array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.files import make_folder, written_whole
+from progdf.files import check_regular, make_folder, written_whole
 
 _PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -130,6 +130,7 @@ def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
+    check_regular(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is lower

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from progdf.errors import ProgdfError
-from progdf.files import open_failure
+from progdf.files import check_regular, open_failure
 
 MAX_HEADER_BYTES = 1 << 20
 """A header that has not ended by then is no header."""
@@ -110,6 +110,7 @@ def read_header(path: str | os.PathLike[str]) -> PlyHeader:
         ProgdfError: not a .ply, a broken header, or one that promises more than the file holds.
     """
     name = os.fspath(path)
+    check_regular(path)
     try:
         with Path(path).open("rb") as file:
             size = os.fstat(file.fileno()).st_size

@@ -28,7 +28,7 @@ from typing import Any
 import msgspec
 
 from progdf.errors import ProgdfError
-from progdf.files import open_failure, written_whole
+from progdf.files import check_regular, open_failure, written_whole
 from progdf.json_values import decode_json, typed
 
 VERSION = 1
@@ -125,6 +125,7 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
         ProgdfError: it cannot be read, is no session, of a newer version, or holds what no session holds.
     """
     name = Path(path).name
+    check_regular(path)
     try:
         with Path(path).open("rb") as file:
             content = file.read(_LARGEST + 1)
@@ -180,6 +181,7 @@ def sha256(path: Path) -> str:
     Raises:
         ProgdfError: it cannot be read.
     """
+    check_regular(path)
     try:
         state = path.stat()
         return _sha256(str(path), state.st_size, state.st_mtime_ns, state.st_ino)

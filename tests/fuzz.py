@@ -7,6 +7,7 @@ gigabyte. Failures are printed, one a line, and their inputs are kept in FOLDER.
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import resource
@@ -112,7 +113,7 @@ def changed_value(rng: random.Random, value: Any) -> Any:
         while isinstance(found, dict | list) and found and rng.random() < 0.8:
             inner, place = found, rng.choice(list(found) if isinstance(found, dict) else range(len(found)))
             found = inner[place]
-        other = rng.choice(VALUES)
+        other = copy.deepcopy(rng.choice(VALUES))  # which may be put into itself
         if inner is None or place is None:
             value = other if rng.random() < 0.2 else value
         elif (kind := rng.randrange(6)) == 0:

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from progdf.camera_files import load_cameras
+from progdf.checkpoint import load_gdf
 from progdf.errors import ProgdfError
 from progdf.files import is_temporary, written_whole
+from progdf.formats import load_scene
+from progdf.info import kind_of
+from progdf.npy import open_npy
+from progdf.pictures import open_picture
+from progdf.session_file import read_session, sha256
 from tests.full_disk import files_up_to
+from tests.refused import refusal
 
 
 def test_a_file_appears_when_it_is_complete_and_not_before(tmp_path: Path) -> None:
@@ -75,6 +85,22 @@ def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: P
         assert path.stat().st_mode == mode
 
 
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+def test_a_new_file_obeys_the_umask_and_nobody_elses_is_touched(
+    mask: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    earlier = os.umask(mask)
+    try:
+        with monkeypatch.context() as patched:
+            # the process's umask holds for all its threads: to look at it is to change it for a moment
+            patched.setattr(os, "umask", lambda mask: pytest.fail("the umask was changed"))
+            with written_whole(tmp_path / "new.txt") as beside:
+                beside.write_text("x")
+    finally:
+        os.umask(earlier)
+    assert (tmp_path / "new.txt").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
 def test_the_suffix_is_kept_for_writers_that_go_by_it(tmp_path: Path) -> None:
     with written_whole(tmp_path / "picture.png") as beside:
         assert beside.suffix == ".png"
@@ -90,10 +116,10 @@ def test_a_missing_folder_and_a_folder_in_place_of_a_file_are_one_line(tmp_path:
 def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(**_: object) -> None:
-        raise PermissionError(13, "Permission denied", str(tmp_path / ".out.x1y2.txt"))
+    def refused(beside: Path, _: int | None) -> None:
+        raise PermissionError(13, "Permission denied", str(beside))
 
-    monkeypatch.setattr("progdf.files.tempfile.mkstemp", refused)
+    monkeypatch.setattr("progdf.files._create", refused)
     path = tmp_path / "out.txt"
     with pytest.raises(ProgdfError) as told, written_whole(path):
         pass
@@ -112,6 +138,22 @@ def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) ->
         assert link.is_symlink()
         assert real.read_text() == "whole"
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["new.txt", "old.txt"]
+
+
+@pytest.mark.parametrize(
+    "read", [load_scene, load_gdf, kind_of, load_cameras, open_npy, open_picture, read_session, sha256]
+)
+def test_a_pipe_that_is_read_from_is_refused_and_not_waited_for(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    signal.alarm(20)  # ends the process, where a reader waits
+    try:
+        for path in (pipe, Path("/dev/zero")):
+            assert refusal(read, path) == f"{path} is a pipe or a device; give a file"
+    finally:
+        signal.alarm(0)
 
 
 def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:

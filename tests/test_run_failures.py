@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,10 +91,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(
 ) -> None:
     OUT.mkdir()
 
-    def mkstemp(**_: object) -> None:
-        raise OSError(30, os.strerror(30), "run/.log.txt")
+    def create(beside: Path, _: int | None) -> None:
+        raise OSError(30, os.strerror(30), str(beside))
 
-    monkeypatch.setattr(tempfile, "mkstemp", mkstemp)
+    monkeypatch.setattr("progdf.files._create", create)
     with pytest.raises(ProgdfError, match=r"run.log\.txt cannot be written \(Read-only file system\); "):
         train(small_run(bear_folder), quiet=True)
     with pytest.raises(ProgdfError, match="cannot be made"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from progdf.camera_files import load_cameras
-from progdf.files import open_failure
+from progdf.files import check_regular, open_failure
 from progdf.region_spec import check_region
 from trainer.artefacts import check_folder
 from trainer.editors import check_editor, check_new_editor
@@ -30,6 +30,7 @@ def check_command(options: TrainOptions, edit: Mapping[str, str]) -> None:
     check_editor(options.editor)
     folder = check_folder(options.out, edit)
     if not options.scene.is_dir():  # some formats are folders
+        check_regular(options.scene)
         try:
             options.scene.open("rb").close()
         except OSError as error:

@@ -22,7 +22,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from progdf.errors import ProgdfError
-from progdf.files import open_failure, written_whole
+from progdf.files import check_regular, open_failure, written_whole
 from progdf.info import TIMELINE_MARK as MARK
 from progdf.json_values import decode_json
 
@@ -88,6 +88,7 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
         ProgdfError: the file is missing, no timeline, damaged, of a newer version, or names an edit that is
             not open.
     """
+    check_regular(path)
     try:
         with path.open("rb") as opened:
             text = opened.read(_LARGEST + 1)
