@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import get_args
 
 import pytest
@@ -13,7 +13,7 @@ from trainer.cli import train_options
 from trainer.objective import LossWeights
 from trainer.options import Preset, TrainOptions, settled
 from trainer.presets import PRESETS, under_preset
-from trainer.settings import loss_weights, pgs_settings, stages_to_ask
+from trainer.settings import idle_options, loss_weights, pgs_settings, stages_to_ask
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
 
@@ -95,6 +95,20 @@ def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() ->
     for kind in ("colour", "style"):
         weights = loss_weights(options, kind)
         assert (weights.perceptual, weights.sharpness, weights.sharpness_weight) == (0.0, "hinge", 0.9)
+
+
+def test_options_that_change_nothing_are_named() -> None:
+    lpips = asked("--perceptual", "vgg", "--perceptual-every", "1")
+    assert idle_options(asked(), "colour") == []
+    assert idle_options(lpips, "colour") == ["--perceptual", "--perceptual-every"], "colors are solved for"
+    assert idle_options(lpips, "style") == []
+    assert idle_options(replace(lpips, perceptual_weight=0.1), "colour") == []
+    assert idle_options(asked("--perceptual", "vgg", "--perceptual-weight", "0"), "style") == ["--perceptual"]
+    assert idle_options(asked("--preset", "paper"), "colour") == []
+    weights = asked("--progressive-weight", "2", "--sharpness-weight", "2")
+    assert idle_options(weights, "geometry") == ["--progressive-weight", "--sharpness-weight"]
+    assert idle_options(asked("--group-steps", "9", "--no-follow"), "colour") == ["--group-steps"]
+    assert idle_options(asked("--group-steps", "9", "--no-follow"), "geometry") == ["--no-follow"]
 
 
 def test_only_the_warm_up_shortens_the_first_steps() -> None:

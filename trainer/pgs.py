@@ -5,8 +5,12 @@ worse than a straight line (method.md 3), so the targets are staged here: the ed
 several strengths and the members are optimised towards each in turn. Within a stage the target moves too,
 from the last stage's pictures to its own, so that the way between them is short and straight.
 
-Measured on playbot_31k, its robot recoloured, 600 steps, held-out views, PSNR to the editor's picture: with 4
-stages 29.3 dB at the stages and 27.4 (worst 24.2) half way between them, with 8 stages 30.4 and 30.8 (27.9).
+Edits of colours alone are solved for instead, all views at once (`color_solver`), unless something is asked
+for that only a descent view by view has (`settings.solves_colors`).
+
+Measured on playbot_31k, its robot recoloured by such a descent, 600 steps, held-out views, PSNR to the
+editor's picture: with 4 stages 29.3 dB at the stages and 27.4 (worst 24.2) half way between them, with 8
+stages 30.4 and 30.8 (27.9).
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ from trainer.reedit import reedit
 from trainer.regions import region_kinds, region_settings
 from trainer.reopen import its_views, reopened
 from trainer.resume import kept_region, one_line, open_session, plain_options, still_there
-from trainer.settings import objective_line, slider_meant, stages_to_ask
+from trainer.settings import idle_options, objective_line, slider_meant, stages_to_ask
 from trainer.training import retimed, trained
 from trainer.trajectory import before_fit
 from trainer.views import pictured
@@ -237,6 +237,8 @@ def _record(
     kind, scene, region = approach.kind, stand.scene, stand.region
     objective = objective_line(options, kind, perceptual.name)
     log.say(f"loss: {objective}")
+    if idle := idle_options(options, kind):
+        log.say(f"{', '.join(idle)}: without effect on this {kind} edit, whose loss is {objective}")
     with log.stage("optimise"):
         renewal = reedit(options, stand, kind, folder, log)
         followers = followers_of(options, stand, kind)

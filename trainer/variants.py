@@ -10,7 +10,7 @@ from progdf.errors import ProgdfError
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.presets import PRESETS
-from trainer.settings import PERCEPTUAL_WEIGHT, SHARPNESS, slider_meant
+from trainer.settings import PERCEPTUAL_WEIGHT, SHARPNESS, slider_meant, solves_colors
 
 BASE, LINEAR = "base", "2-keyframes"
 
@@ -102,6 +102,7 @@ def chosen(variants: Sequence[Variant], only: str) -> list[Variant]:
 def _resolved(options: TrainOptions, kind: EditKind, stages: int) -> TrainOptions:
     """With the kind's own values in place of "auto" and None."""
     weight = PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight
+    weight = 0.0 if solves_colors(options, kind) else weight
     sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness
     slider = slider_meant(options.slider, options.editor, (1.0,) * stages)
     return replace(options, perceptual_weight=weight, sharpness=sharpness, slider=slider)
