@@ -6,17 +6,22 @@ passed on, are not read: pycolmap gets the other files beside an empty list of p
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
+import subprocess
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import torch
 
+from progdf import colmap_child
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.files import open_failure
+from progdf.json_values import decode_json, typed
 from progdf.lens import Lens
 
 _NEEDED = ("cameras", "images")
@@ -37,6 +42,18 @@ _LENSES = {
 """Camera models that are a pinhole behind a lens → what their parameters after the principal point mean."""
 
 
+class _Image(msgspec.Struct):
+    """A registered image: world → camera, OpenCV axes, pixel centres at +0.5, as ours."""
+
+    name: str
+    pose: list[list[float]]
+    K: list[list[float]]
+    width: int
+    height: int
+    model: str
+    params: list[float]
+
+
 def find_model(folder: Path) -> Path | None:
     """The sparse model in a folder: itself, sparse/0, sparse, 0 or colmap/sparse/0; None where none is."""
     for place in _PLACES:
@@ -55,12 +72,10 @@ def load_model(model: Path) -> list[Camera]:
         ProgdfError: pycolmap is not installed, a file is broken, a camera is no pinhole behind a lens that
             we know, or no image is registered.
     """
-    try:
-        import pycolmap
-    except ImportError:
+    if importlib.util.find_spec("pycolmap") is None:
         raise ProgdfError(
             f"{model} is a COLMAP model, which needs pycolmap; pip install 'progdf-studio[colmap]'"
-        ) from None
+        )
     suffix = _suffix(model)
     with tempfile.TemporaryDirectory() as beside:
         try:
@@ -71,17 +86,28 @@ def load_model(model: Path) -> list[Camera]:
         except OSError as error:
             raise open_failure(error.filename or model, error) from None
         Path(beside, f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
-        try:
-            found = pycolmap.Reconstruction(beside)
-            images = [image for _, image in sorted(found.images.items()) if image.has_pose]
-        # what pycolmap raises where a file is cut off or is something else
-        except (ValueError, IndexError, RuntimeError, MemoryError, UnicodeDecodeError):
-            raise ProgdfError(
-                f"{model} is a broken COLMAP model; export cameras{suffix} and images{suffix} again"
-            ) from None
+        images = _images(Path(beside))
+    if images is None:
+        raise ProgdfError(
+            f"{model} is a broken COLMAP model; export cameras{suffix} and images{suffix} again"
+        )
     if not images:
         raise ProgdfError(f"{model} has no registered image; at least one would be right")
-    return [_camera(model, image) for image in sorted(images, key=lambda image: str(image.name))]
+    return [_camera(model, image) for image in sorted(images, key=lambda image: image.name)]
+
+
+def _images(folder: Path) -> list[_Image] | None:
+    """What pycolmap reads, in a process of its own (see `colmap_child`); None: nothing that it can."""
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    memory, seconds = (1 << 30) + 64 * size, 10 + int(2e-6 * size)
+    words = [sys.executable, "-P", colmap_child.__file__, str(folder), str(memory), str(seconds)]
+    try:
+        ended = subprocess.run(
+            words, stdin=subprocess.DEVNULL, capture_output=True, timeout=6 * seconds, check=False
+        )
+        return None if ended.returncode else typed(decode_json(ended.stdout), list[_Image])
+    except (subprocess.TimeoutExpired, ValueError):
+        return None
 
 
 def _suffix(model: Path) -> str | None:
@@ -91,15 +117,14 @@ def _suffix(model: Path) -> str | None:
     return None
 
 
-def _camera(model: Path, image: Any) -> Camera:
-    """`image` is a pycolmap.Image: world → camera, OpenCV axes, pixel centres at +0.5, as ours."""
+def _camera(model: Path, image: _Image) -> Camera:
     where = f"image {image.name} of {model}"
-    lens = _lens(where, image.camera)
+    lens = _lens(where, image)
     viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.from_numpy(image.cam_from_world().matrix())
-    K = torch.from_numpy(image.camera.calibration_matrix())
     try:
-        camera = Camera(viewmat.float(), K.float(), image.camera.width, image.camera.height, image.name)
+        viewmat[:3] = torch.tensor(image.pose, dtype=torch.float64)
+        K = torch.tensor(image.K, dtype=torch.float64)
+        camera = Camera(viewmat.float(), K.float(), image.width, image.height, image.name)
     except ValueError as error:
         raise ProgdfError(f"{where} is broken: {error}") from None
     rotation = viewmat[:3, :3]
@@ -108,15 +133,15 @@ def _camera(model: Path, image: Any) -> Camera:
     return replace(camera, lens=lens)
 
 
-def _lens(where: str, camera: Any) -> Lens | None:
-    kind = camera.model.name
+def _lens(where: str, image: _Image) -> Lens | None:
+    kind = image.model
     if kind not in _LENSES:
         raise ProgdfError(
             f"{where} has the camera model {kind}; only pinhole cameras can be used: "
             "run colmap image_undistorter and give its sparse folder"
         )
     first = 3 if kind.startswith("SIMPLE") or kind == "RADIAL" else 4
-    numbers = [float(number) for number in camera.params[first:]]
+    numbers = [float(number) for number in image.params[first:]]
     names = _LENSES[kind]
     if any(numbers[len(names) :]):
         raise ProgdfError(

@@ -7,7 +7,6 @@ gigabyte. Failures are printed, one a line, and their inputs are kept in FOLDER.
 
 from __future__ import annotations
 
-import copy
 import json
 import random
 import resource
@@ -20,22 +19,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.torch
 import torch
 from PIL import Image
 
 from progdf.camera_files import load_cameras, save_cameras
-from progdf.checkpoint import _checksum, load_gdf, save_gdf
+from progdf.checkpoint import load_gdf, save_gdf
 from progdf.errors import ProgdfError
-from progdf.gdf_head import head_checksum
 from progdf.info import _DESCRIBE, kind_of
 from progdf.npy import open_npy
 from progdf.pictures import open_picture
 from progdf.ply import load_ply, save_ply
-from progdf.tensor_file import table_of, write_tensors
 from progdf.trajectory import load_trajectory, save_trajectory
 from tests.edits import curved_field, edit_of, some_rows
-from tests.hostile import JSON_TEXTS
+from tests.fuzz_changes import Change, changed_bytes, changed_gdf, changed_json, changed_parts
+from tests.fuzz_folders import COSTLY, more_inputs
 from tests.ply_files import camera_element, face_element, scene_of, write
 from tests.ply_files import table_of as columns_of
 from tests.scenes import orbit_camera, random_gaussians
@@ -46,163 +43,6 @@ from viewer import session, timeline_file
 
 SECONDS, BYTES = 10, 1 << 30
 """What one input may take, at most."""
-
-VALUES: list[Any] = [
-    *(
-        None,
-        True,
-        False,
-        0,
-        -1,
-        1,
-        7,
-        2**31,
-        2**63,
-        -(2**70),
-        1e-300,
-        1e300,
-        0.5,
-        "",
-        "a",
-        "means",
-        "\0",
-        "/",
-    ),
-    *("\x1b[2J\n", "ä" * 300, "9" * 5000, [], {}, [[]], [0] * 5000, {"a": {"b": []}}, "../../../etc/passwd"),
-]
-"""In place of what a file holds."""
-
-Change = Callable[[random.Random, Path], None]
-"""Writes another input to a path."""
-
-
-def changed_bytes(content: bytes) -> Change:
-    """Damage as of disks and downloads."""
-
-    def change(rng: random.Random, path: Path) -> None:
-        data = bytearray(content)
-        for _ in range(rng.choice([1, 1, 1, 2, 6])):
-            at = (
-                rng.randrange(len(data) + 1) if rng.random() < 0.5 else rng.randrange(min(len(data), 400) + 1)
-            )
-            length = rng.choice([1, 1, 2, 4, 8, 100])
-            kind = rng.randrange(6)
-            if kind == 0:
-                data[at : at + 1] = bytes([rng.randrange(256)])
-            elif kind == 1:
-                data[at : at + length] = rng.choice([b"\xff", b"\0", b"9", b"["]) * length
-            elif kind == 2:
-                data[at:at] = rng.randbytes(length)
-            elif kind == 3:
-                data[at:at] = data[at : at + 50 * length]
-            elif kind == 4:
-                del data[at : at + length]
-            else:
-                del data[at:]
-        path.write_bytes(bytes(data))
-
-    return change
-
-
-def changed_value(rng: random.Random, value: Any) -> Any:
-    """A JSON value with one to three places of it replaced, removed or doubled."""
-    value = json.loads(json.dumps(value))
-    for _ in range(rng.choice([1, 1, 2, 3])):
-        inner, place = None, None
-        found = value
-        while isinstance(found, dict | list) and found and rng.random() < 0.8:
-            inner, place = found, rng.choice(list(found) if isinstance(found, dict) else range(len(found)))
-            found = inner[place]
-        other = copy.deepcopy(rng.choice(VALUES))  # which may be put into itself
-        if inner is None or place is None:
-            value = other if rng.random() < 0.2 else value
-        elif (kind := rng.randrange(6)) == 0:
-            del inner[place]
-        elif kind == 1 and isinstance(inner, dict):
-            inner[rng.choice(["extra", "", "a" * 5000, "\x1b"])] = other
-        elif kind == 2 and isinstance(inner, list):
-            inner.append(inner[place])
-        elif kind == 3 and isinstance(found, int | float):
-            inner[place] = rng.choice([-found, found * 1e30, found + 1, str(found), [found]])
-        else:
-            inner[place] = other
-    return value
-
-
-def changed_json(content: bytes) -> Change:
-    """Damage as by somebody who knows the form: other values, and now and then what is no JSON at all."""
-
-    def change(rng: random.Random, path: Path) -> None:
-        text = json.dumps(changed_value(rng, json.loads(content)))
-        if rng.random() < 0.1:
-            at = rng.randrange(len(text))
-            text = text[:at] + rng.choice(list(JSON_TEXTS.values())) + text[at + 1 :]
-        path.write_text(text)
-
-    return change
-
-
-def changed_tensors(rng: random.Random, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Tensors of which one has other numbers, another type, shape or name, or is gone."""
-    tensors = dict(tensors)
-    name = rng.choice(sorted(tensors))
-    tensor = tensors.pop(name)
-    kind = rng.randrange(7)
-    if kind == 0:
-        tensors[name] = tensor[: len(tensor) // 2] if tensor.ndim else tensor
-    elif kind == 1:
-        tensors[name] = tensor.to(
-            rng.choice([torch.float64, torch.int8, torch.uint8, torch.int64, torch.float16])
-        )
-    elif kind == 2:
-        tensors[name] = tensor.reshape(
-            rng.choice([(-1,), (1, -1), (-1, 1)]) if tensor.numel() else tensor.shape
-        )
-    elif kind == 3:
-        tensors[name] = tensor.clone()
-        tensors[name].reshape(-1)[: rng.choice([1, 5, 10**6])] = rng.choice([0, -1, 1, 100])
-    elif kind == 4 and tensor.is_floating_point():
-        filled = tensor.clone().reshape(-1)
-        filled[: rng.choice([1, 10**6])] = rng.choice([3e38, -3e38, float("nan"), float("inf"), 1e-40])
-        tensors[name] = filled.reshape(tensor.shape)
-    elif kind == 5:
-        tensors["extra"] = tensor
-    return tensors
-
-
-def changed_gdf(content: bytes) -> Change:
-    """An edit with another header or other tensors, signed as if progdf had written it."""
-    size = int.from_bytes(content[:8], "little")
-    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
-    tensors = safetensors.torch.load(content)
-
-    def change(rng: random.Random, path: Path) -> None:
-        text = json.dumps(changed_value(rng, header) if rng.random() < 0.7 else header)
-        found = changed_tensors(rng, tensors) if rng.random() < 0.5 else tensors
-        found = {name: tensor.contiguous() for name, tensor in found.items()}
-        metadata = {"progdf": text, "sha256": _checksum(text, found)}
-        if rng.random() < 0.7:
-            metadata["header_sha256"] = head_checksum(text, table_of(found))
-        path.write_bytes(safetensors.torch.save(found, metadata))
-
-    return change
-
-
-def changed_parts(content: bytes, key: str) -> Change:
-    """A tensor file with another JSON text among its metadata, or other tensors, its checksum made to fit."""
-    size = int.from_bytes(content[:8], "little")
-    metadata = json.loads(content[8 : 8 + size])["__metadata__"]
-    metadata.pop("crc32", None)
-    tensors = safetensors.torch.load(content)
-
-    def change(rng: random.Random, path: Path) -> None:
-        told = metadata
-        if rng.random() < 0.6:
-            told = {**metadata, key: json.dumps(changed_value(rng, json.loads(metadata[key])))}
-        found = changed_tensors(rng, tensors) if rng.random() < 0.6 else tensors
-        write_tensors(path, found, told, checksum=rng.random() < 0.8)
-
-    return change
 
 
 def read_info(path: Path) -> None:
@@ -223,7 +63,7 @@ def read_state(path: Path) -> None:
     StateFolder(path.parent).load(path.stem)
 
 
-def inputs(folder: Path) -> dict[str, tuple[str, Callable[[Path], Any], list[Change]]]:
+def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], Any], list[Change]]]:
     """By reader: the file's name, the reader, and what is done to a good file."""
     scene = random_gaussians(40, seed=1, sh_degree=1)
     edit = edit_of(scene, some_rows(scene, 12), curved_field(12, channels=14 + 9))
@@ -273,6 +113,7 @@ def inputs(folder: Path) -> dict[str, tuple[str, Callable[[Path], Any], list[Cha
     gdf, parts = read(folder / "a.gdf"), read(folder / "t.safetensors")
     part = read(folder / "state" / "part.safetensors")
     return {
+        **more_inputs(folder, reader),
         "ply": ("x.ply", load_ply, plys),
         "gdf": ("x.gdf", read_gdf, [changed_gdf(gdf), changed_gdf(gdf), changed_bytes(gdf)]),
         "session": ("s/x.session.json", session.open_session, both(read(saved))),
@@ -317,12 +158,19 @@ READERS = (
     "state",
     "run.json",
     "info",
+    "compressed",
+    "ksplat",
+    "masks",
+    "labels",
+    "members",
+    "kernels",
+    *COSTLY,
 )
 
 
 def failures(reader: str, count: int, seed: int, folder: Path) -> Iterator[str]:
     """What got through, a line each; the inputs are kept."""
-    name, read, changes = inputs(folder)[reader]
+    name, read, changes = inputs(folder, reader)[reader]
 
     def late(*_: object) -> None:
         raise TimeoutError
@@ -334,7 +182,7 @@ def failures(reader: str, count: int, seed: int, folder: Path) -> Iterator[str]:
     for i in range(count):
         rng = random.Random(f"{seed} {reader} {i}")
         rng.choice(changes)(rng, path)
-        signal.alarm(SECONDS)
+        signal.alarm(SECONDS * (10 if reader in COSTLY else 1))
         try:
             read(path)
             wrong = ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -156,6 +155,15 @@ DAMAGES: dict[str, Damage] = {
 }
 
 
+def test_a_model_that_claims_more_points_than_its_file_has_is_refused(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "m", views())
+    content = bytearray((model / "images.bin").read_bytes())
+    at = content.index(b".jpg\0") + 5
+    content[at : at + 8] = (1 << 40).to_bytes(8, "little")
+    (model / "images.bin").write_bytes(bytes(content))
+    assert "broken COLMAP model" in refusal(load_cameras, model)
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_broken_model_is_one_line(tmp_path: Path, damage: str) -> None:
     model = write_model(tmp_path / "m", views())
@@ -178,5 +186,5 @@ def test_a_folder_with_one_file_of_cameras_is_that_file(tmp_path: Path) -> None:
 
 def test_without_pycolmap_the_line_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = write_model(tmp_path / "m", views())
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    monkeypatch.setattr("progdf.colmap.importlib.util.find_spec", lambda name: None)
     assert "progdf-studio[colmap]" in refusal(load_cameras, model)
