@@ -39,7 +39,6 @@ Reader = tuple[str, Callable[[Path], Any], list[Change]]
 FILES_OF_RUNS = {
     "resume run.json": "state/run.json",
     "resume training": "state/training.safetensors",
-    "resume edited": "state/edited.safetensors",
     "resume region": "state/region.safetensors",
     "resume recordings": "state/recordings/000001.safetensors",
     "fit trajectory": "trajectory.safetensors",

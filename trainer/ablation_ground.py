@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +18,7 @@ from trainer.fit import visibility
 from trainer.judge import Judge, make_judge
 from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, TrainOptions
 from trainer.preparation import Pictures, Stand, widened
-from trainer.reopen import FinishedRun, its_views
+from trainer.reopen import FinishedRun, its_views, options_of
 from trainer.report import Columns, columns_of
 from trainer.variants import Variant
 from trainer.views import View
@@ -58,13 +58,11 @@ class Ground:
 
 
 def run_options(run: FinishedRun) -> TrainOptions:
-    """The options of a finished run; what it does not know, as it is older, is as by default."""
-    known = {field.name for field in fields(TrainOptions)}
-    given = {name: value for name, value in run.about["options"].items() if name in known}
-    if given.get("group_steps") is None:
-        given["group_steps"] = run.about.get("group_steps")
-    paths = {name: Path(given[name]) for name in ("scene", "out", "cameras") if given.get(name) is not None}
-    return TrainOptions(**{**given, **paths})
+    """The options of a finished run, with the group steps that it found out."""
+    options = options_of(run.about)
+    if options.group_steps is None:
+        return replace(options, group_steps=run.about.get("group_steps"))
+    return options
 
 
 def make_ground(run: FinishedRun, options: TrainOptions, kind: EditKind, quick: bool) -> Ground:

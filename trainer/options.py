@@ -140,12 +140,13 @@ class TrainOptions:
     """Learning rates: as the kind of edit needs, with short steps on the last stretch; or 3DGS's own, flat,
     for all attributes (paper), which hardly move in 600 steps."""
     perceptual: Net = "alex"
-    """LPIPS through AlexNet, or VGG16, with which a run takes more than twice as long and is no better."""
+    """style, geometry: LPIPS through AlexNet, or VGG16, with which a run takes more than twice as long and is
+    no better."""
     perceptual_weight: float | None = None
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
     perceptual_every: int = 2
-    """LPIPS is paid for every so many steps (paper: 1)."""
+    """style, geometry: LPIPS is paid for every so many steps (paper: 1)."""
     progressive: Progressive = "off"
     """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as the loss that it
     is, which lets go of the steps (decay) or tightens (growth). As a loss it freezes the edit."""
@@ -283,11 +284,7 @@ def settled(options: TrainOptions) -> TrainOptions:
             stages=min(options.stages, QUICK_STAGES),
             views=min(options.views, QUICK_VIEWS),
         )
-    name = options.name or options.out.resolve().name
-    if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
-        raise ProgdfError(f"'{name}' cannot be a layer's name; choose one with --name, as --name shirt")
-    if len(f"{name}.gdf".encode()) > LONGEST_NAME:
-        raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
+    name = checked_name(options.name or options.out.resolve().name)
     check_ranges(
         ("--views", options.views, 3, 96),
         ("--image-size", options.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
@@ -321,6 +318,19 @@ def settled(options: TrainOptions) -> TrainOptions:
     _check_editor_options(options)
     check_network_options(options)
     return replace(options, name=name)
+
+
+def checked_name(name: str) -> str:
+    """The name of a layer and its file, if it can be one.
+
+    Raises:
+        ProgdfError: it cannot.
+    """
+    if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
+        raise ProgdfError(f"'{name}' cannot be a layer's name; choose one with --name, as --name shirt")
+    if len(f"{name}.gdf".encode()) > LONGEST_NAME:
+        raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
+    return name
 
 
 def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:

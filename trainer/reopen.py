@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from progdf.json_values import typed
 from progdf.region import Region
 from progdf.trajectory import Trajectory, load_trajectory
 from trainer.artefacts import RunFolder
+from trainer.editors.base import EditKind
+from trainer.options import TrainOptions, checked_name
 from trainer.preparation import Stand
 from trainer.trajectory import before_fit
 from trainer.views import make_view, near_enough
@@ -50,6 +52,16 @@ class _About(msgspec.Struct):
     held_out: list[str]
     background: tuple[float, float, float]
     options: dict[str, Any]
+    objective: str
+    losses: dict[str, list[float | None]]
+    attribute_worth_db: dict[str, float]
+    kind: EditKind | None = None
+    group_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        columns = [self.losses.get(name, []) for name in ("step", "left")]
+        if not all(columns) or len({len(column) for column in self.losses.values()}) > 1:
+            raise ValueError("its losses do not fit each other")
 
 
 def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
@@ -68,7 +80,12 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
         told = typed(about, _About)
+        options_of(about)
         name = typed(told.options["name"], str)
+        try:
+            checked_name(name)
+        except ProgdfError:
+            raise ValueError("its name is none") from None
         members, score = extra["members"], extra["score"]
         path = scene or Path(told.scene)
         if not os.path.isfile(scene_file(path)):
@@ -79,6 +96,7 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
                 f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
                 "give that one with --scene"
             )
+        trajectory = before_fit(trajectory, extra)
         region = Region(name, members, score)
         if len(region) != trajectory.end.shape[0]:
             raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")
@@ -86,7 +104,27 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
         raise
     except (KeyError, TypeError, ValueError) as error:
         raise ProgdfError(f"{folder.trajectory} is damaged ({error}); train again") from error
-    return FinishedRun(folder, gaussians, region, before_fit(trajectory, extra), about)
+    return FinishedRun(folder, gaussians, region, trajectory, about)
+
+
+def options_of(about: Mapping[str, Any]) -> TrainOptions:
+    """The options of a finished run; what it does not know, as it is older, is as by default.
+
+    Raises:
+        ValueError: one is of another type.
+    """
+    known = {field.name for field in fields(TrainOptions)}
+    given = {name: value for name, value in about["options"].items() if name in known}
+    try:
+        return msgspec.convert(given, TrainOptions, dec_hook=_path)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from None
+
+
+def _path(kind: type, value: object) -> object:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"{value!r} is no {kind.__name__}")
 
 
 def its_views(run: FinishedRun) -> Stand:

@@ -148,8 +148,16 @@ def with_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory:
 
 
 def before_fit(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajectory:
-    """A trajectory read from its file, as it was before a field's slider was laid over it (`lay_over`)."""
-    return replace(trajectory, s=extra.get(_BEFORE, trajectory.s))
+    """A trajectory read from its file, as it was before a field's slider was laid over it (`lay_over`).
+
+    Raises:
+        ValueError: that slider does not fit the recordings.
+    """
+    s = extra.get(_BEFORE, trajectory.s)
+    fits = s.shape == trajectory.s.shape and s.dtype == trajectory.s.dtype
+    if not fits or (float(s[0]), float(s[-1])) != (0.0, 1.0) or not bool((s.diff() > 0).all()):
+        raise ValueError(f"{_BEFORE} does not fit its recordings")
+    return replace(trajectory, s=s)
 
 
 def lay_over(path: Path, dial: Dial) -> Trajectory:
