@@ -238,6 +238,8 @@ def test_a_name_that_a_session_has_is_asked_about(window: application.App, folde
         press(window, answer)
     assert question(window).kind == "save"
     assert question(window).text == str(saved)
+    by_hand(window, text="another name")
+    assert question(window).text == "another name", "the field has the keyboard"
     assert saved.read_bytes() == yesterday
     window.desk.serve(f"overwrite:{saved}")
     assert window.stage.work.dialog is None

@@ -328,7 +328,7 @@ class Desk:
         """
         stage, file = self._app.stage, _session_file(_typed(path))
         if not overwrite and file != self.path and file.is_file() and kind_of(file) == "session":
-            stage.ask(Dialog("overwrite", path, then))
+            stage.ask(Dialog("overwrite", str(file), then))
             return
         error = _failure(lambda: self.save(_typed(path)))
         if error:

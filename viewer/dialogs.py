@@ -107,8 +107,9 @@ def _content(
     if dialog.chosen:
         return _given(dialog, dialog.chosen)
     if dialog.kind in _CHOICES:
+        _is_new(dialog.kind)
         return _chosen(dialog, _pressed(_CHOICES[dialog.kind], pressed, ui))
-    if imgui.is_window_appearing() or (dialog.error and not imgui.is_any_item_active()):
+    if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
         imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
@@ -139,6 +140,14 @@ def _content(
     if path and (button == name or "Enter" in pressed):
         return _given(dialog, path)
     return Answer(dialog)
+
+
+def _is_new(kind: str) -> bool:
+    """Whether this question was not asked in the last frame; another one may have been, in the same popup."""
+    storage, slot, number = imgui.get_state_storage(), int(imgui.get_id("kind")), 1 + [*TITLES].index(kind)
+    changed = storage.get_int(slot) != number
+    storage.set_int(slot, number)
+    return bool(changed or imgui.is_window_appearing())
 
 
 def _given(dialog: Dialog, path: str) -> Answer:

@@ -37,7 +37,10 @@ _NAMES = {
     glfw.KEY_RIGHT_BRACKET: "]",
     glfw.KEY_COMMA: ",",
     glfw.KEY_PERIOD: ".",
+    glfw.KEY_KP_ENTER: "Enter",
 }
+_X11_LINE_FEED = 109
+"""Scancode of a key that keyboards lack and programs that type for one press as Enter; glfw has no name for it."""
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),
     (glfw.CONTEXT_VERSION_MINOR, 3),
@@ -102,7 +105,11 @@ class Window:
             wake()
 
         def on_key(_: object, key: int, scancode: int, action: int, mods: int) -> None:
+            if key == glfw.KEY_UNKNOWN and scancode == _X11_LINE_FEED:
+                key = glfw.KEY_ENTER
             self._note_key(key, scancode, action, mods)
+            if scancode == _X11_LINE_FEED and action != glfw.REPEAT:  # imgui's own callback does not know it
+                imgui.get_io().add_key_event(imgui.Key.enter, action == glfw.PRESS)
             wake()
 
         def on_drop(_: object, names: Sequence[str]) -> None:
