@@ -419,6 +419,20 @@ def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: app
     assert "~nobody-here/bear.ply" in message(window)
 
 
+@pytest.mark.gl
+@pytest.mark.parametrize("name", ["x" * 300, "/".join(["x" * 200] * 30), "a\0b", "\x1b[2J\n"])
+def test_a_path_that_no_file_can_have_is_one_line(window: application.App, name: str) -> None:
+    for request in (f"open_file:{name}", f"replace_by:0:{name}"):
+        window.desk.serve(request)
+        assert message(window)
+        assert "\x1b" not in message(window)
+        window.draw()
+    for path in (f"no folder/{name}", "/"):
+        window.desk.serve(f"save_to:{path}")
+        assert question(window).error
+        window.draw()
+
+
 def test_f4_keeps_each_view_as_a_camera_beside_the_session(window: application.App, folder: Path) -> None:
     assert window.document.path is not None
     kept = folder / f"{window.document.path.stem}.cameras.json"

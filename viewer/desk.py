@@ -5,7 +5,6 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ from progdf.camera_files import load_cameras
 from progdf.checkpoint import Gdf, load_gdf
 from progdf.errors import ProgdfError
 from progdf.info import kind_of
-from progdf.session_file import SUFFIX
 
 from . import autosave as autosaves
 from . import document as documents
@@ -28,6 +26,7 @@ from .stage import Stage
 from .state import Timeline, ViewState
 from .threads import all_threads
 from .turntable import first_camera, from_camera, to_camera
+from .typed_paths import session_file, typed
 from .upright import up_of
 from .workspace import Dialog
 
@@ -79,7 +78,7 @@ class Desk:
         elif name == "browse":
             self._browse()
         elif name == "open_file":
-            self.open(_typed(argument))
+            self._told(lambda: self.open(typed(argument)))
         elif name == "camera":
             self._told(self._keep_camera)
         elif name == "discard":
@@ -94,7 +93,7 @@ class Desk:
             self._app.stage.ask(Dialog("replace", then=argument))
         elif name == "replace_by":
             index, _, path = argument.partition(":")
-            self._told(lambda: self._replace(self._layer(index), _typed(path)))
+            self._told(lambda: self._replace(self._layer(index), typed(path)))
         elif name == "quit":
             self._leave()
 
@@ -126,7 +125,7 @@ class Desk:
             ProgdfError: see `session.save`.
             OSError: it cannot be written.
         """
-        path = _session_file(path)
+        path = session_file(path)
         if path != self.path and path.is_file() and kind_of(path) != "session":
             raise ProgdfError(f"{path} is another file, no session; choose another name")
         self._write(path)
@@ -326,17 +325,20 @@ class Desk:
 
         A file that is not this session's own is replaced only where the person says so.
         """
-        stage, file = self._app.stage, _session_file(_typed(path))
-        if not overwrite and file != self.path and file.is_file() and kind_of(file) == "session":
-            stage.ask(Dialog("overwrite", str(file), then))
-            return
-        error = _failure(lambda: self.save(_typed(path)))
-        if error:
+        stage = self._app.stage
+
+        def save() -> None:
+            file = session_file(typed(path))
+            if not overwrite and file != self.path and file.is_file() and kind_of(file) == "session":
+                stage.ask(Dialog("overwrite", str(file), then))
+                return
+            self.save(file)
+            stage.work = replace(stage.work, dialog=None)
+            if then:
+                stage.request(then)
+
+        if error := _failure(save):
             stage.ask(Dialog("save", path, then, error=error))
-            return
-        stage.work = replace(stage.work, dialog=None)
-        if then:
-            stage.request(then)
 
     def _browse(self) -> None:
         """The desktop's own dialog beside the question that is open."""
@@ -371,16 +373,6 @@ class Desk:
         if not paths:
             return recent.read(self._memory)
         return recent.remember(paths, self._memory)
-
-
-def _session_file(path: Path) -> Path:
-    """A path as a session's file is called."""
-    return path if path.suffix == ".json" else path.with_name(path.name + SUFFIX)
-
-
-def _typed(path: str) -> Path:
-    """A path as a person types it; the home of an unknown user is a name like any other, and missing."""
-    return Path(os.path.expanduser(path))  # pathlib's raises there
 
 
 def _failure(act: Callable[[], None]) -> str:

@@ -113,7 +113,8 @@ def _content(
         imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
-    _, text = imgui.input_text("##path", dialog.text)
+    flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
+    _, text = imgui.input_text("##path", dialog.text, flags)
     dialog = replace(dialog, text=text)
     imgui.same_line(0.0, gap)
     imgui.begin_disabled(dialog.choosing)

@@ -40,7 +40,7 @@ _NAMES = {
     glfw.KEY_KP_ENTER: "Enter",
 }
 _X11_LINE_FEED = 109
-"""Scancode of a key that keyboards lack and programs that type for one press as Enter; glfw has no name for it."""
+"""Scancode of a key that glfw does not name: what programs that type for one press as Enter."""
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),
     (glfw.CONTEXT_VERSION_MINOR, 3),
