@@ -8,6 +8,7 @@ import json
 import logging
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -78,7 +79,7 @@ def read_camera(text: str) -> Camera:
         ProgdfError: the file is missing or holds no cameras, or not that many.
     """
     name, colon, index = text.rpartition(":")
-    numbered = bool(colon) and index.lstrip("-").isdecimal() and not Path(text).exists()
+    numbered = re.fullmatch(r"-?[0-9]{1,18}", index) is not None and bool(colon) and not os.path.exists(text)
     path, number = (name, int(index)) if numbered else (text, 0)
     cameras = load_cameras(path)
     if not -len(cameras) <= number < len(cameras):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -102,7 +103,7 @@ def parse_size(text: str) -> tuple[int, int]:
         ProgdfError: it is no size, or one that no picture should have.
     """
     width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
+    if not cross or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in (width, height)):
         raise ProgdfError(f"--size {text} is not a size; write it as WIDTHxHEIGHT, for example 640x480")
     size = int(width), int(height)
     if not all(1 <= side <= LARGEST_SIDE for side in size):

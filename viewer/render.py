@@ -133,7 +133,7 @@ def _count(sheet: str | None) -> int:
     """How many pictures of a film a contact sheet shall show; 0 where none was asked for."""
     if sheet is None:
         return 0
-    if not sheet.isdecimal() or not 1 <= int(sheet) <= timeline_film.MOST_SHOWN:
+    if not (sheet.isdecimal() and len(sheet) < 9) or not 1 <= int(sheet) <= timeline_film.MOST_SHOWN:
         most = timeline_film.MOST_SHOWN
         raise ProgdfError(f"--sheet {sheet} is no number of a film's pictures; give one from 1 to {most}")
     return int(sheet)
