@@ -163,7 +163,6 @@ READERS = (
     "masks",
     "labels",
     "members",
-    "kernels",
     *COSTLY,
 )
 

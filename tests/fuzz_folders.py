@@ -47,7 +47,7 @@ FILES_OF_RUNS = {
 }
 """What is damaged in a run's folder before `progdf train --resume` or `progdf fit` is called on it."""
 
-COSTLY = ("spz", "splat", "sog", "colmap", *FILES_OF_RUNS)
+COSTLY = ("spz", "splat", "sog", "colmap", "kernels", *FILES_OF_RUNS)
 """A second or so for each input."""
 
 KERNEL = """
