@@ -51,6 +51,8 @@ STAGE_STEPS = 40
 one is met. `QUICK_STAGES` are asked for then. Room's walls, 200 steps, PSNR on held-out views at .25, .5, .75
 and 1: 8 stages 38.6 37.1 34.2 39.7, the same with steps twice as long 43.1 40.9 36.5 39.6, 4 stages 41.7 40.9
 37.9 41.0."""
+VIEWS, MOST_VIEWS = 30, 40
+"""How many views are edited by default, and how many of a dense region (see `trainer.resolution`)."""
 SMALLEST_VIEW = 32
 """Pixels of a view's longer side, at least."""
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
@@ -111,8 +113,9 @@ class TrainOptions:
     the region."""
     up: UpChoice = "auto"
     """The axis of the scene that is up. auto: as the cameras are held, or as a ground lies, or −y."""
-    views: int = 30
-    """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with."""
+    views: int = 0
+    """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with. 0: 30,
+    or 40 for an edit of colors whose members are dense."""
     image_size: int = 0
     """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
     dense that most have less than a pixel."""
@@ -282,11 +285,11 @@ def settled(options: TrainOptions) -> TrainOptions:
             options,
             steps=min(options.steps, QUICK_STEPS),
             stages=min(options.stages, QUICK_STAGES),
-            views=min(options.views, QUICK_VIEWS),
+            views=min(options.views or QUICK_VIEWS, QUICK_VIEWS),
         )
     name = checked_name(options.name or options.out.resolve().name)
     check_ranges(
-        ("--views", options.views, 3, 96),
+        ("--views", options.views or VIEWS, 3, 96),
         ("--image-size", options.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
         ("--stages", options.stages, 0, 16),
         ("--group-steps", options.group_steps, 0, 10_000),

@@ -63,16 +63,15 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"{options.scene} {INSIDE}")
 
-    def cameras_of(image_size: int) -> list[Camera]:
+    def cameras_of(image_size: int, views: int) -> list[Camera]:
         if options.cameras is not None:
             found = [fit_size(camera, image_size) for camera in given]
         else:  # half as many again, as some will find the region hidden
-            count = options.views + options.views // 2
-            found = region_rig(scene, region, count, image_size, up.direction)
+            found = region_rig(scene, region, views + views // 2, image_size, up.direction)
         return near_enough(named(found), scene)
 
-    cameras, unresolved = sized(options, scene, region, cameras_of)
-    choice = choose_views(scene, region, cameras, options.views, background)
+    cameras, views, unresolved = sized(options, scene, region, cameras_of)
+    choice = choose_views(scene, region, cameras, views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [f"up is {up.name}, {up.reason}"]
     notes += [unresolved] if unresolved else []

@@ -23,7 +23,7 @@ from progdf.up_axis import UpChoice, find_up
 from trainer.artefacts import claim
 from trainer.editors.kept import KeptPictures, Recipe
 from trainer.lift import Rule, lift_masks
-from trainer.options import TrainOptions
+from trainer.options import VIEWS, TrainOptions
 from trainer.preparation import BACKGROUND, INSIDE
 from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
@@ -82,7 +82,7 @@ def region_settings(
 
     return RegionSettings(
         options.cameras,
-        options.views,
+        options.views or VIEWS,
         kept,
         options.lift,
         options.lift_threshold,

@@ -1,4 +1,4 @@
-"""How many pixels the views need: as many as the members' density asks for, as far as time allows."""
+"""How many views an edit needs and of how many pixels: what the members' density asks for, within reason."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from trainer.editors import VIEW_BY_VIEW
-from trainer.options import TrainOptions
+from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
 from trainer.views import fit_size
 
 SIZES = (256, 320, 384)
@@ -50,23 +50,28 @@ def sized(
     options: TrainOptions,
     scene: Gaussians,
     region: Region,
-    cameras_of: Callable[[int], Sequence[Camera]],
-) -> tuple[Sequence[Camera], str]:
-    """The cameras at `--image-size` or the size that the members need, and a line where that is too small.
+    cameras_of: Callable[[int, int], Sequence[Camera]],
+) -> tuple[Sequence[Camera], int, str]:
+    """Cameras, how many of them to choose, and a line where the members are not resolved by these.
 
-    What is painted or given picture by picture stays at the smallest size, as does a draft.
+    `--views` and `--image-size` are kept to. Else there are more and larger views where members are dense; only
+    larger ones where the cameras are given and few. What is painted or given picture by picture stays as small
+    as can be, as does a draft. Of the same number of pixels, 40 views of 320 are .3 dB nearer to the editor's
+    picture from elsewhere than 30 of 384 (67 000 and 83 000 members), and 48 of 256 up to 1.2 dB farther.
 
     Args:
         options: see `TrainOptions`
         scene, region: what they look at
-        cameras_of: longer side in pixels -> cameras
+        cameras_of: longer side in pixels, number of views -> cameras
     """
-    painted = options.editor.partition(":")[0] in VIEW_BY_VIEW
-    sizes = SIZES[:1] if painted or options.quick else SIZES
-    sizes = (options.image_size,) if options.image_size else sizes
-    for size in sizes:
-        cameras = cameras_of(size)
-        count = min(options.views, len(cameras)) * 4 // 5  # every fifth is held out
+    fixed = options.quick or options.editor.partition(":")[0] in VIEW_BY_VIEW
+    tried = [(SIZES[0], VIEWS)] if fixed else list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True))
+    if not fixed and options.cameras is None and not options.views:
+        tried.pop()
+    tried = [(options.image_size or size, options.views or views) for size, views in tried]
+    for size, views in tried:
+        cameras = cameras_of(size, views)
+        count = min(views, len(cameras)) * 4 // 5  # every fifth is held out
         share = unresolved(scene, region, cameras, size, count)
         if share <= _WELCOME:
             break
@@ -74,4 +79,4 @@ def sized(
         f"{share:.0%} of the region's visible Gaussians have less than a pixel in all {count} views "
         f"of {size} pixels: what differs among neighbours is not resolved; give --image-size or --views more"
     )
-    return cameras, line if share > _BEARABLE else ""
+    return cameras, views, line if share > _BEARABLE else ""
