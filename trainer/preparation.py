@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,13 +14,17 @@ from progdf.camera_files import load_cameras
 from progdf.errors import ProgdfError
 from progdf.framing import is_surrounding
 from progdf.gaussians import Gaussians
+from progdf.pictures import write_image
+from progdf.rasterize.threads import threads
 from progdf.region import Region
 from progdf.up_axis import UpAxis, find_up
-from trainer.artefacts import RunFolder, write_views
+from trainer.artefacts import RunFolder
 from trainer.crops import CropScene, crop_scene
 from trainer.editors import EditorSettings, ImageEditor
 from trainer.editors.base import EditKind
+from trainer.editors.procedural import ColourEditor
 from trainer.options import TrainOptions
+from trainer.picture_list import add_pictures
 from trainer.progress import Advance
 from trainer.resolution import sized
 from trainer.view_choice import choose_views, split_views
@@ -128,16 +133,30 @@ def edited_views(
         confined: put back what changed outside the region; members would be pulled over it otherwise
         advance: progress
     """
-    edited: dict[float, list[Tensor]] = {}
-    for strength in strengths:
-        pictures = []
-        for view in views:
-            made = editor.edit(view, strength)
-            pictures.append(eight_bits(view.confined(made) if confined else made))
-            advance(len(edited) * len(views) + len(pictures), f"strength {strength:g}")
-        named_pictures = {view.camera.name: p for view, p in zip(views, pictures, strict=True)}
-        write_views(folder, "edited", named_pictures, strength)
-        edited[strength] = pictures
+    paths = {
+        strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
+    }
+
+    def edit(asked: tuple[float, int]) -> Tensor:
+        strength, i = asked
+        made = editor.edit(views[i], strength)
+        picture = eight_bits(views[i].confined(made) if confined else made)
+        write_image(paths[strength][i], picture)
+        return picture
+
+    add_pictures(folder.views, [path for some in paths.values() for path in some])
+    asked = [(strength, i) for strength in strengths for i in range(len(views))]
+    edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
+    with ThreadPoolExecutor(threads()) as pool:
+        # the others have a network, or draw: these use all cores by themselves
+        made = pool.map(edit, asked) if isinstance(editor, ColourEditor) else map(edit, asked)
+        try:
+            for done, ((strength, _), picture) in enumerate(zip(asked, made, strict=True), 1):
+                edited[strength].append(picture)
+                advance(done, f"strength {strength:g}")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return edited
 
 
