@@ -51,11 +51,11 @@ lint: setup extras
 	$(BIN)/mypy
 
 bench: setup
-	$(BIN)/progdf bench
+	$(BIN)/python -m benchmarks
 
 # Everything the README shows that a command made.
 pictures: setup window
 	$(BIN)/progdf demo --out demo --no-window
 	cp demo/hero.png demo/two-sliders.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
-	$(BIN)/progdf bench --readme README.md
+	$(BIN)/python -m benchmarks --readme README.md

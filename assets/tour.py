@@ -18,12 +18,12 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from ui_rig import Rig, rig
 
-from progdf.checkpoint import Gdf
-from progdf.ply import load_ply
-from viewer import panel
-from viewer.arguments import load_edits
-from viewer.state import LayerState, ViewState
-from viewer.turntable import first_camera
+from progdf.formats.ply import load_ply
+from progdf.gdf.file import Gdf
+from viewer.camera.view_camera import first_camera
+from viewer.files.document import load_edits
+from viewer.panel import panel
+from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
 COLOURS, PANEL_COLOURS = 144, 96  # so that a file stays below 250 kB

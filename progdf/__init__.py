@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from progdf.camera import Camera
-from progdf.camera_files import load_cameras
-from progdf.checkpoint import Gdf, load_gdf, save_gdf
-from progdf.compose import Layer, compose
-from progdf.formats import load_scene
-from progdf.gaussians import Gaussians
-from progdf.ply import load_ply, save_ply
-from progdf.rasterize import rasterize, render
+from progdf.compose.reference import Layer, compose
+from progdf.formats.ply import load_ply, save_ply
+from progdf.formats.scene_file import load_scene
+from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.io.cameras import load_cameras
+
+from .camera import Camera
+from .gaussians import Gaussians
+from .rasterize import rasterize, render
 
 __version__ = "0.1.0"
 

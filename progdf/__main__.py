@@ -11,43 +11,31 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from progdf.errors import ProgdfError
-from progdf.files import disk_full, written_whole
-from progdf.terminal import PrintableFormatter, printable
-from progdf.user_folders import state_folder
+from progdf.io.atomic import disk_full, written_whole
+from progdf.io.user_folders import state_folder
+
+from .errors import ProgdfError
+from .terminal import PrintableFormatter, printable
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("trainer.demo:main", "make a scene, train its region edits, write previews, open the window"),
+    "demo": ("trainer.pipeline.demo:main", "make a scene, train its edits, write previews, open the window"),
     "train": ("trainer.cli:train", "edit a region of a scene and write its .gdf file"),
     "region": ("trainer.cli:region", "show or keep which Gaussians a region selects"),
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
-    "ablate": ("trainer.cli:ablate", "train a run again without each part of the method: one table"),
-    "view": ("viewer.cli:view", "open the window: splats, layers, sliders"),
-    "render": ("viewer.render:render", "write a picture, a sweep or a contact sheet without a window"),
-    "rebind": ("progdf.rebind:main", "carry an edit over to the same scene in another file or format"),
-    "export": ("viewer.cli:export", "write the edited scene as a 3DGS .ply file"),
-    "check": ("progdf.check:main", "report what a scene holds and what had to be repaired"),
-    "info": ("progdf.info:main", "tell what a scene or a .gdf holds, with its error report"),
-    "bench": ("progdf.bench:main", "measure speed against error"),
+    "view": ("viewer.commands.cli:view", "open the window: splats, layers, sliders"),
+    "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
+    "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
+    "export": ("viewer.commands.cli:export", "write the edited scene as a 3DGS .ply file"),
+    "check": ("progdf.cli.check:main", "report what a scene holds and what had to be repaired"),
+    "info": ("progdf.cli.info:main", "tell what a scene or a .gdf holds, with its error report"),
 }
-
-BENCHES: dict[str, str] = {
-    "rasterize": "progdf.bench_rasterize:tables",
-    "field": "progdf.bench_field:tables",
-    "viewer": "viewer.bench:tables",
-    "frames": "viewer.bench_frames:tables",
-    "window": "viewer.bench_window:tables",
-}
-
-RECORDED = "trainer.bench_runs:recorded_course"
-"""Reads a run folder for the benchmark of fields, which lies on a lower floor."""
 
 
 def _usage() -> str:
@@ -57,17 +45,22 @@ def _usage() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status.
+    """Run one command and return its exit status, see `guarded`."""
+    return guarded(_run, list(sys.argv[1:] if argv is None else argv))
 
-    0 done; 2 the user can mend it; 70 it is a mistake of ours, kept in a file; 130 interrupted.
+
+def guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> int:
+    """Run a command line with what goes wrong told in one line.
+
+    Returns:
+        0 done; 2 the user can mend it; 70 it is a mistake of ours, kept in a file; 130 interrupted.
     """
     _open_standard_streams()
     if logging.lastResort is not None:  # prints warnings where no program has said otherwise
         logging.lastResort.setFormatter(PrintableFormatter())
-    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        with _signals_end(arguments[:1] != ["view"]):
-            status = _run(arguments)
+        with _signals_end(list(arguments[:1]) != ["view"]):
+            status = run(arguments)
             if sys.stdout is not None:
                 sys.stdout.flush()  # here, where a full disk or a closed pipe can still be told
             return status
@@ -96,7 +89,7 @@ def _run(arguments: Sequence[str]) -> int:
         print(_usage())
         return 0
     if arguments[0] == "--version":
-        from progdf import __version__
+        from . import __version__
 
         print(f"progdf {__version__}")
         return 0

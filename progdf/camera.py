@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from progdf.errors import ProgdfError
-from progdf.framing import NEAR, front, is_surrounding, scene_sphere
-from progdf.gaussians import Gaussians
-from progdf.lens import Lens
-from progdf.up_axis import guess_up
+from .errors import ProgdfError
+from .lens import Lens
 
-_log = logging.getLogger(__name__)
-
-_GOLDEN = (math.sqrt(5) - 1) / 2
-_RIG_FOV = math.radians(60)
-"""Field of view at which a distance of 2.2 radii leaves a margin of a tenth: sin 30° is 1.1 / 2.2."""
+NEAR = 0.01
+"""Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
 
 
 @dataclass(frozen=True)
@@ -105,65 +97,6 @@ def intrinsics(fov_y: float, width: int, height: int) -> Tensor:
     """Intrinsics of a centred camera with square pixels; `fov_y` in radians. [3,3] float32"""
     focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * fov_y, dtype=torch.float64)))
     return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-
-
-def orbit_rig(
-    scene: Gaussians,
-    count: int,
-    width: int,
-    height: int,
-    fov_y: float = _RIG_FOV,
-    up: Tensor | None = None,
-    elevations: tuple[float, float] = (5.0, 60.0),
-    distance: float = 2.2,
-) -> list[Camera]:
-    """Cameras all around a scene that has none, in order of azimuth.
-
-    Azimuths are even and begin at the front (see `framing.front`); elevations follow the golden ratio over
-    the band, even in area: every n-th camera of the list is spread as evenly as the whole.
-
-    Args:
-        scene: framed by its median centre and 97th-percentile radius, see `scene_sphere`
-        count: number of cameras, ≥ 1
-        width, height: image size in pixels
-        fov_y: vertical field of view, radians
-        up: world direction that is up, [3]; None guesses it, see `guess_up`
-        elevations: lowest and highest, degrees above the horizon, −89..89; below 0 is under the ground
-        distance: from the centre, in radii at a field of view of 60° along the shorter side of the image; a
-            narrower or wider field moves the cameras so that the scene keeps its size in the picture
-
-    Raises:
-        ProgdfError: no camera asked for, or elevations that are no band.
-    """
-    lowest, highest = elevations
-    if count < 1:
-        raise ProgdfError(f"the rig was asked for {count} cameras; at least 1 would be right")
-    if not -89 <= lowest <= highest <= 89:
-        raise ProgdfError(
-            f"the rig's elevations {lowest:g} to {highest:g} are no band within -89 to 89 degrees"
-        )
-    up = guess_up(scene) if up is None else up.float() / up.float().norm()
-    if is_surrounding(scene, up):
-        _log.warning(
-            "this looks like a scene to stand inside: cameras around it cannot frame it; "
-            "give its own cameras, or keep views with F4 in progdf view"
-        )
-    centre, radius = scene_sphere(scene)
-    K = intrinsics(fov_y, width, height)
-    half = math.atan(0.5 * min(width, height) / float(K[1, 1]))
-    away = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
-    ahead = front(up)
-    side = torch.linalg.cross(up, ahead)
-    low, high = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
-    cameras = []
-    for i in range(count):
-        azimuth = 2 * math.pi * i / count
-        rise = low + (high - low) * ((0.5 + i * _GOLDEN) % 1.0)
-        level = math.sqrt(1 - rise * rise)
-        back = level * (math.cos(azimuth) * ahead + math.sin(azimuth) * side) + rise * up
-        viewmat = look_at(centre + away * back, centre, up)
-        cameras.append(Camera(viewmat, K, width, height, name=f"orbit_{i:03d}"))
-    return cameras
 
 
 def split_held_out(cameras: Sequence[Camera], count: int) -> tuple[list[Camera], list[Camera]]:

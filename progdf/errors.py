@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from progdf.terminal import printable
+from .terminal import printable
 
 
 class ProgdfError(ValueError):

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.camera import Camera
 from progdf.rasterize.conventions import ALPHA_MIN, DILATION
 from progdf.rasterize.geometry import dot, footprint, make_lens, vec
 from progdf.rasterize.jit import kernel
+
+from .camera import Camera
 
 Array = NDArray[Any]
 

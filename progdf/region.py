@@ -1,6 +1,6 @@
 """A region: which Gaussians an edit may change, and how sure we are of each; set operations, plain shapes.
 
-The language in which a region is written is in `progdf.region_spec`.
+The language in which a region is written is in `progdf.scene.region_spec`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.gaussians import Gaussians
+from .gaussians import Gaussians
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,11 @@ import torch
 from hypothesis import settings
 from PIL import Image
 
-pytest.register_assert_rewrite("tests.ply_files", "tests.refused", "tests.stopped_runs")
+from tests.helpers.paths import SHARED_DATA
+
+pytest.register_assert_rewrite(
+    "tests.helpers.ply_files", "tests.helpers.refused", "tests.helpers.stopped_runs"
+)
 
 # `make test` tries the same examples everywhere; `make test-all` looks for new ones; a busy machine may take
 # long over each
@@ -37,7 +41,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Real scenes and odd files kept beside the checkout (or named by PROGDF_TEST_DATA); absent: skip."""
-    folder = Path(os.environ.get("PROGDF_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    folder = Path(os.environ.get("PROGDF_TEST_DATA", SHARED_DATA))
     if not folder.is_dir():
         pytest.skip(f"no real test data at {folder}")
     return folder

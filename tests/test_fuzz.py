@@ -1,4 +1,4 @@
-"""A fuzz of every reader; a longer round is `python -m tests.fuzz READER COUNT SEED FOLDER`."""
+"""A fuzz of every reader; a longer round is `python -m tests.helpers.fuzz READER COUNT SEED FOLDER`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.fuzz import READERS
-from tests.fuzz_folders import COSTLY
+from tests.helpers.fuzz import READERS
+from tests.helpers.fuzz_folders import COSTLY
+from tests.helpers.paths import ROOT
 
 
 @pytest.mark.slow
@@ -18,12 +19,12 @@ def test_whatever_a_file_holds_it_is_read_or_refused_in_one_line(reader: str, tm
     words = [
         sys.executable,
         "-m",
-        "tests.fuzz",
+        "tests.helpers.fuzz",
         reader,
         "30" if reader in COSTLY else "400",
         "1",
         str(tmp_path),
     ]
-    ran = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    ran = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
     assert ran.stdout == ""
     assert ran.returncode == 0, ran.stderr

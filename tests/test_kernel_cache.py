@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from progdf import user_folders
+from progdf.io import user_folders
 from progdf.rasterize import jit
 
 SOURCE = """

@@ -48,8 +48,8 @@ def test_no_floor_imports_one_it_must_not_know(floor: str) -> None:
 
 
 def test_the_layer_test_names_an_offending_import() -> None:
-    assert offending_imports("import viewer.app\n", "trainer", "trainer/x.py") == [
-        "trainer/x.py:1 imports viewer.app"
+    assert offending_imports("import viewer.app.app\n", "trainer", "trainer/x.py") == [
+        "trainer/x.py:1 imports viewer.app.app"
     ]
     assert offending_imports("def f():\n    from trainer import pgs\n", "viewer", "viewer/y.py")
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from progdf.rasterize import ENGINES, rasterize
-from tests.drawn import CASES, INPUTS, draw, drawn_case, relative_errors
-from tests.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
+from tests.helpers.drawn import CASES, INPUTS, draw, drawn_case, relative_errors
+from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -142,7 +142,7 @@ def test_double_precision_inputs_get_double_precision_gradients() -> None:
 
 
 def test_a_real_scene_matches_the_reference(shared_data: Path) -> None:
-    from progdf.ply import load_ply
+    from progdf.formats.ply import load_ply
 
     scene = load_ply(shared_data / "playbot_8k.ply")
     low, high = scene.means.quantile(0.1, dim=0), scene.means.quantile(0.9, dim=0)

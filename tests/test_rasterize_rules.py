@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from progdf.rasterize import ENGINES, alpha_weights, rasterize, render
-from tests.drawn import CASES, draw, drawn_case
-from tests.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
+from tests.helpers.drawn import CASES, draw, drawn_case
+from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

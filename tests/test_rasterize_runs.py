@@ -14,8 +14,8 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.rasterize import alpha_weights, rasterize, render, set_threads
-from tests.drawn import INPUTS, Drawn, draw
-from tests.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
+from tests.helpers.drawn import INPUTS, Drawn, draw
+from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

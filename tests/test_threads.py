@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from progdf.checkpoint import Gdf, load_gdf
 from progdf.gaussians import Gaussians
-from tests.ui_rig import bear
-from viewer import arguments, render, threads
+from progdf.gdf.file import Gdf, load_gdf
+from tests.helpers.ui_rig import bear
+from viewer.commands import arguments, render
+from viewer.render import threads
 
 
 def test_a_command_draws_on_one_thread_and_reads_edits_on_all(

@@ -1,19 +1,20 @@
-"""`progdf train`, `progdf fit` and `progdf ablate`: the command line, made from the options' dataclasses."""
+"""`progdf train`, `fit`, `region` and `views`: the command lines, made from the options' dataclasses."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from progdf.command_line import parsed
-from trainer.options import AblateOptions, FitOptions, TrainOptions
-from trainer.presets import under_preset
-from trainer.region_options import RegionOptions, ViewsOptions, joined
+from progdf.cli.options import parsed
+from trainer.regions.options import RegionOptions, ViewsOptions, joined
+
+from .options import FitOptions, TrainOptions
+from .presets import under_preset
 
 
 def train(argv: Sequence[str]) -> int:
     """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
     options = train_options(argv)
-    from trainer.run import train as run  # only now: --help and a mistyped option need no torch
+    from trainer.pipeline.run import train as run  # only now: --help and a mistyped option need no torch
 
     run(options)
     return 0
@@ -22,7 +23,7 @@ def train(argv: Sequence[str]) -> int:
 def fit(argv: Sequence[str]) -> int:
     """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
     options = parsed(FitOptions, argv, "progdf fit")
-    from trainer.run import refit
+    from trainer.pipeline.run import refit
 
     refit(options)
     return 0
@@ -39,7 +40,7 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
 def region(argv: Sequence[str]) -> int:
     """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
     options = parsed(RegionOptions, joined(argv), "progdf region")
-    from trainer.region_picture import show
+    from trainer.regions.command import show
 
     print(show(options))
     return 0
@@ -48,18 +49,7 @@ def region(argv: Sequence[str]) -> int:
 def views(argv: Sequence[str]) -> int:
     """Run `progdf views`; 0 when they are written. Raises ProgdfError for what the user can mend."""
     options = parsed(ViewsOptions, argv, "progdf views")
-    from trainer.original_views import write
+    from trainer.regions.originals import write
 
     print(write(options))
-    return 0
-
-
-def ablate(argv: Sequence[str]) -> int:
-    """Run `progdf ablate`; 0 when the table is written. Raises ProgdfError for what the user can mend."""
-    options = parsed(AblateOptions, argv, "progdf ablate")
-    from trainer.ablate import ablate as run
-    from trainer.ablation_table import print_table
-
-    done = run(options)
-    print_table(done.outcomes, done.title, done.perceptual)
     return 0

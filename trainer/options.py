@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,11 +13,18 @@ import tyro
 from progdf.errors import ProgdfError
 from progdf.field.neural import Bins, Inputs, Size
 from progdf.field.ranks import NO_DIFFERENCE
-from progdf.lpips import Net
-from progdf.up_axis import UpChoice
-from trainer.objective import Progressive
-from trainer.pgs import Rates
-from trainer.trajectory import Slider
+from progdf.metrics.lpips import Net
+from progdf.scene.up_axis import UpChoice
+
+Slider = Literal["auto", "even", "stages", "time"]
+"""How a slider is laid over what was recorded; auto becomes one of the others (`settings.slider_meant`)."""
+
+
+Rates = Literal["kind", "3dgs"]
+
+
+Progressive = Literal["warmup", "decay", "growth", "off"]
+
 
 Preset = Literal["default", "paper"]
 
@@ -52,7 +59,7 @@ one is met. `QUICK_STAGES` are asked for then. Room's walls, 200 steps, PSNR on 
 and 1: 8 stages 38.6 37.1 34.2 39.7, the same with steps twice as long 43.1 40.9 36.5 39.6, 4 stages 41.7 40.9
 37.9 41.0."""
 VIEWS, MOST_VIEWS = 30, 40
-"""How many views are edited by default, and how many of a dense region (see `trainer.resolution`)."""
+"""How many views are edited by default, and how many of a dense region (see `trainer.setup.resolution`)."""
 SMALLEST_VIEW = 32
 """Pixels of a view's longer side, at least."""
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
@@ -255,25 +262,6 @@ class FitOptions:
     """CPU threads; 0 takes all cores."""
 
 
-@dataclass(frozen=True)
-class AblateOptions:
-    """Train a finished run again without one part of the method, or with another: one table, one picture.
-
-    What is done is kept in RUN/ablation: an interrupted ablation goes on, and --only adds to it.
-    """
-
-    run: tyro.conf.Positional[Path]
-    """Folder that progdf train wrote; its scene, region, edited views and options are taken over."""
-    only: str = ""
-    """Some variants by name, as one-target,no-lpips; all that make sense for the run if empty."""
-    quick: bool = False
-    """A draft: 240 steps in 4 stages, 12 views."""
-    scene: Path | None = None
-    """Where the scene is now, if it has moved since the run."""
-    threads: int = 0
-    """CPU threads; 0 takes all cores."""
-
-
 def settled(options: TrainOptions) -> TrainOptions:
     """The options with `quick` and the name worked in, and checked.
 
@@ -388,3 +376,12 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
         raise ProgdfError(f"--code is {options.code}; 0 to 64 would be right")
     if not 0 <= options.picture_loss < math.inf:
         raise ProgdfError(f"--picture-loss is {options.picture_loss}; 0 or more would be right")
+
+
+def plain_options(options: TrainOptions) -> dict[str, Any]:
+    """The options that the result depends on or came from, as JSON values."""
+    return {
+        name: str(v) if isinstance(v, Path) else v
+        for name, v in asdict(options).items()
+        if name not in ("resume", "save_every")
+    }

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from trainer.options import Preset, TrainOptions
+from .options import Preset, TrainOptions
 
 PRESETS: Mapping[Preset, Mapping[str, Any]] = {
     "default": {},

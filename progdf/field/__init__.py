@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from progdf.field.bake import NeuralForm, baked_neural
-from progdf.field.baked import AttributeBases, BakedField
-from progdf.field.choose import Choice, choose_field
-from progdf.field.floor import PositionFloor, position_floor
-from progdf.field.judge import Candidate, FieldJudge
-from progdf.field.keyframes import fit_keyframes, fit_lossless
-from progdf.field.neural import NeuralField
-from progdf.field.neural_fit import NeuralSettings, fit_neural
-from progdf.field.separable import fit_separable
+from .bake import NeuralForm, baked_neural
+from .baked import AttributeBases, BakedField
+from .choose import Choice, choose_field
+from .evaluate import Candidate, FieldJudge
+from .floor import PositionFloor, position_floor
+from .keyframes import fit_keyframes, fit_lossless
+from .neural import NeuralField
+from .neural_fit import NeuralSettings, fit_neural
+from .separable import fit_separable
 
 __all__ = [
     "AttributeBases",

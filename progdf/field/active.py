@@ -1,7 +1,7 @@
 """Members whose part in an edit no picture shows, and fields without them.
 
 A member left out keeps its original numbers, at s = 1 too, so this is asked for and not done unasked; what it
-brings is measured in `trainer.active`.
+brings is measured in `trainer.fit.active`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from progdf.field.baked import AttributeBases, BakedField
+from .baked import AttributeBases, BakedField
 
 PIXEL = 0.5 / 255
 """Change of a colour that 8 bits do not show, of 1."""

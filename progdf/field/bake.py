@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from progdf.field.baked import BakedField
-from progdf.field.judge import Field, sample_strengths
-from progdf.field.neural import NeuralField
-from progdf.field.ranks import decibels
-from progdf.field.rendered import Render
-from progdf.field.separable import fit_separable, follow, leading_modes, moving_attributes
 from progdf.gaussians import BASE_CHANNELS
+
+from .baked import BakedField
+from .evaluate import Field, sample_strengths
+from .neural import NeuralField
+from .ranks import decibels
+from .rendered import Render
+from .separable import fit_separable, follow, leading_modes, moving_attributes
 
 TOLERANCE = 0.01
 """Root mean square error of the factoring, as a share of the course's own root mean square."""

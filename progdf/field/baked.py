@@ -17,7 +17,7 @@ from torch import Tensor
 from progdf.gaussians import attribute_slices
 
 if TYPE_CHECKING:
-    from progdf.field.bake import NeuralForm
+    from .bake import NeuralForm
 
 REST_TYPES = (torch.int8, torch.float16, torch.float32)
 """How bases 1..R may be stored."""

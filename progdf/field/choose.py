@@ -15,19 +15,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from progdf.field.baked import BakedField
-from progdf.field.judge import Candidate, FieldJudge, sample_strengths
-from progdf.field.keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
-from progdf.field.ranks import emphasised_modes, expected_worst, grown_ranks
-from progdf.field.refine import refined
-from progdf.field.rendered import Render, RenderedCourses, picture_gram, rendered_courses
-from progdf.field.separable import (
-    channel_weights,
-    check_trajectory,
-    leading_modes,
-    moving_attributes,
-    stored_attribute,
-)
+from .baked import BakedField
+from .evaluate import Candidate, FieldJudge, sample_strengths
+from .keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
+from .ranks import emphasised_modes, expected_worst, grown_ranks
+from .refine import refined
+from .rendered import Render, RenderedCourses, picture_gram, rendered_courses
+from .separable import channel_weights, check_trajectory, leading_modes, moving_attributes, stored_attribute
 
 __all__ = [
     "Candidate",

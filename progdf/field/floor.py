@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.field.judge import FieldJudge
-from progdf.field.separable import channel_weights, check_trajectory, moving_attributes
+from .evaluate import FieldJudge
+from .separable import channel_weights, check_trajectory, moving_attributes
 
 NEIGHBOURS = (1, 2, 4, 8, 16)
 

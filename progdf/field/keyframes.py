@@ -22,8 +22,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from progdf.field.baked import AttributeBases, BakedField
-from progdf.field.separable import check_trajectory, moving_attributes, stored_bases
+from .baked import AttributeBases, BakedField
+from .separable import check_trajectory, moving_attributes, stored_bases
 
 Between = Literal["linear", "cubic"]
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from progdf.field.neural import (
+from .neural import (
     LAYOUT,
     Bins,
     Inputs,
@@ -28,8 +28,8 @@ from progdf.field.neural import (
     encoded,
     look_of,
 )
-from progdf.field.rendered import Render
-from progdf.field.separable import LEVELS, channel_weights, check_trajectory, moving_attributes
+from .rendered import Render
+from .separable import LEVELS, channel_weights, check_trajectory, moving_attributes
 
 PictureLoss = Callable[[Tensor, Tensor], Tensor]
 """Packed offsets of the field, packed offsets recorded at the same strength -> loss. [M,C], [M,C] -> []"""

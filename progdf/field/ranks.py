@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from progdf.field.rendered import Modes, RenderedCourses
+from .rendered import Modes, RenderedCourses
 
 NO_DIFFERENCE = 99.0
 """PSNR, dB, that stands for pictures which do not differ."""

@@ -25,9 +25,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from progdf.field.baked import BakedField
-from progdf.field.rendered import Render
 from progdf.gaussians import attribute_slices
+
+from .baked import BakedField
+from .rendered import Render
 
 STEP = 0.01
 """Share of a coefficient's largest size by which it is moved to see what that changes."""

@@ -17,7 +17,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from progdf.field.separable import Course, follow, leading_modes, moving_attributes
+from .separable import Course, follow, leading_modes, moving_attributes
 
 Render = Callable[[Tensor], Tensor]
 """Offsets of the members -> the pixels that count, of some views side by side. [M,C] -> [P,3]"""

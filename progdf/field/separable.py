@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import attribute_slices
+
+from .baked import AttributeBases, BakedField
 
 LEVELS = 127
 """Largest int8 level that is used; −128 is left out to keep the levels symmetric."""

@@ -22,8 +22,9 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.rasterize.conventions import RasterInfo
-from progdf.rasterize.threads import set_threads
+
+from .conventions import RasterInfo
+from .threads import set_threads
 
 __all__ = ["ENGINES", "Crop", "RasterInfo", "alpha_weights", "rasterize", "render", "set_threads"]
 

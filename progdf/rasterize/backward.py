@@ -6,10 +6,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from progdf.rasterize.blend_backward import unblend
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.projection_backward import project_backward
-from progdf.rasterize.shares import enter, leave
+from .blend_backward import unblend
+from .jit import kernel
+from .projection_backward import project_backward
+from .shares import enter, leave
 
 Array = NDArray[Any]
 

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.gathers import Rows, gather, rows_from
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import WIDTH, Lanes, any_of, choose, spread, store
-from progdf.rasterize.projection import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE
-from progdf.rasterize.shares import pieces
+from .gathers import Rows, gather, rows_from
+from .jit import kernel
+from .lanes import WIDTH, Lanes, any_of, choose, spread, store
+from .projection import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE
+from .shares import pieces
 
 Array = NDArray[Any]
 

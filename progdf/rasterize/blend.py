@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
-from progdf.rasterize.jit import Number, kernel
-from progdf.rasterize.lanes import WIDTH, choose, count, load, store
-from progdf.rasterize.pixels import (
+from .binning import TILE_H, TILE_W
+from .conventions import ALPHA_MAX, TRANSMITTANCE_MIN
+from .jit import Number, kernel
+from .lanes import WIDTH, choose, count, load, store
+from .pixels import (  # fmt: skip
     BATCH,
     BLUE,
     CARD,
@@ -30,8 +30,8 @@ from progdf.rasterize.pixels import (
     new_cards,
     row_of,
     tile_bounds,
-)  # fmt: skip
-from progdf.rasterize.shares import pieces
+)
+from .shares import pieces
 
 Array = NDArray[Any]
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.conventions import ALPHA_MAX, TRANSMITTANCE_MIN
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.pixels import LOG2_ALPHA_MIN
-from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
-from progdf.rasterize.shares import enter, leave, pieces
+from .binning import TILE_H, TILE_W
+from .conventions import ALPHA_MAX, TRANSMITTANCE_MIN
+from .jit import kernel
+from .pixels import LOG2_ALPHA_MIN
+from .projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
+from .shares import enter, leave, pieces
 
 Array = NDArray[Any]
 

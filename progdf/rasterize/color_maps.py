@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.rasterize.blend_lists import add_gradients, add_pictures, list_weights
-from progdf.rasterize.cpu import float32, list_view, make_view
-from progdf.rasterize.jit import running
+from .blend_lists import add_gradients, add_pictures, list_weights
+from .cpu import float32, list_view, make_view
+from .jit import running
 
 Array = NDArray[Any]
 

@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.rasterize import weights
-from progdf.rasterize.backward import backpropagate
-from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.blend_backward import SUMS
-from progdf.rasterize.conventions import RasterInfo
-from progdf.rasterize.forward import draw, list_splats, list_tiles
-from progdf.rasterize.jit import running
-from progdf.rasterize.order import new_sorting
-from progdf.rasterize.projection_backward import CAMERA, PARTS
-from progdf.rasterize.shares import Team
-from progdf.rasterize.threads import threads
+
+from . import weights
+from .backward import backpropagate
+from .binning import TILE_H, TILE_W
+from .blend_backward import SUMS
+from .conventions import RasterInfo
+from .forward import draw, list_splats, list_tiles
+from .jit import running
+from .order import new_sorting
+from .projection_backward import CAMERA, PARTS
+from .shares import Team
+from .threads import threads
 
 Array = NDArray[Any]
 

@@ -25,8 +25,8 @@ from numba.core.callconv import RETCODE_NONE, RETCODE_OK
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from progdf.rasterize.atomics import change, put, seen
-from progdf.rasterize.jit import kernel
+from .atomics import change, put, seen
+from .jit import kernel
 
 Array = NDArray[Any]
 

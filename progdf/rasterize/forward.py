@@ -6,12 +6,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import fill_tiles, find_tiles
-from progdf.rasterize.blend import blend
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.order import STEPS, Sorting, depth_order
-from progdf.rasterize.projection import cull, project
-from progdf.rasterize.shares import enter, leave
+from .binning import fill_tiles, find_tiles
+from .blend import blend
+from .jit import kernel
+from .order import STEPS, Sorting, depth_order
+from .projection import cull, project
+from .shares import enter, leave
 
 Array = NDArray[Any]
 

@@ -9,8 +9,8 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import LANES, WIDTH, Lanes, VectorType
+from .jit import kernel
+from .lanes import LANES, WIDTH, Lanes, VectorType
 
 Array = NDArray[Any]
 

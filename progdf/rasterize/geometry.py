@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.conventions import DILATION, FRUSTUM_MARGIN
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import choose
+from .conventions import DILATION, FRUSTUM_MARGIN
+from .jit import kernel
+from .lanes import choose
 
 Array = NDArray[Any]
 Real = Any

@@ -22,9 +22,10 @@ import numba
 from numba import config
 
 from progdf.errors import ProgdfError
-from progdf.files import written_whole
-from progdf.rasterize.threads import threads
-from progdf.user_folders import cache_folder, is_private, temporary_folder
+from progdf.io.atomic import written_whole
+from progdf.io.user_folders import cache_folder, is_private, temporary_folder
+
+from .threads import threads
 
 log = logging.getLogger("progdf")
 

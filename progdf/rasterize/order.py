@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.jit import Number, kernel
-from progdf.rasterize.shares import pieces
+from .jit import Number, kernel
+from .shares import pieces
 
 Array = NDArray[Any]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from progdf.rasterize.jit import Number, kernel
-from progdf.rasterize.lanes import WIDTH, Lanes, prefetch, times_power, whole
-from progdf.rasterize.projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
+from .binning import TILE_H, TILE_W
+from .conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .jit import Number, kernel
+from .lanes import WIDTH, Lanes, prefetch, times_power, whole
+from .projection import EXTENT_Y, INV_L11, L11, L22, MX, MY, R2, SLOPE
 
 Array = NDArray[Any]
 

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.conventions import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
-from progdf.rasterize.gathers import gather, gather_vec, rows_at, rows_from, scatter
-from progdf.rasterize.geometry import Vec, dot, footprint, make_lens, vec
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import WIDTH, choose, prefetch_to_write
-from progdf.rasterize.shading import fill_basis, view_direction
-from progdf.rasterize.shares import pieces
+from .conventions import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
+from .gathers import gather, gather_vec, rows_at, rows_from, scatter
+from .geometry import Vec, dot, footprint, make_lens, vec
+from .jit import kernel
+from .lanes import WIDTH, choose, prefetch_to_write
+from .shading import fill_basis, view_direction
+from .shares import pieces
 
 Array = NDArray[Any]
 

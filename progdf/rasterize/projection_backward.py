@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.blend_backward import SUMS
-from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION
-from progdf.rasterize.gathers import first, gather, gather_vec, rows_at, scatter, scatter_vec
-from progdf.rasterize.geometry import (
+from .blend_backward import SUMS
+from .conventions import ANTIALIAS_FLOOR, DILATION
+from .gathers import first, gather, gather_vec, rows_at, scatter, scatter_vec
+from .geometry import (  # fmt: skip
     Footprint,
     Lens,
     Vec,
@@ -29,12 +29,12 @@ from progdf.rasterize.geometry import (
     row_times,
     times,
     vec,
-)  # fmt: skip
-from progdf.rasterize.jit import kernel
-from progdf.rasterize.lanes import WIDTH, Lanes, Mask, choose, load, prefetch, spread, store, total, widen
-from progdf.rasterize.projection import R2, UNIT
-from progdf.rasterize.shading import shade_backward
-from progdf.rasterize.shares import pieces
+)
+from .jit import kernel
+from .lanes import WIDTH, Lanes, Mask, choose, load, prefetch, spread, store, total, widen
+from .projection import R2, UNIT
+from .shading import shade_backward
+from .shares import pieces
 
 Array = NDArray[Any]
 

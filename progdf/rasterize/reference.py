@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import normalize_quats
-from progdf.rasterize.conventions import (
+from progdf.sh import shade
+
+from .conventions import (
     ALPHA_MAX,
     ALPHA_MIN,
     ANTIALIAS_FLOOR,
@@ -21,7 +23,6 @@ from progdf.rasterize.conventions import (
     TRANSMITTANCE_MIN,
     RasterInfo,
 )
-from progdf.sh import shade
 
 TILE = 16
 

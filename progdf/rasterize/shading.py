@@ -7,9 +7,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from progdf.rasterize.geometry import Vec
-from progdf.rasterize.jit import kernel
 from progdf.sh import _C1, _C2, _C3, C0
+
+from .geometry import Vec
+from .jit import kernel
 
 Array = NDArray[Any]
 

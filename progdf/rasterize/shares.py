@@ -17,9 +17,9 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from progdf.rasterize.atomics import add, put, seen
-from progdf.rasterize.crew import ENTRY, HELPERS, LOOKS, call, call_back, engage, make_way
-from progdf.rasterize.jit import Number, kernel
+from .atomics import add, put, seen
+from .crew import ENTRY, HELPERS, LOOKS, call, call_back, engage, make_way
+from .jit import Number, kernel
 
 Array = NDArray[Any]
 

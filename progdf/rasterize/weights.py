@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.binning import TILE_H, TILE_W
-from progdf.rasterize.jit import Number, kernel
-from progdf.rasterize.lanes import WIDTH, choose, count, load, spread, store, total
-from progdf.rasterize.pixels import (
+from .binning import TILE_H, TILE_W
+from .jit import Number, kernel
+from .lanes import WIDTH, choose, count, load, spread, store, total
+from .pixels import (  # fmt: skip
     BATCH,
     CARD,
     EIGHT,
@@ -26,8 +26,8 @@ from progdf.rasterize.pixels import (
     new_cards,
     row_of,
     tile_bounds,
-)  # fmt: skip
-from progdf.rasterize.shares import enter, leave, pieces
+)
+from .shares import enter, leave, pieces
 
 Array = NDArray[Any]
 

@@ -1,5 +1,5 @@
 // A stack of edits, for one Gaussian: Σ or "over" of share · gain · (factor₀ · full + Σ factor_k · basis_k), as
-// progdf/compose.py states it.
+// progdf/compose/reference.py states it.
 //
 // Reads the textures below, lists of texels in rows of TEXELS_PER_ROW, filled from viewer/gl/edit_bases.py (once) and
 //         viewer/gl/edit_stack.py (with every new strength); a test compares the layout with viewer/gl/layout.py.
@@ -17,7 +17,7 @@ uniform isampler2D edit_layers;   // LAYER_TEXELS a layer: places, weights, numb
                                   // rank follow the full offset; numbers −1: the layer does not move this target
 uniform sampler2D edit_numbers;   // of a layer: cover, –, –, –; of its targets: gain, then factor₀ … factor_rank
 uniform int layer_count;          // lowest layer first
-uniform int blend;                // index into progdf.layers.BLENDS
+uniform int blend;                // index into progdf.compose.layers.BLENDS
 
 const int TEXELS_PER_ROW = 4096;
 const int LAYER_TEXELS = 6;
@@ -27,7 +27,7 @@ struct Part {
     int member;    // −1: none
     float share;   // painted strength, 0..1
     float cover;   // strength without its overshoot, 0..1
-    vec4 hides;    // of geometry, opacity and colour (progdf/coverage.py), 0..1; only where blend is OVER
+    vec4 hides;    // of geometry, opacity and colour (progdf/compose/coverage.py), 0..1; only where blend is OVER
 };
 
 ivec2 texel_at(int index) {

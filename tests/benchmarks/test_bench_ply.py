@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
+from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.ply import load_ply, save_ply
 
 
 def sh3_scene(count: int) -> Gaussians:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from progdf import bench_rasterize
-from progdf.bench_rasterize import Case, measure, tables
+from benchmarks import rasterizer as bench_rasterize
+from benchmarks.rasterizer import Case, measure, tables
 
 
 def test_the_rasteriser_benchmark_names_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,21 +9,23 @@ from typing import Any
 import pytest
 import torch
 
-from progdf import bench as front
-from progdf.bench import Table
+from benchmarks import __main__ as front
+from benchmarks.table import Table
+from benchmarks.viewer import frames as bench_frames
+from benchmarks.viewer import slider as bench
+from benchmarks.viewer import window as bench_window
+from benchmarks.viewer.mouse import Mouse
+from benchmarks.viewer.scenes import copies, edit_for, scenes_of
+from benchmarks.viewer.slider import Case
+from benchmarks.viewer.window import Dragging, Idle
 from progdf.camera import Camera
+from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
-from progdf.ply import save_ply
-from progdf.scenes import bear
-from viewer import bench, bench_frames, bench_window
-from viewer.bench import Case
-from viewer.bench_mouse import Mouse
-from viewer.bench_scenes import copies, edit_for, scenes_of
-from viewer.bench_window import Dragging, Idle
-from viewer.engine import Engine, FrameTimings
-from viewer.headless import headless_context
-from viewer.state import LayerState, ViewState
-from viewer.turntable import bounds_of, first_camera
+from progdf.formats.ply import save_ply
+from viewer.camera.view_camera import bounds_of, first_camera
+from viewer.render.engine import Engine, FrameTimings
+from viewer.render.headless import headless_context
+from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (160, 400)
 
@@ -197,9 +199,9 @@ def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path
 
 
 def test_options_of_one_benchmark_are_refused_where_it_does_not_run(tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="say progdf bench viewer"):
+    with pytest.raises(ProgdfError, match="use python -m benchmarks viewer"):
         front.main(["rasterize", "--scenes", str(tmp_path / "a.ply")])
-    with pytest.raises(ProgdfError, match="say progdf bench window"):
+    with pytest.raises(ProgdfError, match="use python -m benchmarks window"):
         front.main(["frames", "--seconds", "3"])
 
 
@@ -209,7 +211,7 @@ def test_what_cannot_be_measured_here_is_said_and_left_out_unless_it_was_named(
     def refuse(**_: object) -> list[Table]:
         raise ProgdfError("nothing here; something there")
 
-    monkeypatch.setattr(front, "_named", lambda _: refuse)
+    monkeypatch.setattr(front, "_function", lambda _: refuse)
     assert front.main([]) == 0
     assert "window is not measured: nothing here" in capsys.readouterr().err
     with pytest.raises(ProgdfError, match="nothing here"):

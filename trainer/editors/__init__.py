@@ -8,12 +8,13 @@ from functools import partial
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.editors.base import EditorSettings, ImageEditor, Painter
-from trainer.editors.folder import folder, folder_of, photograph_folders, photographs
-from trainer.editors.instruct import check_instruct, instruct
-from trainer.editors.procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
-from trainer.editors.style import check_style, style
-from trainer.views import View
+from trainer.views.view import View
+
+from .base import EditorSettings, ImageEditor, Painter
+from .folder import folder, folder_of, photograph_folders, photographs
+from .instruct import check_instruct, instruct
+from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
+from .style import check_style, style
 
 Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorSettings], ImageEditor]
 

@@ -8,7 +8,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from trainer.views import View
+from trainer.views.view import View
 
 EditKind = Literal["colour", "style", "geometry"]
 """What an edit moves, which chooses learning rates and loss weights (method.md 3)."""

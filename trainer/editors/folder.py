@@ -24,9 +24,10 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.lens import straightened
 from progdf.region import Region
-from trainer.editors.base import EditKind, EditorSettings
-from trainer.pictures import read_picture
-from trainer.views import View
+from trainer.store.images import read_picture
+from trainer.views.view import View
+
+from .base import EditKind, EditorSettings
 
 _EDITED = "put the edited copies of RUN/views/original/*.png there, under the same names"
 _TAKEN = "put the photographs there, under the names that the cameras have"

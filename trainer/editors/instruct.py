@@ -27,13 +27,14 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.pictures import to_picture
+from progdf.io.images import to_picture
 from progdf.region import Region
-from trainer.editors.adapters import ADAPTERS, DEFAULT_MODEL, Adapter
-from trainer.editors.base import EditKind, EditorSettings
-from trainer.editors.kept import KeptPictures, Recipe
-from trainer.views import View
-from trainer.weights import BROKEN, check_weights_here, folder_of_model
+from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
+from trainer.views.view import View
+
+from .adapters import ADAPTERS, DEFAULT_MODEL, Adapter
+from .base import EditKind, EditorSettings
+from .cache import KeptPictures, Recipe
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
 

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf import colour
-from progdf.color_path import ColorPath, bend_of, between, path_of
+from progdf.color import edits as colour
+from progdf.color.path import ColorPath, bend_of, between, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.editors.base import EditKind, EditorSettings
-from trainer.views import View, drawn, seen_colors
+from trainer.views.view import View, drawn, seen_colors
+
+from .base import EditKind, EditorSettings
 
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region

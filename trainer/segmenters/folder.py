@@ -19,8 +19,8 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
+from progdf.io.images import laid_on, open_picture
 from progdf.lens import straightened
-from progdf.pictures import laid_on, open_picture
 from trainer.editors.folder import SUFFIXES
 
 

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.pictures import to_picture
+from progdf.io.images import to_picture
 from trainer.options import DETECTOR, OUTLINER
-from trainer.segmenters.base import SegmenterSettings
-from trainer.weights import BROKEN, check_weights_here, folder_of_model
+from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
+
+from .base import SegmenterSettings
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from progdf.checkpoint import Gdf
-from progdf.coverage import coverage
+from progdf.compose.coverage import coverage
 from progdf.field.baked import AttributeBases
 from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
 
 from .layout import PLACES, SHOWN_SH, TARGETS, Place
 
@@ -63,7 +63,7 @@ class PackedEdits:
         places: for each edit in turn, which member each slot is, −1 where none. [E·U] int32
         edits: by target, what each edit does to it
         covers: where each edit's texels of geometry, opacity and colour begin in `floats`, see
-            `progdf.coverage`; one a member
+            `progdf.compose.coverage`; one a member
         nodes: strengths of each edit's coefficients. [S] each
         sh_coefficients: K of shN that are shown
     """

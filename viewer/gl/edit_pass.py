@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.checkpoint import Gdf
-from progdf.compose_plan import plan_rows
+from progdf.compose.layers import BLENDS, Layer
+from progdf.compose.plan import plan_rows
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.layers import BLENDS, Layer
+from progdf.gdf.file import Gdf
 
 from .edit_bases import pack_edits
 from .edit_spans import spans_of
@@ -103,7 +103,7 @@ class EditPass:
         Args:
             stack: active layers with the indices of their edits, the lowest first
             blend: one of `BLENDS`
-            changed: see `progdf.compose_effects.changed_edits`
+            changed: see `progdf.compose.effects.changed_edits`
 
         Returns:
             Sorted indices of the Gaussians that were written. [M]

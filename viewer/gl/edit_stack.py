@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.compose_plan import factors
-from progdf.layers import Layer
+from progdf.compose.layers import Layer
+from progdf.compose.plan import factors
 
 from .edit_bases import Floats, PackedEdits, TargetBases
 from .layout import EDIT_LAYER, PLACES

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
+from .highlight_texture import TintTexture
 from .layout import ORDER, PROJECTED, SHOWN_SH
 from .programs import load_program
 from .scene_textures import SplatTextures
-from .tint_texture import TintTexture
 
 Rgb = tuple[float, float, float]
 
@@ -103,7 +103,7 @@ class SplatRenderer:
             self._tints = None
 
     def set_order(self, order: NDArray[np.uint32]) -> None:
-        """Which Gaussians are drawn, farthest first; see `viewer.sort`."""
+        """Which Gaussians are drawn, farthest first; see `viewer.render.depth_sort`."""
         assert self._buffers is not None, "upload comes first"
         self._drawn = len(order)
         if self._drawn:

@@ -1,0 +1,1 @@
+"""Timings beside errors, and ablations: `python -m benchmarks`."""

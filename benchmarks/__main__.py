@@ -1,0 +1,130 @@
+"""`python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
+
+`python -m benchmarks ablate RUN` trains a finished run again without each part of the method.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from progdf.__main__ import guarded
+from progdf.cli.options import parsed
+from progdf.errors import ProgdfError
+from progdf.io.atomic import written_whole
+
+from .table import Table, machine, put_tables
+
+COMMAND = "python -m benchmarks"
+
+BENCHES: dict[str, str] = {
+    "rasterize": "benchmarks.rasterizer:tables",
+    "field": "benchmarks.field:tables",
+    "viewer": "benchmarks.viewer.slider:tables",
+    "frames": "benchmarks.viewer.frames:tables",
+    "window": "benchmarks.viewer.window:tables",
+}
+
+RECORDED = "benchmarks.recorded_runs:recorded_course"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure speed against error; each benchmark interleaves what it compares in one process.
+
+    Args:
+        what: rasterize, field, viewer, frames, window; all of them when none is named
+        json: also write the tables to this JSON file
+        readme: also put the tables between their markers in this Markdown file
+        runs: finished run folders whose recorded edits `field` measures beside the bear's
+        plot: `field` also draws its errors into this PNG file
+        scenes: .ply files that viewer, frames and window draw in place of the bears
+        seconds: how long `window` drags its slider; 60 where not said
+    """
+
+    what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    json: Path | None = None
+    readme: Path | None = None
+    runs: tuple[Path, ...] = ()
+    plot: Path | None = None
+    scenes: tuple[Path, ...] = ()
+    seconds: float | None = None
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the named benchmarks, or the ablation. Raises ProgdfError for a name that does not exist."""
+    if list(argv[:1]) == ["ablate"]:
+        return ablate(argv[1:])
+    options = parsed(Options, argv, COMMAND)
+    for name in options.what:
+        if name not in BENCHES:
+            raise ProgdfError(f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate'))}")
+    if (options.runs or options.plot) and options.what and "field" not in options.what:
+        raise ProgdfError("--runs and --plot are for fields; use python -m benchmarks field")
+    drawing = ("viewer", "frames", "window")
+    if options.scenes and options.what and not set(drawing) & set(options.what):
+        raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks {drawing[0]}")
+    if options.seconds is not None and options.what and "window" not in options.what:
+        raise ProgdfError("--seconds is how long the window is dragged; use python -m benchmarks window")
+    for output in (options.json, options.plot):  # told now, not when an hour has been measured
+        if output is not None and not output.parent.is_dir():
+            raise ProgdfError(f"the folder {output.parent} does not exist; make it first")
+    if options.readme is not None and not options.readme.is_file():
+        raise ProgdfError(f"{options.readme} does not exist; check the name and the folder")
+    given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
+    if options.runs:
+        given["field"]["recorded"] = [_function(RECORDED)(run) for run in options.runs]
+    given |= {name: {"scenes": options.scenes} for name in drawing}
+    if options.seconds is not None:
+        given["window"]["seconds"] = options.seconds
+    tables: list[Table] = []
+    print(f"{machine()}\n")
+    for name in options.what or tuple(BENCHES):
+        try:
+            measured = _function(BENCHES[name])(**given.get(name, {}))
+        except ProgdfError as error:
+            if options.what:
+                raise
+            print(f"{name} is not measured: {error}\n", file=sys.stderr)
+            continue
+        for table in measured:
+            tables.append(table)
+            print(table.markdown() + "\n", flush=True)
+    if options.json:
+        written = {"machine": machine(), "tables": [asdict(table) for table in tables]}
+        with written_whole(options.json) as beside:
+            beside.write_text(json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    if options.readme:
+        filled = put_tables(options.readme.read_text(encoding="utf-8"), tables)
+        with written_whole(options.readme) as beside:
+            beside.write_text(filled, encoding="utf-8")
+    return 0
+
+
+def _function(path: str) -> Callable[..., Any]:
+    """The function that "module:name" names; each benchmark is imported only when it runs."""
+    module, function = path.split(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found
+
+
+def ablate(argv: Sequence[str]) -> int:
+    """Run the ablation; 0 when the table is written. Raises ProgdfError for what the user can mend."""
+    from .ablation.ablate import ablate as run
+    from .ablation.options import AblateOptions
+    from .ablation.table import print_table
+
+    done = run(parsed(AblateOptions, argv, f"{COMMAND} ablate"))
+    print_table(done.outcomes, done.title, done.perceptual)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(guarded(main, sys.argv[1:]))

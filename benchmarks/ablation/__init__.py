@@ -1,0 +1,1 @@
+"""The method without each of its parts."""

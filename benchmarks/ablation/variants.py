@@ -1,0 +1,108 @@
+"""The method without one of its parts, or with another: what `python -m benchmarks ablate` trains again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from progdf.errors import ProgdfError
+from trainer.editors.base import EditKind
+from trainer.optimize.settings import PERCEPTUAL_WEIGHT, SHARPNESS, slider_meant, solves_colors
+from trainer.options import TrainOptions
+from trainer.presets import PRESETS
+
+BASE, LINEAR = "base", "2-keyframes"
+
+_AS_PRINTED = {name: value for name, value in PRESETS["paper"].items() if name not in ("steps", "views")}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of the ablation.
+
+    Args:
+        name: short, as --only takes it
+        what: what is different, in words
+        changes: options in place of the run's
+        linear: the slider goes straight from the original to the end, whatever was recorded
+    """
+
+    name: str
+    what: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    linear: bool = False
+
+    @property
+    def trains_as(self) -> str:
+        """Name of the variant whose optimisation it shares: the slider is laid over what was recorded."""
+        return BASE if set(self.changes) <= {"slider"} else self.name
+
+
+VARIANTS = (
+    Variant(BASE, "the run's own options"),
+    Variant(LINEAR, "a straight line to the same end: 2 keyframes", linear=True),
+    Variant("one-target", "no stages: towards the finished edit alone", {"stages": 1}),
+    Variant("progressive-off", "no progressive constraint", {"progressive": "off"}),
+    Variant("progressive-warmup", "the constraint as a warm-up", {"progressive": "warmup"}),
+    Variant("progressive-decay", "the printed constraint, letting go", {"progressive": "decay"}),
+    Variant("progressive-growth", "the printed constraint, tightening", {"progressive": "growth"}),
+    Variant("sharpness-off", "no sharpness term", {"sharpness": "off"}),
+    Variant("sharpness-hinge", "as sharp as the target", {"sharpness": "hinge"}),
+    Variant("sharpness-paper", "the printed sharpness", {"sharpness": "paper"}),
+    Variant("no-lpips", "L1 alone", {"perceptual_weight": 0.0}),
+    Variant("no-sh", "view-dependent colour left as it is", {"sh": "off"}),
+    Variant("no-groups", "parts are not moved as wholes first", {"group_steps": 0}),
+    Variant("slider-stages", "the editor's own strengths, even in between", {"slider": "stages"}),
+    Variant("slider-even", "even over the whole slider", {"slider": "even"}),
+    Variant("slider-time", "the optimiser's time", {"slider": "time"}),
+    Variant("paper", "all as the paper prints it", _AS_PRINTED),
+)
+
+
+def sensible(options: TrainOptions, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
+    """The variants that differ from a run.
+
+    Args:
+        options: the run's own
+        kind: what the edit moves
+        stages: how many strengths the editor was asked for
+        sh_degree: of the scene
+    """
+    idle = {
+        *(() if stages > 1 else ("one-target", "slider-stages", "slider-even")),
+        *(() if sh_degree > 0 else ("no-sh",)),
+        *(() if kind == "geometry" else ("no-groups",)),
+    }
+    own = _resolved(options, kind, stages)
+    return [
+        variant
+        for variant in VARIANTS
+        if variant.name not in idle
+        and (not variant.changes or _resolved(replace(options, **variant.changes), kind, stages) != own)
+    ]
+
+
+def chosen(variants: Sequence[Variant], only: str) -> list[Variant]:
+    """Those that `only` names, in their own order, or all.
+
+    Raises:
+        ProgdfError: a name that is none, or that makes no difference to this run; or no name but commas.
+    """
+    names = {name.strip() for name in only.split(",") if name.strip()}
+    known = {variant.name for variant in variants}
+    if only and not names:
+        raise ProgdfError(f"--only '{only}' names no variant; choose of {','.join(v.name for v in variants)}")
+    for name in sorted(names - known):
+        about = "makes no difference to this run" if name in {v.name for v in VARIANTS} else "does not exist"
+        raise ProgdfError(f"the variant '{name}' {about}; choose of {','.join(v.name for v in variants)}")
+    return [variant for variant in variants if not names or variant.name in names]
+
+
+def _resolved(options: TrainOptions, kind: EditKind, stages: int) -> TrainOptions:
+    """With the kind's own values in place of "auto" and None."""
+    weight = PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight
+    weight = 0.0 if solves_colors(options, kind) else weight
+    sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness
+    slider = slider_meant(options.slider, options.editor, (1.0,) * stages)
+    return replace(options, perceptual_weight=weight, sharpness=sharpness, slider=slider)

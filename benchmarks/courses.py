@@ -1,0 +1,153 @@
+"""Edits whose course is known, by formula or as recorded, for fields to be fitted, judged and timed."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.compose.composer import Composer
+from progdf.compose.layers import Layer
+from progdf.demo_scenes import AnalyticEdit
+from progdf.field import BakedField, FieldJudge
+from progdf.field.evaluate import Field
+from progdf.field.ranks import decibels
+from progdf.field.rendered import Render
+from progdf.gaussians import Gaussians, pack
+from progdf.gdf.file import Gdf, fingerprint
+from progdf.rasterize import alpha_weights, render, set_threads
+from progdf.rasterize.threads import threads
+from progdf.region import from_mask
+
+AT_SNAPSHOTS = 6
+"""Snapshots at which fields are judged beside the strengths between them."""
+
+
+@dataclass(frozen=True)
+class KnownCourse:
+    """An edit's true course.
+
+    Args:
+        name: of the edit
+        scene: the original
+        members: that the edit changes, ascending. [M] int64
+        strengths: of the snapshots that fields are fitted to. [T]
+        offsets: [T,M,C]
+        truth: the offsets at any strength. [M,C]
+        judge: errors against the truth, in views that `look` does not show, over the pixels that change
+        look: pixels on which fields may be chosen
+        weights: visibility of the members. [M]
+        unseen: the judge's pixels
+    """
+
+    name: str
+    scene: Gaussians
+    members: Tensor
+    strengths: Tensor
+    offsets: Tensor
+    truth: Callable[[float], Tensor]
+    judge: FieldJudge
+    look: Render
+    weights: Tensor
+    unseen: Render
+
+    @cached_property
+    def _shown(self) -> list[tuple[float, Tensor]]:
+        inner = range(1, len(self.strengths) - 1)
+        some = inner[:: max(1, len(inner) // AT_SNAPSHOTS)][:AT_SNAPSHOTS]
+        with torch.no_grad():
+            return [(float(self.strengths[t]), self.unseen(self.offsets[t])) for t in some]
+
+    def worst_at_snapshots(self, field: Field) -> float:
+        """Least PSNR at some snapshots that a field was fitted to, dB, where `judge` looks between them."""
+        with torch.no_grad():
+            errors = [
+                float((self.unseen(field.offsets(s)) - shown).double().square().mean())
+                for s, shown in self._shown
+            ]
+        return min((decibels(error) for error in errors), default=decibels(0.0))
+
+
+def known_course(
+    name: str,
+    scene: Gaussians,
+    edit: AnalyticEdit,
+    members: Tensor,
+    cameras: Sequence[Camera],
+    snapshots: int,
+) -> KnownCourse:
+    """Everything of an edit that a benchmark of fields needs."""
+    with_sh = bool((edit.apply(scene, members, 1.0).shN != scene.shN).any())
+    start = pack(scene[members], with_sh)
+
+    def truth(s: float) -> Tensor:
+        return pack(edit.apply(scene, members, s)[members], with_sh) - start
+
+    strengths = torch.linspace(0, 1, snapshots)
+    offsets = torch.stack([truth(float(s)) for s in strengths])
+    seen, unseen = cameras[::11][:3], cameras[5::10][:2]
+    shown = _changed_pixels(scene, members, offsets, unseen)
+    judge = FieldJudge(strengths, offsets, shown, truth)
+    visible = sum(
+        (
+            alpha_weights(scene, camera, torch.ones(camera.height, camera.width))[members, 2].float()
+            for camera in seen
+        ),
+        torch.zeros(len(members)),
+    )
+    weights = visible / visible.mean() + 1e-3
+    look = _changed_pixels(scene, members, offsets, seen)
+    return KnownCourse(name, scene, members, strengths, offsets, truth, judge, look, weights, shown)
+
+
+def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras: Sequence[Camera]) -> Render:
+    start = pack(scene[members], offsets.shape[2] > 14)
+
+    def pictures(moved: Tensor) -> list[Tensor]:
+        edited = scene.replace_rows(members, start + moved)
+        return [render(edited, camera) for camera in cameras]
+
+    ends = [pictures(offsets[t]) for t in (0, len(offsets) // 2, -1)]
+    counts = [((b - a).abs() + (c - a).abs()).amax(dim=2) > 2 / 255 for a, b, c in zip(*ends, strict=True)]
+    return lambda moved: torch.cat([p[c] for p, c in zip(pictures(moved), counts, strict=True)])
+
+
+def step_ms(scene: Gaussians, edit: Gdf) -> tuple[float, float]:
+    """A slider step of the composer with one thread and with two, in turns, medians, ms."""
+    composer = Composer(scene, [edit])
+    layers = [Layer(edit, s / 20) for s in range(1, 20)]
+    before = threads()
+
+    def step(count: int, layer: Layer) -> float:
+        set_threads(count)
+        return milliseconds(partial(composer.update, [layer]))
+
+    times: tuple[list[float], list[float]] = ([], [])
+    try:
+        for layer in layers:
+            for count in (1, 2):
+                composer.update([])
+                times[count - 1].append(step(count, layer))
+    finally:
+        set_threads(before)
+    return statistics.median(times[0]), statistics.median(times[1])
+
+
+def milliseconds(work: Callable[[], object]) -> float:
+    """How long something takes."""
+    begin = time.perf_counter()
+    work()
+    return 1e3 * (time.perf_counter() - begin)
+
+
+def edit_of(scene: Gaussians, members: Tensor, field: BakedField) -> Gdf:
+    """An edit of these rows."""
+    mask = torch.zeros(len(scene), dtype=torch.bool)
+    mask[members] = True
+    return Gdf("edit", from_mask("edit", mask), field, fingerprint(scene))

@@ -1,0 +1,130 @@
+"""Every form of field on one edit: how large, how wrong, how long to fit and to step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from progdf.field import BakedField, choose_field, fit_keyframes
+from progdf.field.choose import separable_within
+from progdf.field.keyframes import bending_snapshots
+from progdf.field.rendered import picture_gram, rendered_courses
+from progdf.field.separable import channel_weights
+
+from .courses import KnownCourse, edit_of, step_ms
+from .joint_svd import fit_joint
+
+COUNTS = (3, 4, 9)
+"""Keyframes in int8, and the separable fields and joint factors of the same bytes beside them."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """One field of one edit, measured.
+
+    Args:
+        edit, members: what was edited
+        kind: as the plot tells them apart
+        label: what it is
+        numbers: stored, or learned by a network
+        bytes_per_member: on disk
+        curve: PSNR over the slider between the snapshots, dB; empty where it was not judged
+        at_snapshots: least PSNR at snapshots, dB
+        seconds: to fit it, with the pictures that this looks at
+        step: ms for one change of the slider, with one thread and with two
+    """
+
+    edit: str
+    members: int
+    kind: str
+    label: str
+    numbers: int
+    bytes_per_member: float
+    curve: tuple[float, ...]
+    at_snapshots: float | None
+    seconds: float | None
+    step: tuple[float, float]
+
+    @property
+    def worst(self) -> float | None:
+        """Least PSNR over the slider, dB."""
+        return min(self.curve, default=None)
+
+    @property
+    def mean(self) -> float | None:
+        """Mean PSNR over the slider, dB."""
+        return sum(self.curve) / len(self.curve) if self.curve else None
+
+
+def baked_forms(course: KnownCourse) -> list[Form]:
+    """Keyframes, joint and separable factors of the same bytes, and what `auto` chooses; all judged alike."""
+    strengths, offsets, judge, weights = course.strengths, course.offsets, course.judge, course.weights
+    found: list[Form] = []
+
+    def measured(kind: str, fit: Callable[[], tuple[BakedField, str]], shared: float = 0.0) -> Form:
+        begin = time.perf_counter()
+        field, label = fit()
+        seconds = shared + time.perf_counter() - begin
+        found.append(
+            Form(
+                course.name, len(course.members), kind, label, stored_numbers(field), field.bytes_per_member,
+                judge.curve(field), course.worst_at_snapshots(field), seconds,
+                step_ms(course.scene, edit_of(course.scene, course.members, field)),
+            )
+        )  # fmt: skip
+        return found[-1]
+
+    begin = time.perf_counter()
+    gram = picture_gram(offsets, course.look)
+    looked = time.perf_counter() - begin
+    kept = {count: bending_snapshots(strengths, gram, count) for count in {2, 4, 9, *COUNTS}}
+    for count in (2, 4, 9):
+        measured(
+            "keyframes, float32",
+            lambda c=count: (  # type: ignore[misc]
+                fit_keyframes(strengths, offsets, c, kept=kept[c]), f"{c} keyframes, float32"
+            ),
+            looked,
+        )  # fmt: skip
+    begin = time.perf_counter()
+    courses = rendered_courses(offsets, channel_weights(weights, *offsets.shape[1:]), course.look)
+    straightened = time.perf_counter() - begin
+    for count in COUNTS:
+        for between in ("linear", "cubic"):
+            name = "keyframes, int8" if between == "linear" else "cubic keyframes, int8"
+            measured(
+                name,
+                lambda c=count, b=between, n=name: (  # type: ignore[misc]
+                    fit_keyframes(strengths, offsets, c, None, torch.int8, kept[c], b), f"{c} {n}"
+                ),
+                looked,
+            )  # fmt: skip
+        size = found[-1].bytes_per_member
+        measured(
+            "joint SVD",
+            lambda c=count: (fit_joint(strengths, offsets, c - 2, weights), f"joint SVD, rank {c - 2}"),  # type: ignore[misc]
+        )
+
+        def separable(size: float = size) -> tuple[BakedField, str]:
+            candidate = separable_within(courses, strengths, size, judge)
+            return candidate.field, candidate.label
+
+        measured("separable", separable, straightened)
+
+    def auto() -> tuple[BakedField, str]:
+        best = choose_field(strengths, offsets, course.look, weights, judge=judge).best
+        return best.field, f"auto at 40 dB: {best.label}"
+
+    measured("auto", auto)
+    return found
+
+
+def stored_numbers(field: BakedField) -> int:
+    """How many numbers the field holds for all members together, coefficients included."""
+    return sum(
+        bases.full.numel() + bases.rest.numel() + bases.step.numel() + bases.coefficients.numel()
+        for bases in field.attributes.values()
+    )

@@ -1,0 +1,238 @@
+"""`python -m benchmarks rasterize`: the cpu engine's speed beside its error, against tiles in plain torch.
+
+What it is compared with is a plain tiled renderer in float32, differentiated by autograd: tiles of 16x16
+pixels, within which every listed Gaussian meets every pixel; listed is what the square of three standard
+deviations of the longer axis touches, as published (Kerbl 2023). Both take turns in one process, once on all
+threads and once on one thread each.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from math import pi
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, intrinsics
+from progdf.rasterize import rasterize, reference, set_threads
+
+from .table import Table
+
+INPUTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A random cloud in front of a camera.
+
+    Args:
+        count: Gaussians
+        size: width and height of the image, pixels
+        baseline: whether torch can do it in the memory of a small machine
+    """
+
+    count: int
+    size: int
+    baseline: bool = True
+
+
+CASES = (Case(2_000, 128), Case(20_000, 256), Case(100_000, 512, baseline=False))
+
+
+@dataclass(frozen=True)
+class Duel:
+    """Times of forward + backward on so many threads, ms: the cpu engine's (medians) and torch's by round."""
+
+    threads: int
+    ours: list[float]
+    torch: list[float]
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster than torch; the median over the rounds of each round's ratio."""
+        return statistics.median(b / a for a, b in zip(self.ours, self.torch, strict=True))
+
+
+@dataclass(frozen=True)
+class Result:
+    """Times of one case in ms, one entry a round, and errors against float64.
+
+    Args:
+        forward, both: the cpu engine without and with the backward pass, on all threads
+        duels: against the tiled torch renderer, on all threads and on one; empty where it is left out
+        image_error: largest difference of a colour
+        gradient_errors: largest difference over the largest gradient, by input
+    """
+
+    case: Case
+    forward: list[float]
+    both: list[float]
+    duels: list[Duel]
+    image_error: float
+    gradient_errors: dict[str, float]
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster than torch, each on all threads."""
+        return self.duels[0].ratio
+
+
+def cloud(case: Case) -> tuple[list[Tensor], Camera]:
+    """Activated means, quats, scales, opacities, rgb, seeded, and a camera that sees most of them.
+
+    A Gaussian's standard deviation is about 1.4 pixels, axes differ by a factor of about 2: what a trained
+    scene looks like from where its pictures were taken.
+    """
+    rng = torch.Generator().manual_seed(case.count)
+    means = torch.randn(case.count, 3, generator=rng) * 0.7 + torch.tensor([0.0, 0.0, 4.0])
+    K = intrinsics(0.9, case.size, case.size)
+    scale = 1.4 * 4.0 / float(K[0, 0])
+    scales = scale * torch.exp(0.5 * torch.randn(case.count, 3, generator=rng))
+    quats = torch.randn(case.count, 4, generator=rng)
+    opacities = torch.sigmoid(1.5 * torch.randn(case.count, generator=rng))
+    colors = torch.rand(case.count, 3, generator=rng)
+    return [means, quats, scales, opacities, colors], Camera(torch.eye(4), K, case.size, case.size)
+
+
+def draw(
+    inputs: list[Tensor], camera: Camera, engine: str, dtype: torch.dtype, backward: bool
+) -> tuple[float, Tensor, list[Tensor]]:
+    """Milliseconds of one pass, the image, and the gradients that a fixed gradient of the image leads to."""
+    leaves = [tensor.clone().to(dtype).requires_grad_(backward) for tensor in inputs]
+    means, quats, scales, opacities, colors = leaves
+    ramp = torch.linspace(0.0, pi, camera.width, dtype=dtype).sin()
+    grad_image = torch.stack([ramp[:, None] * ramp, ramp[:, None] - ramp, -ramp * ramp[:, None]], -1)
+    begin = time.perf_counter()
+    image = _image(engine, (means, quats, scales, opacities, colors), camera)
+    if backward:
+        image.backward(grad_image)  # type: ignore[no-untyped-call]
+    elapsed = 1e3 * (time.perf_counter() - begin)
+    return elapsed, image.detach(), [leaf.grad for leaf in leaves if leaf.grad is not None]
+
+
+def _image(engine: str, gaussians: tuple[Tensor, ...], camera: Camera) -> Tensor:
+    means, quats, scales, opacities, colors = gaussians
+    size = (camera.width, camera.height)
+    if engine != "tiled":
+        image, _, _ = rasterize(
+            means, quats, scales, opacities, colors, camera.viewmat, camera.K, *size, engine=engine
+        )
+        return image
+    window = (0, 0, *size)
+    splats, _ = reference.project(
+        means, quats, scales, opacities, colors, camera.viewmat, camera.K, *size, 0.01, None, False, window
+    )
+    image, _ = reference.blend(three_sigma(splats), window, means.new_zeros(3))
+    return image
+
+
+def three_sigma(splats: reference.Splats) -> reference.Splats:
+    """With the published extents: a square of three standard deviations along the longer axis, whole pixels.
+
+    They leave out what a Gaussian still adds between there and alpha = 1/255.
+    """
+    l11, l21, l22 = splats.whitening.detach().double().unbind(1)
+    c = l22.square().reciprocal()
+    det = c / l11.square()
+    b = l21 * (det * c).sqrt()
+    a = (det + b.square()) / c
+    middle = 0.5 * (a + c)
+    longest = middle + (middle.square() - det).clamp_min(0.0).sqrt()
+    radius = (3.0 * longest.sqrt()).ceil().to(splats.extents.dtype)
+    return replace(splats, extents=radius[:, None].expand(-1, 2))
+
+
+def measure(case: Case, rounds: int = 9, torch_rounds: int = 3) -> Result:
+    """Measure one case; engines take turns, and the first round of each is not counted.
+
+    Args:
+        case: what to draw
+        rounds: of the cpu engine, within each round of torch
+        torch_rounds: of torch
+    """
+    inputs, camera = cloud(case)
+    _, image, gradients = draw(inputs, camera, "cpu", torch.float32, backward=True)
+    with _threads(1):
+        draw(inputs, camera, "cpu", torch.float32, backward=False)
+        forward = [draw(inputs, camera, "cpu", torch.float32, backward=False)[0] for _ in range(rounds)]
+        both = [draw(inputs, camera, "cpu", torch.float32, backward=True)[0] for _ in range(rounds)]
+    duels = []
+    for threads in sorted({1, torch.get_num_threads()}, reverse=True) if case.baseline else ():
+        ours, theirs = [], []
+        with _threads(threads):
+            draw(inputs, camera, "tiled", torch.float32, backward=True)
+        for _ in range(torch_rounds):
+            # the kernels have their own threads; torch's would only spin beside them
+            with _threads(1, threads):
+                fast = [draw(inputs, camera, "cpu", torch.float32, backward=True)[0] for _ in range(rounds)]
+            ours.append(statistics.median(fast))
+            with _threads(threads):
+                theirs.append(draw(inputs, camera, "tiled", torch.float32, backward=True)[0])
+        duels.append(Duel(threads, ours, theirs))
+    with torch.set_grad_enabled(case.baseline):
+        _, exact, exact_gradients = draw(inputs, camera, "reference", torch.float64, backward=case.baseline)
+    errors = {
+        name: float((found - expected).abs().max() / expected.abs().max())
+        for name, found, expected in zip(INPUTS, gradients, exact_gradients, strict=False)
+    }
+    image_error = float((image - exact).abs().max())
+    return Result(case, forward, both, duels, image_error, errors)
+
+
+@contextmanager
+def _threads(of_torch: int, of_kernels: int | None = None) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(of_torch)
+    set_threads(of_kernels)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        set_threads(None)
+
+
+def tables() -> list[Table]:
+    """The benchmark's table."""
+    results = [measure(case) for case in CASES]
+    rows = []
+    for result in results:
+        case = result.case
+        worst = max(result.gradient_errors, key=lambda name: result.gradient_errors[name], default="")
+        rows.append(
+            (
+                f"{case.count:,}".replace(",", " "),
+                f"{case.size}²",
+                _spread(result.forward),
+                _spread(result.both),
+                _spread(result.duels[0].torch) if case.baseline else "not run",
+                f"{result.ratio:.0f}×" if case.baseline else "not run",
+                f"{result.duels[-1].ratio:.0f}×" if case.baseline else "not run",
+                f"{result.image_error:.1e}",
+                f"{result.gradient_errors[worst]:.1e} ({worst})" if worst else "not run",
+            )
+        )
+    columns = (
+        "Gaussians",
+        "pixels",
+        "forward (ms)",
+        "forward + backward (ms)",
+        "tiled torch (ms)",
+        "ratio",
+        "ratio on one thread",
+        "image error",
+        "worst gradient error",
+    )
+    note = (
+        "Median and range; the engines take turns in one process. Errors are against float64: largest "
+        "difference of a colour; largest difference of a gradient over the largest, worst input named."
+    )
+    return [Table("rasterize", "CPU rasteriser", columns, tuple(rows), note)]
+
+
+def _spread(times: list[float]) -> str:
+    return f"{statistics.median(times):.1f} ({min(times):.1f}-{max(times):.1f})"

@@ -1,0 +1,1 @@
+"""What a slider, a frame and an idle window cost."""

@@ -1,0 +1,163 @@
+"""The real window for benchmarks: `progdf view` in a process of its own on a virtual X display."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from progdf.errors import ProgdfError
+
+PATIENCE_S = 120.0
+PROGRAMS = ("Xvfb", "xdotool")
+
+
+def missing() -> str:
+    """What is needed for a window without a screen and is not installed; empty if nothing is."""
+    return " and ".join(program for program in PROGRAMS if shutil.which(program) is None)
+
+
+@contextmanager
+def display(width: int = 1400, height: int = 900) -> Iterator[str]:
+    """The name of a virtual display, while it is there.
+
+    Raises:
+        ProgdfError: Xvfb or xdotool is not installed.
+    """
+    if missing():
+        raise ProgdfError(f"{missing()} is not installed; install xvfb and xdotool to measure the window")
+    receive, send = os.pipe()
+    screen = ("-screen", "0", f"{width}x{height}x24")
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(send), *screen, "-nolisten", "tcp"],
+        pass_fds=[send],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(send)
+    try:
+        with os.fdopen(receive) as told:
+            yield f":{told.readline().strip()}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+@dataclass
+class Opened:
+    """A window that is open: its process and what it says of itself.
+
+    Args:
+        process: runs `benchmarks.viewer.watched`
+        environment: with the display
+        figures: what was said so far (see `bench_watched`)
+    """
+
+    process: subprocess.Popen[str]
+    environment: dict[str, str]
+    figures: dict[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+    def listen(self) -> None:
+        """Wait for the next line and take its figures.
+
+        Raises:
+            ProgdfError: the window closed without one.
+        """
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            assert self.process.stderr is not None
+            said = self.process.stderr.read().strip().splitlines() or ["it said nothing"]
+            raise ProgdfError(f"the window closed while it was measured: {said[-1]}; try `progdf view`")
+        self.figures |= json.loads(line)
+
+    def xdotool(self, *arguments: object) -> str:
+        """One call of xdotool; what it prints."""
+        run = subprocess.run(
+            ["xdotool", *map(str, arguments)], env=self.environment, capture_output=True, text=True
+        )
+        return run.stdout.strip()
+
+    def focus(self) -> None:
+        """Find the window and give it the keyboard."""
+        end = time.monotonic() + PATIENCE_S
+        while not self.name and time.monotonic() < end:
+            self.name = self.xdotool("search", "--onlyvisible", "--name", "ProGDF Studio").split("\n")[0]
+        self.xdotool("windowfocus", self.name)
+
+    def processor_s(self) -> float:
+        """Processor time that all its threads have used, seconds."""
+        numbers = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
+
+    def memory_mb(self) -> float:
+        """Memory that it holds now (resident set), MB of 1e6 bytes."""
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def close(self) -> None:
+        """End it as Ctrl+C in a terminal does, and take its last figures.
+
+        Raises:
+            ProgdfError: it does not end by itself.
+        """
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+        try:
+            said, _ = self.process.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.communicate()
+            raise ProgdfError(
+                f"the window did not close within {PATIENCE_S:g} s; try `progdf view`"
+            ) from None
+        for line in said.splitlines():
+            self.figures |= json.loads(line)
+
+
+@contextmanager
+def window(
+    screen: str, arguments: Sequence[object], size: tuple[int, int], folder: Path, leave: bool = False
+) -> Iterator[Opened]:
+    """`progdf view` with these arguments, opened now.
+
+    Args:
+        screen: of `display`
+        arguments: of `progdf view`
+        size: of the window, pixels
+        folder: where it works and keeps its list of recent files
+        leave: close it by itself once the first picture is on the screen
+
+    Raises:
+        ProgdfError: it closed before its first picture.
+    """
+    environment = os.environ | {"DISPLAY": screen, "XDG_STATE_HOME": str(folder)}
+    environment.pop("WAYLAND_DISPLAY", None)
+    own = [str(time.time()), f"{size[0]}x{size[1]}", "leave" if leave else "stay"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.viewer.watched", *own, *map(str, arguments)],
+        env=environment,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    opened = Opened(process, environment)
+    try:
+        opened.listen()
+        yield opened
+    finally:
+        if process.poll() is None:
+            opened.close()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()

@@ -1,0 +1,333 @@
+"""`python -m benchmarks frames`: how long a frame takes while one orbits, how soon the first is there.
+
+A mouse turns the picture of a whole window; every frame is drawn anew in its own depth order. The two ways
+to draw take turns at every step, in one process; what a picture costs that is coarse while it moves stands
+beside its error. The first picture is that of `progdf view` on a virtual display, from the process's start.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.table import Table
+from progdf.formats.ply import save_ply
+from viewer.camera.view_camera import first_camera
+from viewer.files import document as documents
+from viewer.panel.panel import WIDTH_PX
+from viewer.render import dynamic_resolution as draft
+from viewer.render.engine import Engine
+from viewer.render.headless import headless_context
+from viewer.render.threads import one_thread
+from viewer.state.view_state import ViewState
+
+from . import display as bench_display
+from .mouse import SIZE, Mouse
+from .scenes import COPIES, copies, scenes_of
+
+WARM_UP, STEPS, STARTS, KEPT = 2, 20, 3, 4
+LEAST, TURN_S, STARTS_S = 3, 20.0, 30.0
+"""Slow frames and starts are as many as fit into so many seconds, and at least so many frames."""
+
+MOST_COPIED = 1_000_000
+"""Gaussians beyond which the largest scene is not laid over itself."""
+
+TURN_PX = 10.0
+"""How far the mouse goes from one frame to the next: three degrees."""
+
+WAYS = {"gl": "OpenGL", "cpu": "CPU"}
+
+
+@dataclass(frozen=True)
+class Turning:
+    """One scene turned, drawn one way; an entry of `frames_ms`, `draws_ms` and `coarse_ms` per frame.
+
+    Args:
+        count: Gaussians in the scene
+        way: a key of `WAYS`
+        frames_ms: from the mouse's event to finished pixels of the whole window
+        draws_ms: the picture in it: sorted and drawn
+        checked, wrong: pictures that were drawn afresh once more, and how many of them differ
+        opened_s: from a file opened in the running window to its first picture
+        coarse_ms: whole frames again, coarse while they move
+        coarse_db: PSNR of the coarse pictures against the full ones, the worst
+        at_rest: how far the picture is from the full one once the hand rests, of 255
+    """
+
+    count: int
+    way: str
+    frames_ms: tuple[float, ...]
+    draws_ms: tuple[float, ...]
+    checked: int
+    wrong: int
+    opened_s: float
+    coarse_ms: tuple[float, ...]
+    coarse_db: float
+    at_rest: int
+
+
+@dataclass(frozen=True)
+class Start:
+    """`progdf view` in a process of its own; medians.
+
+    Args:
+        first_s: from the start of the process to the first picture on the screen
+        imports_s: of that, until Python has read the program and the libraries
+        memory_mb: the most that the process has held by then
+    """
+
+    first_s: float
+    imports_s: float
+    memory_mb: float
+
+
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """Measure, for the README and for `python -m benchmarks`.
+
+    Args:
+        scenes: .ply files that take the place of the bears; the largest is also laid over itself four times
+            unless that makes more than `MOST_COPIED` Gaussians
+
+    Raises:
+        ProgdfError: there is no OpenGL here, or a file is broken.
+    """
+    opened = scenes_of(scenes)
+    if COPIES * len(opened[-1]) <= MOST_COPIED:
+        opened.append(copies(opened[-1]))
+    ctx = headless_context()
+    try:
+        renderer = str(ctx.info["GL_RENDERER"])
+        with tempfile.TemporaryDirectory() as folder:
+            turnings: list[Turning] = []
+            starts: list[Start] = []
+            for scene in opened:
+                path = Path(folder) / "scene.ply"
+                save_ply(path, scene)
+                turnings += turned(ctx, path)
+                starts += [] if bench_display.missing() else [started(path, way) for way in WAYS]
+    finally:
+        ctx.release()
+    return [frames_table(turnings, starts, renderer), coarse_table(turnings, renderer)]
+
+
+@one_thread()
+def turned(
+    ctx: moderngl.Context, path: Path, steps: int = STEPS, size: tuple[int, int] = SIZE
+) -> list[Turning]:
+    """A scene's file opened and turned with the mouse, by every way in turns; then again, coarse."""
+    results = []
+    with ExitStack() as held:
+        nothing = documents.load(path).scene[:0]
+        mice: dict[str, Mouse] = {}
+        opened_s: dict[str, float] = {}
+        for way in WAYS:
+            empty = Engine(ctx, nothing, (), way)
+            mice[way] = held.enter_context(Mouse(ctx, empty, nothing, (), ViewState(draft="off"), size))
+            _open(mice[way], path, way)
+            empty.release()
+            first = mice[way].engine
+            opened_s[way] = _open(mice[way], path, way)  # a window has drawn before
+            first.release()
+            held.callback(mice[way].engine.release)
+        full = _turn(mice, steps)
+        for mouse in mice.values():
+            mouse.stage.change(replace(mouse.stage.work.view, draft="on"))
+        coarse = _turn(mice, steps)
+        for way, mouse in mice.items():
+            wrong = sum(not np.array_equal(image, _afresh(mouse, view)) for view, image in full[way].kept)
+            errors = [_psnr(image, _afresh(mouse, view)) for view, image in coarse[way].kept]
+            results.append(
+                Turning(
+                    mouse.stage.facts.count,
+                    way,
+                    tuple(full[way].frames_ms[WARM_UP:]),
+                    tuple(full[way].draws_ms[WARM_UP:]),
+                    len(full[way].kept),
+                    wrong,
+                    opened_s[way],
+                    tuple(coarse[way].frames_ms[WARM_UP:]),
+                    min(errors),
+                    _at_rest(mouse),
+                )
+            )
+    return results
+
+
+def started(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
+    """`progdf view --draw` of a scene's file, up to so many times, after one more that fills the caches.
+
+    Raises:
+        ProgdfError: Xvfb or xdotool is not installed, or the window does not open.
+    """
+    figures: list[dict[str, float]] = []
+    wide = (size[0] + round(WIDTH_PX), size[1])
+    with bench_display.display() as screen, tempfile.TemporaryDirectory() as folder:
+        began = time.monotonic()
+        while len(figures) < 2 or (len(figures) <= times and time.monotonic() - began < STARTS_S):
+            arguments = [path, "--draw", way]
+            with bench_display.window(screen, arguments, wide, Path(folder), leave=True) as opened:
+                figures.append(opened.figures)
+    names = ("first_s", "imports_s", "memory_mb")
+    return Start(*(statistics.median(figure[name] for figure in figures[1:]) for name in names))
+
+
+def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer: str) -> Table:
+    """Frames while turning, and first pictures. `starts`: one for each in their order, or none."""
+    rows = []
+    for i, result in enumerate(turnings):
+        middle, late = np.percentile(result.frames_ms, (50, 95))
+        start = starts[i] if starts else None
+        rows.append(
+            (
+                f"{result.count:,}".replace(",", " "),
+                WAYS[result.way],
+                f"{np.median(result.draws_ms):.1f}",
+                f"**{middle:.1f}** / {late:.1f}",
+                f"{result.checked - result.wrong} of {result.checked}",
+                f"{result.opened_s:.2f}",
+                "-" if start is None else f"{start.first_s:.2f} ({start.imports_s:.2f})",
+                "-" if start is None else f"{start.memory_mb:.0f}",
+            )
+        )
+    return Table(
+        "frames",
+        "Frames while orbiting, 640×480, and the first picture",
+        (
+            "Gaussians",
+            "drawn by",
+            "sort and draw, ms",
+            "whole frame p50 / p95, ms",
+            "the same drawn afresh",
+            "first picture of an opened file, s",
+            "of `progdf view`, s (imports)",
+            "memory by then, MB",
+        ),
+        tuple(rows),
+        f"OpenGL by {renderer}. Every frame turns three degrees and has its own exact depth order; a whole "
+        "frame goes from the mouse's event to finished pixels of picture and panel. A file is opened in a "
+        "window that is there; `progdf view` counts from the start of its process, kernels compiled before.",
+    )
+
+
+def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
+    """What a picture costs that is coarse while it moves, beside its error moving and at rest."""
+    rows = []
+    for result in turnings:
+        full, coarse = np.median(result.frames_ms), np.median(result.coarse_ms)
+        rows.append(
+            (
+                f"{result.count:,}".replace(",", " "),
+                WAYS[result.way],
+                f"{full:.1f}",
+                f"{coarse:.1f}",
+                f"{full / coarse:.1f}×",
+                f"{result.coarse_db:.1f}",
+                str(result.at_rest),
+            )
+        )
+    return Table(
+        "coarse",
+        "A picture that is coarse while it moves, 640×480",
+        (
+            "Gaussians",
+            "drawn by",
+            "frame in full, ms",
+            "coarse, ms",
+            "ratio",
+            "PSNR while moving, dB",
+            "difference at rest, of 255",
+        ),
+        tuple(rows),
+        f"OpenGL by {renderer}. Medians of whole frames while orbiting; one pixel drawn fills "
+        f"{draft.COARSE}×{draft.COARSE} of the window. The error is the worst of {KEPT} frames.",
+    )
+
+
+@dataclass
+class _Turned:
+    """Frames of one turn, and some of the states that were shown with their pictures."""
+
+    frames_ms: list[float] = field(default_factory=list)
+    draws_ms: list[float] = field(default_factory=list)
+    kept: list[tuple[ViewState, NDArray[np.uint8]]] = field(default_factory=list)
+
+
+def _open(mouse: Mouse, path: Path, way: str) -> float:
+    """Open a file in the window as it is done when one is dropped there; seconds to its first picture."""
+    began = time.perf_counter()
+    document = documents.load(path)
+    mouse.engine = Engine(mouse.stage.context, document.scene, (), way)
+    mouse.stage.serve(mouse.engine, document.facts())
+    mouse.stage.restart(replace(mouse.stage.work.view, camera=first_camera(document.scene)))
+    mouse.frame()
+    return time.perf_counter() - began
+
+
+def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
+    """Turn every mouse's picture, a frame each in turns, up to `steps` of them (see `TURN_S`)."""
+    turns = {way: _Turned() for way in mice}
+    for mouse in mice.values():
+        mouse.settle()
+        mouse.grip_picture()
+    for step in range(-WARM_UP, steps):
+        if step == 0:
+            one_s = sum(turned.frames_ms[-1] for turned in turns.values()) / 1e3
+            steps = affordable(steps, one_s)
+        elif step >= steps:
+            break
+        for way, mouse in mice.items():
+            turns[way].frames_ms.append(mouse.turn(TURN_PX))
+            turns[way].draws_ms.append(mouse.stage.canvas.timings.total_ms)
+            if step >= 0 and (steps - 1 - step) % -(-steps // KEPT) == 0:
+                turns[way].kept.append((mouse.stage.work.view, mouse.picture()))
+    for mouse in mice.values():
+        mouse.release()
+        mouse.settle()
+    return turns
+
+
+def affordable(steps: int, one_s: float) -> int:
+    """How many of `steps` fit into `TURN_S` if one takes so many seconds; at least `LEAST` of them."""
+    return min(steps, max(LEAST, int(TURN_S / max(one_s, 1e-9))))
+
+
+def _afresh(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
+    """The picture of `view` in full, by an engine that has drawn nothing before."""
+    stage, engine = mouse.stage, mouse.engine
+    new = Engine(stage.context, engine.scene, (), engine.draws_with)
+    stage.serve(new, stage.facts)
+    stage.change(replace(view, draft="off"))
+    mouse.frame()
+    picture = mouse.picture()
+    stage.serve(engine, stage.facts)
+    new.release()
+    return picture
+
+
+def _at_rest(mouse: Mouse) -> int:
+    """Largest difference from the full picture once the hand, still holding it, has come to rest."""
+    mouse.stage.change(replace(mouse.stage.work.view, draft="on"))
+    mouse.grip_picture()
+    mouse.turn(TURN_PX)
+    if mouse.stage.canvas.pixels == 1:
+        raise AssertionError("the picture in motion was not coarse")
+    mouse.frame(seconds=2 * draft.REST_S)
+    rested, view = mouse.picture(), mouse.stage.work.view
+    mouse.release()
+    mouse.settle()
+    return int(np.abs(rested.astype(int) - _afresh(mouse, view)).max())
+
+
+def _psnr(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> float:
+    error = float(((image.astype(np.float64) - target) ** 2).mean()) / 255**2
+    return math.inf if error == 0.0 else -10.0 * math.log10(error)

@@ -1,0 +1,121 @@
+"""A hand at the whole window without a window: mouse events in, finished pixels out, a clock beside them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+
+import moderngl
+import numpy as np
+from imgui_bundle import imgui
+from numpy.typing import NDArray
+
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from viewer.app.main_view import Stage
+from viewer.files.document import Document
+from viewer.gl.screen import read_rgb
+from viewer.panel import panel
+from viewer.render.engine import Engine
+from viewer.state.view_state import ViewState
+
+SIZE = (640, 480)
+"""Of the picture; the panel stands beside it."""
+
+_STEP_S = 1.0 / 60.0
+_INSET, _FIRST, _NEXT = 12 + 10 + 7, 136.0, 97.0  # the panel's layout at 1×
+
+
+def slider_at(width: float, layer: int, strength: float) -> tuple[float, float]:
+    """Where on a window of this width, at 1×, the handle of a folded layer stands at a strength."""
+    x = width - panel.WIDTH_PX + _INSET + strength * (panel.WIDTH_PX - 2 * _INSET)
+    return x, _FIRST + _NEXT * layer
+
+
+class Mouse:
+    """Moves the mouse on a stage of its own and says how long each finished frame took.
+
+    Args:
+        ctx: the GL context that the window is drawn in
+        engine: draws the splats, with `scene` and `gdfs`
+        view: what is shown first
+        size: of the picture, pixels
+    """
+
+    def __init__(
+        self,
+        ctx: moderngl.Context,
+        engine: Engine,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf],
+        view: ViewState,
+        size: tuple[int, int] = SIZE,
+    ) -> None:
+        self.engine, self.size = engine, size
+        self.pixels = (size[0] + round(panel.WIDTH_PX), size[1])
+        self._ctx = ctx
+        self.stage = Stage(ctx, engine, Document("scene.ply", scene, tuple(gdfs)).facts(), view)
+        self._screen = ctx.simple_framebuffer(self.pixels)
+        self._io = imgui.get_io()
+        self._io.display_size = imgui.ImVec2(*self.pixels)
+        self.settle()
+
+    def __enter__(self) -> Mouse:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stage.close()
+        self._screen.release()
+
+    def frame(self, seconds: float = _STEP_S) -> float:
+        """Milliseconds from now to a frame's finished pixels.
+
+        Args:
+            seconds: that have passed on the stage's clock since the last one
+        """
+        began = time.perf_counter()
+        self.stage.wake()
+        self.stage.frame(self._screen, self.pixels, seconds, arrived=began)
+        self._ctx.finish()
+        return 1e3 * (time.perf_counter() - began)
+
+    def settle(self) -> None:
+        """Frames until nothing is left to draw at once."""
+        while self.stage.patience() == 0.0:
+            self.stage.frame(self._screen, self.pixels, _STEP_S)
+
+    def move(self, x: float, y: float) -> float:
+        """Move the mouse there, window pixels; milliseconds to finished pixels."""
+        self._io.add_mouse_pos_event(x, y)
+        return self.frame()
+
+    def press(self) -> float:
+        self._io.add_mouse_button_event(0, True)
+        return self.frame()
+
+    def release(self) -> float:
+        self._io.add_mouse_button_event(0, False)
+        return self.frame()
+
+    def grip_slider(self, layer: int = 0) -> None:
+        """Take the handle of a layer's slider where it stands."""
+        self.move(*slider_at(self.pixels[0], layer, self.stage.work.view.layers[layer].strength))
+        self.press()
+
+    def grip_picture(self) -> None:
+        """Take the picture by its middle, to turn it."""
+        self.move(self.size[0] / 2, self.size[1] / 2)
+        self.frame(seconds=1.0)  # or it would be the second half of a double click
+        self.press()
+
+    def turn(self, pixels: float) -> float:
+        """Drag the picture sideways by so many pixels; milliseconds to finished pixels."""
+        x, y = self._io.mouse_pos
+        return self.move(x + pixels, y)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The splats as they are on screen. [H,W,3] uint8"""
+        return read_rgb(self._screen, self.pixels)[:, : self.size[0]]

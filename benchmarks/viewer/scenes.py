@@ -1,0 +1,87 @@
+"""Scenes and edits for the viewer's benchmarks, made on the spot: anybody can repeat them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.demo_scenes import bear
+from progdf.field.baked import AttributeBases, BakedField
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gdf.file import Gdf, fingerprint
+from progdf.region import Region
+from viewer.camera.view_camera import bounds_of
+
+SIZES = (31_000, 125_000)
+"""Gaussians of the bears that are drawn where no scenes are given."""
+
+COPIES = 4
+"""How many times the largest scene is laid over itself for one that is larger still."""
+
+RANKS = 3
+_SHIFT, _JITTER = 0.003, 0.002  # of the scene's radius
+
+
+def scenes_of(paths: Sequence[Path] = ()) -> list[Gaussians]:
+    """The scenes of these .ply files, else bears, the smallest first.
+
+    Raises:
+        ProgdfError: a file is missing or broken.
+    """
+    scenes = [load_scene(path) for path in paths] or [bear(size).gaussians for size in SIZES]
+    return sorted(scenes, key=len)
+
+
+def copies(scene: Gaussians, times: int = COPIES) -> Gaussians:
+    """The scene laid over itself, every copy's centres off by a normal 0.2 % of the radius: as dense as a
+    scene that was trained with `times` as many Gaussians."""
+    rng = torch.Generator().manual_seed(0)
+    repeated: dict[str, Any] = {name: torch.cat([getattr(scene, name)] * times) for name in ATTRIBUTES}
+    many = replace(scene, **repeated)
+    off = torch.randn(many.means.shape, generator=rng)
+    off[: len(scene)] = 0.0
+    return replace(many, means=many.means + _JITTER * bounds_of(scene).radius * off)
+
+
+def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
+    """A made-up edit of the `members` Gaussians nearest to the scene's centre, as large as a trained one:
+    beside the full offset three int8 bases.
+
+    Args:
+        members: how many; all of a scene that has fewer
+        moves: whether it moves and turns them too; else it only recolours them
+    """
+    rng = torch.Generator().manual_seed(0)
+    region = _nearest(scene, members)
+    far = _SHIFT * bounds_of(scene).radius
+    spread = {"means": far, "log_scales": 0.01, "quats": 0.01, "sh0": 0.5} if moves else {"sh0": 0.5}
+    nodes = torch.linspace(0, 1, 9)
+    bumps = [torch.sin(math.pi * (k + 1) * nodes) for k in range(RANKS)]
+    coefficients = torch.stack([nodes, *bumps], dim=1)
+    coefficients[-1] = torch.tensor([1.0] + [0.0] * RANKS)
+    attributes = {}
+    for name, size in spread.items():
+        width = 4 if name == "quats" else 3
+        attributes[name] = AttributeBases(
+            full=size * torch.randn(len(region), width, generator=rng),
+            rest=torch.randint(-127, 128, (RANKS, len(region), width), generator=rng, dtype=torch.int8),
+            step=torch.full((RANKS, width), 2e-3 * size),
+            coefficients=coefficients.clone(),
+        )
+    score = torch.zeros(len(scene)).index_fill(0, region, 1.0)
+    field = BakedField("separable", nodes, attributes, 14)
+    return Gdf("edit", Region("edit", region, score), field, fingerprint(scene))
+
+
+def _nearest(scene: Gaussians, count: int) -> Tensor:
+    centre = torch.tensor(bounds_of(scene).centre)
+    distances = (scene.means - centre).norm(dim=1).nan_to_num(nan=math.inf)
+    chosen: Tensor = distances.argsort(stable=True)[:count].sort().values
+    return chosen

@@ -1,0 +1,238 @@
+"""`python -m benchmarks viewer`: milliseconds from a slider's event to finished pixels, and where they go.
+
+A hand drags the slider of a whole window (panel and picture) drawn without a screen; the ways of drawing take
+turns at every step, in one process. The scenes are bears, so that anybody can repeat it, or --scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import moderngl
+import numpy as np
+
+from benchmarks.table import Table
+from progdf.gaussians import Gaussians
+from progdf.rasterize import render
+from viewer.camera.view_camera import first_camera, to_camera
+from viewer.render.engine import Engine, FrameTimings
+from viewer.render.headless import headless_context
+from viewer.render.threads import one_thread
+from viewer.state.view_state import LayerState, ViewState
+
+from .mouse import SIZE, Mouse, slider_at
+from .scenes import edit_for, scenes_of
+
+WARM_UP, STEPS = 2, 24
+PARTS = ("compose_ms", "upload_ms", "sort_ms", "draw_ms")
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to bring a slider's change to the screen; what is to be compared gets a row here.
+
+    Args:
+        title: in the table
+        draw: of `engine.DRAWS`
+        whole: draw the whole picture at every step, though only a part of it has changed
+        edit_pass: of `engine.EDIT_PASSES`: what works out the attributes
+    """
+
+    title: str
+    draw: str
+    whole: bool = False
+    edit_pass: str = "cpu"
+
+
+WAYS = {
+    "gl": Way("OpenGL", "gl"),
+    "gl, gpu": Way("OpenGL, the GPU's edit pass", "gl", edit_pass="gpu"),
+    "cpu": Way("CPU", "cpu"),
+    "cpu, whole": Way("CPU, whole picture", "cpu", whole=True),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """An edit of a scene.
+
+    Args:
+        members: Gaussians that it changes
+        moves: whether it moves them too, so that they have to be sorted anew
+    """
+
+    members: int
+    moves: bool
+
+    @property
+    def title(self) -> str:
+        return "colour and place" if self.moves else "colour"
+
+
+CASES = (Case(3_000, False), Case(3_000, True), Case(30_000, True), Case(125_000, True))
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one way took, an entry per step of the slider, and how far its picture is from the CPU engine's.
+
+    Args:
+        count: Gaussians in the scene
+        way: a key of `WAYS`
+        events_ms: from the mouse's event to finished pixels
+        parts: what of that the engine took
+        psnr_db: against `progdf.render`, the worst of three strengths
+        apart: largest difference of a picture that was drawn step by step from the same drawn afresh
+        edit_error: largest difference of an attribute from `progdf.compose` (see `Engine.edit_error`)
+    """
+
+    case: Case
+    count: int
+    way: str
+    events_ms: tuple[float, ...]
+    parts: tuple[FrameTimings, ...]
+    psnr_db: float
+    apart: float
+    edit_error: float
+
+    @property
+    def rest_ms(self) -> float:
+        """Panel, events and the way to the screen: what the engine did not take; the median."""
+        pairs = zip(self.events_ms, self.parts, strict=True)
+        return float(np.median([event - part.total_ms for event, part in pairs]))
+
+
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """Measure, for the README and for `python -m benchmarks`.
+
+    Args:
+        scenes: .ply files that take the place of the bears
+
+    Raises:
+        ProgdfError: there is no OpenGL here to draw a window with, or a file is broken.
+    """
+    opened = scenes_of(scenes)
+    ctx = headless_context()
+    try:
+        results: list[Result] = []
+        for case in CASES:
+            results += rows(ctx, _fitting(opened, case.members), case)
+        return [table(results, str(ctx.info["GL_RENDERER"]))]
+    finally:
+        ctx.release()
+
+
+@one_thread()
+def rows(
+    ctx: moderngl.Context,
+    scene: Gaussians,
+    case: Case,
+    steps: int = STEPS,
+    size: tuple[int, int] = SIZE,
+) -> list[Result]:
+    """One edit, by every way, a step each in turns."""
+    gdf = edit_for(scene, case.members, case.moves)
+    case = replace(case, members=len(gdf.region))
+    layers = (LayerState(0, "edit", 0.05),)
+    view = ViewState(first_camera(scene), layers, draft="off")
+    events: dict[str, list[float]] = {way: [] for way in WAYS}
+    parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
+    with ExitStack() as held:
+        mice: dict[str, Mouse] = {}
+        for name, way in WAYS.items():
+            engine = Engine(ctx, scene, [gdf], way.draw, way.edit_pass)
+            held.callback(engine.release)
+            mice[name] = held.enter_context(Mouse(ctx, engine, scene, [gdf], view, size))
+            mice[name].grip_slider()
+        for step in range(1, WARM_UP + steps + 1):
+            place = slider_at(mice["cpu"].pixels[0], 0, 0.05 + 0.9 * step / (WARM_UP + steps))
+            for name, mouse in mice.items():
+                if WAYS[name].whole:
+                    mouse.engine.forget()
+                events[name].append(mouse.move(*place))
+                parts[name].append(mouse.stage.canvas.timings)
+        return [
+            Result(
+                case,
+                len(scene),
+                name,
+                tuple(events[name][WARM_UP:]),
+                tuple(parts[name][WARM_UP:]),
+                _psnr(mouse.engine, view, size),
+                _apart(mouse, size),
+                mouse.engine.edit_error(),
+            )
+            for name, mouse in mice.items()
+        ]
+
+
+def table(results: Sequence[Result], renderer: str) -> Table:
+    """The measurements, named after what OpenGL was drawn by."""
+    return Table(
+        "viewer",
+        "Slider event to finished pixels, 640×480, ms",
+        (
+            "Gaussians",
+            "members",
+            "edit of",
+            "drawn by",
+            "compose",
+            "upload",
+            "sort",
+            "draw",
+            "panel, screen",
+            "redrawn",
+            "in all p50 / p95",
+            "PSNR to the CPU engine, dB",
+            "attributes off by",
+        ),
+        tuple(_cells(result) for result in results),
+        f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
+        "waited for, the parts are medians. The CPU rasteriser sorts as it draws and draws where the slider "
+        "touches the picture. Largest difference between a picture drawn step by step and the same drawn "
+        f"afresh: {max(result.apart for result in results):g}.",
+    )
+
+
+def _cells(result: Result) -> tuple[str, ...]:
+    middle, late = np.percentile(result.events_ms, (50, 95))
+    return (
+        f"{result.count:,}".replace(",", " "),
+        f"{result.case.members:,}".replace(",", " "),
+        result.case.title,
+        WAYS[result.way].title,
+        *(f"{np.median([getattr(part, name) for part in result.parts]):.1f}" for name in PARTS),
+        f"{result.rest_ms:.1f}",
+        f"{100 * np.median([part.share for part in result.parts]):.0f} %",
+        f"**{middle:.1f}** / {late:.1f}",
+        "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
+        f"{result.edit_error:.0e}" if result.edit_error else "0",
+    )
+
+
+def _fitting(scenes: Sequence[Gaussians], members: int) -> Gaussians:
+    """The smallest scene with so many Gaussians, or nearly; else the largest."""
+    return next((scene for scene in scenes if len(scene) >= 0.9 * members), scenes[-1])
+
+
+def _apart(mouse: Mouse, size: tuple[int, int]) -> float:
+    """How far the picture is from the same one drawn afresh."""
+    view = mouse.stage.work.view
+    stepped = mouse.engine.image(view, size)
+    mouse.engine.forget()
+    return float(np.abs(stepped - mouse.engine.image(view, size)).max())
+
+
+def _psnr(engine: Engine, view: ViewState, size: tuple[int, int]) -> float:
+    worst = math.inf
+    for strength in (0.0, 0.5, 1.0):
+        slid = replace(view, layers=(LayerState(0, "edit", strength),))
+        image = engine.image(slid, size)
+        target = render(engine.gaussians(slid), to_camera(slid.camera, *size)).numpy()
+        error = float(((image.astype(np.float64) - target) ** 2).mean())
+        worst = min(worst, math.inf if error == 0.0 else -10.0 * math.log10(error))
+    return worst

@@ -1,0 +1,44 @@
+"""`progdf check SCENE`: what the file holds, what had to be repaired, what is odd about the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from progdf.formats.scene_file import load_scene_with_report
+from progdf.io.cameras import load_cameras
+from progdf.scene.stats import survey
+from progdf.scene.up_axis import UpChoice, find_up
+from progdf.terminal import say
+
+from .options import parsed
+
+
+@dataclass(frozen=True)
+class Options:
+    """Report what a scene's file holds and what had to be repaired to load it. Nothing is written.
+
+    Args:
+        scene: a .ply, .spz, .splat, .ksplat or .sog
+        cameras: its cameras, which tell the up axis
+        up: the axis that is up
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    cameras: Path | None = None
+    up: UpChoice = "auto"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
+    options = parsed(Options, argv, "progdf check")
+    scene, report = load_scene_with_report(options.scene)
+    cameras = [] if options.cameras is None else load_cameras(options.cameras)
+    up = find_up(scene, cameras, options.up)
+    for line in report.lines() + survey(scene, up).lines():
+        say(line)
+    return 0

@@ -1,0 +1,186 @@
+"""`progdf info FILE`: what a scene, an edit or a camera file holds, told by its content."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import tyro
+
+from progdf.errors import ProgdfError
+from progdf.formats.load_report import counted, file_size, grouped
+from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
+from progdf.gdf.file import open_gdf
+from progdf.gdf.header import GdfHead
+from progdf.io import session as session_file
+from progdf.io.atomic import check_regular, open_failure
+from progdf.io.cameras import load_cameras
+from progdf.io.json_values import decode_json, typed
+from progdf.scene.stats import survey
+from progdf.terminal import say
+
+from .options import parsed
+
+TIMELINE_MARK = "progdf_timeline"
+"""The first key of every timeline file of the window, by which its kind is told."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Tell what a scene, a .gdf edit, a session or a camera file holds, an edit with its error report.
+
+    Args:
+        file: the file; its content decides what it is, not its name
+    """
+
+    file: Annotated[Path, tyro.conf.Positional]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
+    path = parsed(Options, argv, "progdf info").file
+    for line in _DESCRIBE[kind_of(path)](path):
+        say(line)
+    return 0
+
+
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """ "scene", "gdf", "session", "timeline" or "cameras", by content, else by name.
+
+    Raises:
+        ProgdfError: it cannot be read, or is nothing we know.
+    """
+    path = scene_file(path)
+    check_regular(path)
+    try:
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError as error:
+        raise open_failure(path, error) from None
+    if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
+        return "gdf"
+    if scene_format(path) is not None:
+        return "scene"
+    if start.lstrip()[:1] == b"{" and f'"{session_file.MARK}"'.encode() in start:
+        return "session"
+    if start.lstrip()[:1] == b"{" and f'"{TIMELINE_MARK}"'.encode() in start:
+        return "timeline"
+    if start.lstrip()[:1] in (b"{", b"["):
+        return "cameras"
+    if path.suffix.lower() == ".gdf":
+        return "gdf"  # its reader knows best what is wrong
+    raise ProgdfError(f"{path} is nothing progdf knows; give a scene, a .gdf edit or a camera file")
+
+
+def _scene_lines(path: Path) -> Iterator[str]:
+    scene, report = load_scene_with_report(path)
+    yield from report.lines()
+    yield from survey(scene).lines()
+
+
+def _edit_lines(path: Path) -> Iterator[str]:
+    gdf = open_gdf(path)
+    members, count = gdf.members or 0, gdf.scene.count
+    yield f"{path.name}: the edit '{gdf.name}', {file_size(gdf.size)}"
+    if gdf.instruction:
+        yield f"asked for: {gdf.instruction}"
+    yield f"scene: {counted(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
+    yield f"region: {gdf.region}, {counted(members)} ({members / max(1, count):.1%})"
+    yield f"field: {gdf.field.kind}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf)}"
+    if gdf.field.recorded:
+        yield f"recorded: {len(gdf.field.recorded)} snapshots"
+    for head, content in (("option", gdf.options), ("report", gdf.report)):
+        given = {name: value for name, value in content.items() if head == "report" or value is not None}
+        for name, value in _flat(given):
+            yield f"{head}: {name} {value}"
+
+
+def _session_lines(path: Path) -> Iterator[str]:
+    session = session_file.read_session(path)
+    yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
+    for what, ref in (("scene", session.scene), *(("edit", edit) for edit in session.edits)):
+        file = ref.path(path.resolve().parent)
+        known = os.path.isfile(file) and session_file.sha256(file) == ref.sha256.lower()
+        state = "as it was saved" if known else "changed since" if os.path.isfile(file) else "missing"
+        yield f"{what}: {ref.file} ({state})"
+    layers = session.view.get("layers", [])
+    for layer in layers if isinstance(layers, list) else ():
+        if isinstance(layer, dict):
+            hidden = "" if layer.get("enabled", True) else ", hidden"
+            yield f"layer: {_shown(layer.get('name'))} at {_shown(layer.get('strength', 0.0))}{hidden}"
+    yield f"snapshots: {len(session.snapshots)}"
+
+
+def _timeline_lines(path: Path) -> Iterator[str]:
+    try:
+        keys = [key.frame for key in typed(decode_json(path.read_bytes()), _Timeline).keys]
+    except ValueError:
+        raise ProgdfError(f"{path} is a damaged timeline; save it anew with Ctrl+K in the window") from None
+    yield f"{path.name}: a timeline of the window, {counted(len(keys), 'key')}"
+    yield f"keys at frames: {_shown(keys)}"
+
+
+class _Key(msgspec.Struct):
+    frame: int
+
+
+class _Timeline(msgspec.Struct):
+    keys: list[_Key] = []
+
+
+def _form(gdf: GdfHead) -> str:
+    """What a field is made of."""
+    # the first is the offset at strength 1 as it was recorded, see `AttributeBases.full`
+    bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
+    network = gdf.field.network
+    if network is None:
+        return f"{gdf.nodes} nodes; bases: {bases or 'none, nothing moves'}"
+    error = ", ".join(f"{name} {value:.4g}" for name, value in network.bake_error.items())
+    return (
+        f"{grouped(gdf.parameters)} numbers in {network.shape.layers} layers of "
+        f"{network.shape.width}; baked at {gdf.nodes} nodes with bases: {bases}; baking costs: {error}"
+    )
+
+
+def _camera_lines(path: Path) -> Iterator[str]:
+    cameras = load_cameras(path)
+    yield f"{path.name}: {counted(len(cameras), 'camera')}"
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""
+    yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
+
+
+_DESCRIBE = {
+    "scene": _scene_lines,
+    "gdf": _edit_lines,
+    "session": _session_lines,
+    "timeline": _timeline_lines,
+    "cameras": _camera_lines,
+}
+
+
+def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """("field.psnr_worst", "46.9") … of a nested JSON table; long lists are counted, not shown."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{name}.")
+        elif isinstance(value, list) and len(value) > 8:
+            yield f"{above}{name}", f"{grouped(len(value))} values"
+        else:
+            yield f"{above}{name}", _shown(value)
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "not measured"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join(_shown(entry) for entry in value) or "none"
+    return " ".join(str(value).split())

@@ -1,0 +1,197 @@
+"""`progdf rebind EDIT.gdf --from A --to B -o C.gdf`: an edit carried over to the same scene in another file.
+
+Other formats change the numbers and the order of the Gaussians. Each Gaussian of B gets the offsets of the
+one of A that it is: the nearest, by place, then colour and size, one to one where that is possible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from progdf.errors import ProgdfError
+from progdf.field.baked import AttributeBases, BakedField
+from progdf.formats.scene_file import load_scene, scene_name, turned_about_x
+from progdf.gaussians import BASE_CHANNELS, Gaussians
+from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
+from progdf.region import Region
+from progdf.sh import sh0_to_rgb
+from progdf.terminal import say
+
+from .options import parsed
+
+_CANDIDATES = 8
+_LEAST_MATCHED = 0.9
+"""Share of B's Gaussians that must be found in A: fewer, and it is another scene."""
+
+_COLOR = 0.1
+"""How far a color (0..1) may be off: five times what the coarsest format changes."""
+
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Carry an edit over to the same scene in another file or format.
+
+    Args:
+        edit: the .gdf file
+        source: the scene that it was made for
+        target: the same scene in another file
+        out: the .gdf file to write
+    """
+
+    edit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
+    source: Annotated[Path, tyro.conf.arg(name="from", metavar="SCENE")]
+    target: Annotated[Path, tyro.conf.arg(name="to", metavar="SCENE")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.gdf")]
+
+
+@dataclass(frozen=True)
+class Match:
+    """Which Gaussian of A each one of B is.
+
+    Args:
+        rows: row of A for each row of B. [N] int64
+        matched: share of B's rows that are where and as A's are, 0..1
+        once: share of B's rows whose row of A no other has
+        median, p95: distance between the two, in the median size of a Gaussian of A
+    """
+
+    rows: Rows
+    matched: float
+    once: float
+    median: float
+    p95: float
+
+
+def main(argv: Sequence[str]) -> int:
+    """Write the edit for the other file. Raises ProgdfError where the two scenes are not the same."""
+    options = parsed(Options, argv, "progdf rebind")
+    if options.out.suffix.lower() != ".gdf":
+        raise ProgdfError(f"{options.out} is not a .gdf file; give the edit a name that ends in .gdf")
+    a, b = load_scene(options.source), load_scene(options.target)
+    gdf = load_gdf(options.edit, a, scene_name(options.source))
+    match = match_scenes(a, b)
+    say(
+        f"matched: {match.matched:.1%} of {scene_name(options.target)}, {match.once:.1%} one to one; "
+        f"distance {match.median:.3g} (95 %: {match.p95:.3g}) of the median Gaussian's size"
+    )
+    if match.matched < _LEAST_MATCHED:
+        turned = match_scenes(a, turned_about_x(b)).matched >= _LEAST_MATCHED
+        why = "is that scene after half a turn about x" if turned else "is another scene"
+        raise ProgdfError(
+            f"{options.target} {why}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
+            f"{_LEAST_MATCHED:.0%} are needed; give the same scene"
+        )
+    found = rebound(gdf, a, b, match)
+    save_gdf(options.out, found)
+    say(f"wrote {options.out}: {len(found.region)} members, {len(gdf.region)} in the original")
+    return 0
+
+
+def match_scenes(a: Gaussians, b: Gaussians) -> Match:
+    """The Gaussian of A that each one of B is; both hold at least one."""
+    k = min(_CANDIDATES, len(a))
+    distances, candidates = cKDTree(a.means.numpy()).query(b.means.numpy(), k=k, workers=-1)
+    distances, candidates = distances.reshape(len(b), k), candidates.reshape(len(b), k)
+    sizes = a.scales.amax(dim=1).numpy()
+    typical = max(float(np.median(sizes)), 1e-12)
+    color = np.abs(_colors(a)[candidates] - _colors(b)[:, None]).max(axis=2)
+    log_scales = [s.log_scales.clamp(-10.0, 10.0).numpy() for s in (a, b)]
+    shape = np.abs(log_scales[0][candidates] - log_scales[1][:, None]).mean(axis=2)
+    opacity = np.abs(a.opacities.numpy()[candidates] - b.opacities.numpy()[:, None])
+    costs = (distances / typical) ** 2 + (color / _COLOR) ** 2 + shape**2 + (opacity / _COLOR) ** 2
+    chosen = _one_to_one(candidates, costs, len(a))
+    rows = np.take_along_axis(candidates, chosen[:, None], 1)[:, 0]
+    apart = np.take_along_axis(distances, chosen[:, None], 1)[:, 0]
+    near = apart <= np.maximum(sizes[rows], typical)
+    alike = np.take_along_axis(color, chosen[:, None], 1)[:, 0] <= _COLOR
+    taken = np.bincount(rows, minlength=len(a))
+    return Match(
+        rows=rows,
+        matched=float((near & alike).mean()),
+        once=float((taken[rows] == 1).mean()),
+        median=float(np.median(apart)) / typical,
+        p95=float(np.quantile(apart, 0.95)) / typical,
+    )
+
+
+def rebound(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
+    """The edit of A's members on the Gaussians of B that they are; a network is kept as it was baked."""
+    members = gdf.region.members.numpy()
+    if not len(members):
+        raise ProgdfError(f"{gdf.name} has no members; train it again")
+    place = np.searchsorted(members, match.rows).clip(max=len(members) - 1)
+    mine = np.flatnonzero(members[place] == match.rows)
+    if not len(mine):
+        raise ProgdfError(f"no member of {gdf.name} is in the other scene; give the same scene")
+    rows, source = torch.from_numpy(mine), torch.from_numpy(place[mine])
+    of_a = torch.from_numpy(match.rows)
+    # q and −q are one rotation, but not with the same offset
+    flipped = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
+    attributes = {}
+    for name, bases in gdf.field.attributes.items():
+        full, rest, step = bases.full[source], bases.rest[:, source], bases.step
+        if name == "quats":
+            full = torch.where(flipped[:, None], -full, full)
+            rest = torch.where(flipped[None, :, None], -rest, rest)
+        elif name == "shN":
+            full, rest, step = (_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, rest, step))
+        if full.shape[1]:
+            attributes[name] = AttributeBases(full, rest, step, bases.coefficients)
+    field = BakedField(
+        kind="separable" if gdf.field.origin is not None else gdf.field.kind,
+        nodes=gdf.field.nodes,
+        attributes=attributes,
+        channels=BASE_CHANNELS + (3 * b.shN.shape[1] if "shN" in attributes else 0),
+        recorded=gdf.field.recorded,
+    )
+    told = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
+    return replace(
+        gdf,
+        region=Region(gdf.region.name, rows, gdf.region.score[of_a]),
+        field=field,
+        scene=fingerprint(b),
+        report={**gdf.report, "rebound": told},
+    )
+
+
+def _one_to_one(candidates: Rows, costs: NDArray[np.float64], count: int) -> Rows:
+    """Which candidate each row of B takes: the cheapest that no other has more cheaply; where none is left,
+    the cheapest. [N,k] -> [N]"""
+    chosen = np.full(len(candidates), -1)
+    free = np.ones(count, bool)
+    left = np.arange(len(candidates))
+    for _ in range(candidates.shape[1]):
+        open_costs = np.where(free[candidates[left]], costs[left], np.inf)
+        best = open_costs.argmin(axis=1)
+        cost = open_costs[np.arange(len(left)), best]
+        wanted = candidates[left, best]
+        order = np.lexsort((cost, wanted))
+        order = order[np.isfinite(cost[order])]
+        winners = order[np.unique(wanted[order], return_index=True)[1]]
+        chosen[left[winners]] = best[winners]
+        free[wanted[winners]] = False
+        left = np.delete(left, winners)
+    chosen[left] = costs[left].argmin(axis=1)
+    return chosen
+
+
+def _colors(scene: Gaussians) -> NDArray[np.float32]:
+    """Colors of band 0 as far as every format keeps them, 0..1. [N,3]"""
+    rgb: NDArray[np.float32] = sh0_to_rgb(scene.sh0).clamp(0.0, 1.0).numpy()
+    return rgb
+
+
+def _bands(tensor: torch.Tensor, width: int) -> torch.Tensor:
+    """Offsets of higher SH bands, cut or filled up with 0 to the other scene's. [...,c] -> [...,width]"""
+    return torch.nn.functional.pad(tensor[..., :width], (0, max(0, width - tensor.shape[-1])))

@@ -1,0 +1,1 @@
+"""Color edits as pure functions."""

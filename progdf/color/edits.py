@@ -1,0 +1,179 @@
+"""Colour edits as pure functions of colours and strength, the same for pixels and for Gaussians.
+
+Every function takes sRGB as it is stored (0..1, not linear) in any shape [...,3], returns the same shape,
+gives the input back bit for bit where the strength is 0, and moves continuously with it. Hue, chroma and
+lightness are those of `progdf.color.oklab`; what lies between the original and the finished edit is said in
+`progdf.color.path`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+
+from .oklab import fit_gamut, hue_of, oklab_to_srgb, srgb_to_oklab
+from .path import STRAIGHT, ColorPath, Strength, bend_of, between
+
+_LEAST_CHROMA = 0.015  # of a target that has a hue
+_LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
+
+
+def parse_color(text: str) -> Tensor:
+    """The colour of `#rrggbb` or `#rgb`, the `#` optional, as sRGB. [3] float32; else a ProgdfError."""
+    digits = text.strip().removeprefix("#")
+    if len(digits) == 3:
+        digits = "".join(2 * digit for digit in digits)
+    if len(digits) != 6 or any(digit not in "0123456789abcdefABCDEF" for digit in digits):
+        raise ProgdfError(f"'{text}' is not a colour; write it as #rrggbb, for example #d4af37")
+    return torch.tensor([int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)])
+
+
+def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The weighted mean colour, averaged in OKLab. [...,3], [...] or None -> [3]
+
+    Take it once over the whole region (all views, all members) and pass it to every `recolor` of that region:
+    the edit is then the same function of colour in each view.
+    """
+    lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
+    w = torch.ones_like(lab[:, 0]) if weights is None else weights.reshape(-1).to(lab.dtype)
+    total = w.sum()
+    mean = (lab * w[:, None]).sum(0) / total if float(total) > 0 else lab.new_tensor([0.5, 0.0, 0.0])
+    return oklab_to_srgb(mean).clamp(0, 1)
+
+
+def recolor(
+    rgb: Tensor,
+    target: Tensor,
+    strength: Strength = 1.0,
+    reference: Tensor | None = None,
+    path: ColorPath = "bowed",
+) -> Tensor:
+    """Give a thing another colour and keep its shading: `recolored`, and `between` on the way there.
+
+    Args:
+        rgb: sRGB colours, 0..1; what lies outside (SH colours may) fades with the strength. [...,3]
+        target: the colour that `reference` has at strength 1, sRGB 0..1. [3]
+        strength: 0..1
+        reference: the region's own colour, `typical_color` of `rgb` by default. [3]
+        path: see `bend_of`
+    """
+    own = _like(typical_color(rgb) if reference is None else reference, rgb)
+    return between(rgb, recolored(rgb, target, own), strength, bend_of(own, _like(target, rgb), path))
+
+
+def recolored(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
+    """The finished `recolor`. [...,3] -> [...,3] 0..1
+
+    Lightness is scaled so that `reference` becomes `target`; chroma follows the lightness; the hue is the
+    target's, or stays where the target is too grey to have one. A dark source is lifted.
+    """
+    lab, (new_l, new_a, new_b) = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_like(target, rgb))
+    new_c = torch.hypot(new_a, new_b)
+    ref_l = srgb_to_oklab(_like(reference, rgb))[0]
+    lightness = _relight(lab[..., 0], ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))
+    # chroma in proportion to lightness is the same surface in less light; towards white the gamut narrows it
+    chroma = new_c * (lightness / new_l.clamp_min(0.02)).clamp(0, 1)
+    hue = torch.atan2(new_b, new_a) if new_c >= _LEAST_CHROMA else hue_of(lab)
+    return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
+
+
+def tint(
+    rgb: Tensor,
+    target: Tensor,
+    strength: Strength = 1.0,
+    reference: Tensor | None = None,
+    path: ColorPath = "bowed",
+    share: float = 0.7,
+) -> Tensor:
+    """Wash with a colour: lightness stays, hue and chroma go `share` of the way to the target's. [...,3]
+
+    See `recolor` for the arguments; here `reference` decides nothing but the bend.
+    """
+    own = _like(typical_color(rgb) if reference is None else reference, rgb)
+    return between(rgb, tinted(rgb, target, share), strength, bend_of(own, _like(target, rgb), path))
+
+
+def tinted(rgb: Tensor, target: Tensor, share: float) -> Tensor:
+    """The finished `tint`. [...,3] -> [...,3] 0..1"""
+    lab, goal = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_like(target, rgb))
+    lightness = lab[..., :1]
+    fade = torch.minimum(
+        lightness / goal[0].clamp_min(0.02), (1 - lightness) / (1 - goal[0]).clamp_min(0.02)
+    ).clamp(0, 1)
+    return fit_gamut(torch.cat([lightness, torch.lerp(lab[..., 1:], goal[1:] * fade, share)], dim=-1))
+
+
+def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
+    """Take light away: 2^(−stops·strength) of the light is left, hue and contrast stay. [...,3] -> [...,3]"""
+    inside = rgb.clamp(0, 1)
+    s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
+    # OKLab is homogeneous of degree 1/3 in linear light
+    edited = oklab_to_srgb(srgb_to_oklab(inside) * torch.exp2(-stops / 3 * s)[..., None]).clamp(0, 1)
+    return torch.where((s == 0)[..., None], rgb, edited + (1 - s)[..., None] * (rgb - inside))
+
+
+def night(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
+    """Moonlight: `darken`, with colours fading to a cool blue as they do in scarce light. [...,3]"""
+    blue = tinted(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75)
+    return darken(between(rgb, blue, strength, STRAIGHT), strength, stops)
+
+
+def stripe_pattern(
+    points: Tensor,
+    axis: Tensor,
+    period: float,
+    phase: float = 0.0,
+    width: float = 0.5,
+    softness: float = 0.08,
+) -> Tensor:
+    """How much each 3D point lies in a stripe; a function of place, so every view sees the same stripes.
+
+    Args:
+        points: world positions. [...,3]
+        axis: direction across the stripes, any length but 0. [3]
+        period: distance from stripe to stripe, world units, > 0
+        phase: shift in periods
+        width: share of the period that is stripe, 0..1
+        softness: width of the edge in periods
+
+    Returns:
+        0 (between) to 1 (in a stripe). [...]
+    """
+    along = points @ (axis / axis.norm()).to(points) / period + phase
+    return stripe_profile(along, width, softness)
+
+
+def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) -> Tensor:
+    """Stripes along any coordinate counted in periods, centred on whole numbers. [...] -> [...] in 0..1"""
+    distance = (turns - turns.round()).abs()
+    edge = ((0.5 * width - distance) / max(softness, 1e-6) + 0.5).clamp(0, 1)
+    return edge * edge * (3 - 2 * edge)
+
+
+def stripes(
+    rgb: Tensor,
+    pattern: Tensor,
+    target: Tensor,
+    strength: Strength = 1.0,
+    reference: Tensor | None = None,
+    path: ColorPath = "bowed",
+) -> Tensor:
+    """`recolor` where `pattern` ([...], 0..1) is 1, nothing where it is 0. [...,3] -> [...,3]"""
+    return recolor(rgb, target, torch.as_tensor(strength).to(pattern) * pattern, reference, path)
+
+
+def _like(color: Tensor, rgb: Tensor) -> Tensor:
+    return color.to(rgb).clamp(0, 1)
+
+
+def _relight(lightness: Tensor, reference: Tensor, goal: Tensor) -> Tensor:
+    """Scale lightness so that `reference` becomes `goal`; brightening bends towards white, never clips."""
+    gain = goal / reference
+    below = (goal + (lightness - reference) * gain.clamp_max(_LARGEST_GAIN)).clamp_min(0)
+    slope = gain.clamp(1.0, _LARGEST_GAIN) * (1 - reference) / (1 - goal)
+    x = ((lightness - reference) / (1 - reference)).clamp(0, 1)
+    # a hyperbola that leaves (reference, goal) with the gain as slope and ends at (1, 1)
+    above = goal + (1 - goal) * slope * x / (1 + (slope - 1) * x)
+    return torch.where((lightness > reference) & (gain > 1), above, below).clamp(0, 1)

@@ -1,0 +1,1 @@
+"""How do layers of edits add up?"""

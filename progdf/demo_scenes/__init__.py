@@ -1,0 +1,23 @@
+"""Scenes the product makes itself, with exact labels and edits whose true course is known."""
+
+from __future__ import annotations
+
+from .assemble import DemoScene
+from .bear import SMALLEST, bear
+from .edits import AnalyticEdit, bear_edits, darkened, grown, recolored, striped, swung
+from .room import SMALLEST_ROOM, room
+
+__all__ = [
+    "SMALLEST",
+    "SMALLEST_ROOM",
+    "AnalyticEdit",
+    "DemoScene",
+    "bear",
+    "bear_edits",
+    "darkened",
+    "grown",
+    "recolored",
+    "room",
+    "striped",
+    "swung",
+]

@@ -1,0 +1,51 @@
+"""The demo's bear: seated on a stone plinth in the grass, as Gaussians with exact labels."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.errors import ProgdfError
+
+from .assemble import DemoScene, assemble
+from .bear_paint import paint
+from .bear_parts import LABELS, bear_parts
+
+SMALLEST = 400
+"""Fewer Gaussians than this are no bear."""
+
+_SKY = (0.749, 0.847, 0.945)
+
+
+def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
+    """A teddy bear of exactly `size` Gaussians; the same seed gives the same bear, bit for bit.
+
+    Raises:
+        ProgdfError: fewer than `SMALLEST` Gaussians.
+    """
+    if size < SMALLEST:
+        raise ProgdfError(f"{size} Gaussians are too few for a bear; at least {SMALLEST} would be right")
+    gaussians, labels = assemble(bear_parts(), LABELS, paint, size, seed)
+    return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), _SKY)
+
+
+def _rig(count: int = 32, width: int = 512, height: int = 512) -> tuple[Camera, ...]:
+    """Cameras around the bear, the first in front, 4 to 42 degrees above the horizon."""
+    centre = torch.tensor([0.0, 0.78, 0.12])
+    K = intrinsics(math.radians(40), width, height)
+    cameras = []
+    for i in range(count):
+        azimuth = 2 * math.pi * i / count
+        elevation = math.radians(4 + 38 * ((0.22 + i * 0.618034) % 1.0))
+        direction = torch.tensor(
+            [
+                math.sin(azimuth) * math.cos(elevation),
+                math.sin(elevation),
+                math.cos(azimuth) * math.cos(elevation),
+            ]
+        )
+        viewmat = look_at(centre + 4.6 * direction, centre, torch.tensor([0.0, 1.0, 0.0]))
+        cameras.append(Camera(viewmat, K, width, height, name=f"bear_{i:03d}"))
+    return tuple(cameras)

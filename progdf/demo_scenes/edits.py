@@ -1,0 +1,171 @@
+"""Edits whose true course is known: what every Gaussian is at every strength, with nothing to optimise.
+
+A field fitted to one of these can be compared with the truth itself instead of with a recording of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from progdf.color import edits as colour
+from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.sh import rgb_to_sh0, sh0_to_rgb
+
+from .assemble import DemoScene
+
+Change = Callable[[Gaussians, float], Gaussians]
+"""The members before the edit and a strength in (0, 1] -> the members at that strength."""
+
+
+@dataclass(frozen=True)
+class AnalyticEdit:
+    """An edit given by a formula.
+
+    Args:
+        name: what it does
+        change: the formula
+    """
+
+    name: str
+    change: Change
+
+    def apply(self, scene: Gaussians, members: Tensor, strength: float) -> Gaussians:
+        """The scene with `members` ([M] int64) edited to `strength` (0..1); other rows keep their bytes.
+
+        Strength 0 gives the scene bit for bit.
+
+        Raises:
+            ProgdfError: the strength is not within 0..1.
+        """
+        if not 0 <= strength <= 1:
+            raise ProgdfError(f"the strength is {strength:g}; 0 to 1 would be right")
+        if strength == 0:
+            return scene
+        edited = self.change(scene[members], strength)
+        return replace(
+            scene,
+            **{
+                name: getattr(scene, name).index_copy(0, members, getattr(edited, name))
+                for name in ATTRIBUTES
+            },
+        )
+
+
+def recolored(target: Tensor) -> AnalyticEdit:
+    """`colour.recolor` of every Gaussian, seen from the members' own colour; `target` [3] sRGB."""
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        rgb = sh0_to_rgb(part.sh0)
+        return _with_color(part, colour.recolor(rgb, target, strength, _own_color(part)), strength)
+
+    return AnalyticEdit("recolor", change)
+
+
+def striped(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
+    """Stripes across `axis` [3], `period` world units apart, in the colour `target` [3] sRGB."""
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        rgb = sh0_to_rgb(part.sh0)
+        pattern = colour.stripe_pattern(part.means, axis, period)
+        edited = colour.stripes(rgb, pattern, target, strength, _own_color(part))
+        return _with_color(part, edited, strength * pattern[:, None, None])
+
+    return AnalyticEdit("stripes", change)
+
+
+def darkened(stops: float = 3.0) -> AnalyticEdit:
+    """Night falls: `colour.night`, view-dependent light fading with the rest."""
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        dark = colour.night(sh0_to_rgb(part.sh0), strength, stops)
+        # sRGB values fall about as the light to the power 1/2.2
+        return replace(part, sh0=rgb_to_sh0(dark), shN=part.shN * 2 ** (-stops * strength / 2.2))
+
+    return AnalyticEdit("night", change)
+
+
+def grown(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
+    """Scale about the nearest of `pivots` [P,3]: centres move straight, log-scales by log of the size.
+
+    Args:
+        factor: size at strength 1
+        pivots: points that stay where they are, but for the shift. [P,3]
+        shift: what all is moved by besides, world units; None: nothing. [3]
+    """
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        size = 1 + strength * (factor - 1)
+        centre = _nearest(part.means, pivots)
+        means = centre + size * (part.means - centre)
+        if shift is not None:
+            means = means + strength * shift.to(means)
+        return replace(part, means=means, log_scales=part.log_scales + math.log(size))
+
+    return AnalyticEdit("grow", change)
+
+
+def swung(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
+    """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centres run on circles."""
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        half = math.radians(degrees * strength) / 2
+        vector = math.sin(half) * axis.to(part.means) / axis.norm()
+        scalar = math.cos(half)
+        arm = part.means - _nearest(part.means, pivots)
+        twice = 2 * torch.linalg.cross(vector.expand_as(arm), arm)
+        moved = part.means + scalar * twice + torch.linalg.cross(vector.expand_as(arm), twice)
+        w, xyz = part.quats[:, :1], part.quats[:, 1:]
+        turned_w = scalar * w - (xyz @ vector)[:, None]
+        turned_xyz = scalar * xyz + w * vector + torch.linalg.cross(vector.expand_as(xyz), xyz)
+        return replace(part, means=moved, quats=torch.cat([turned_w, turned_xyz], dim=1))
+
+    return AnalyticEdit("swing", change)
+
+
+def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
+    """One edit of each kind for `bear()`, with its members: name -> (edit, members)."""
+    ears = scene.members("ears")
+    roots = _ear_roots(scene.gaussians.means[ears])
+    return {
+        "gold": (
+            recolored(colour.parse_color("#d89a12")),
+            scene.members("body", "head", "ears", "arms", "legs"),
+        ),
+        "blue scarf": (recolored(colour.parse_color("#2356c7")), scene.members("scarf")),
+        "stripes": (striped(colour.parse_color("#2b62c9"), scene.up, 0.20), scene.members("body", "arms")),
+        "big ears": (grown(1.7, roots), ears),
+        "tilted ears": (swung(35.0, torch.tensor([1.0, 0.0, 0.0]), roots), ears),
+        "night": (darkened(), torch.arange(len(scene.gaussians))),
+    }
+
+
+def _ear_roots(means: Tensor) -> Tensor:
+    """Where the ears meet the head: below and inside of each one's middle. [M,3] -> [2,3]"""
+    roots = []
+    for side in (1.0, -1.0):
+        ear = means[means[:, 0] * side > 0]
+        roots.append(ear.mean(0) - torch.tensor([0.09 * side, 0.11, 0.0]))
+    return torch.stack(roots)
+
+
+def _own_color(part: Gaussians) -> Tensor:
+    """The typical colour, each Gaussian counted as much as it can cover. [3]"""
+    _, middle, long = part.scales.sort(dim=1).values.unbind(1)
+    return colour.typical_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
+
+
+def _nearest(means: Tensor, pivots: Tensor) -> Tensor:
+    return pivots.to(means)[torch.cdist(means, pivots.to(means)).argmin(dim=1)]
+
+
+def _with_color(part: Gaussians, rgb: Tensor, share: float | Tensor) -> Gaussians:
+    """Set the colour, and let view-dependent light take its hue: the sheen of gold is golden."""
+    hue = rgb.clamp_min(0) / rgb.clamp_min(0).mean(dim=1, keepdim=True).clamp_min(1e-3)
+    sheen = part.shN.mean(dim=2, keepdim=True) * (0.35 + 0.65 * hue)[:, None, :]
+    return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (sheen - part.shN))

@@ -1,0 +1,137 @@
+"""Light baked into colours: a warm lamp with soft shadows, sky, ground, darkening where parts touch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .surface import Part
+
+_SH_C1 = math.sqrt(3 / (4 * math.pi))
+
+
+@dataclass(frozen=True)
+class Daylight:
+    """How much light there is.
+
+    Args:
+        sun: [N,3] points -> [N], the share of the key light that comes in, 0..1; None is all of it
+        fill: strength of the light from all around
+    """
+
+    sun: Callable[[Tensor], Tensor] | None = None
+    fill: float = 1.0
+
+
+OUTDOORS = Daylight()
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A light from infinitely far: direction towards it (unit, [3]) and linear rgb ([3])."""
+
+    direction: Tensor
+    color: Tensor
+
+
+def _lamp(direction: tuple[float, float, float], color: tuple[float, float, float]) -> Lamp:
+    towards = torch.tensor(direction)
+    return Lamp(towards / towards.norm(), torch.tensor(color))
+
+
+KEY = _lamp((-0.62, 0.80, 0.62), (2.35, 2.05, 1.62))
+RIM = _lamp((0.70, 0.35, -0.75), (0.42, 0.50, 0.66))
+SKY = torch.tensor([0.60, 0.72, 0.95])
+GROUND = torch.tensor([0.20, 0.24, 0.12])
+
+
+def irradiance(
+    points: Tensor, normals: Tensor, parts: Sequence[Part], own: Part, daylight: Daylight = OUTDOORS
+) -> Tensor:
+    """Linear light that falls on each point of the part `own`. [N,3], [N,3] -> [N,3]"""
+    others = [part for part in parts if part is not own]
+    open_sky = torch.ones(len(points))
+    lit = torch.ones(len(points)) if daylight.sun is None else daylight.sun(points)
+    for part in others:
+        local = part.to_local(points)
+        open_sky = open_sky * (1 - _occlusion(points, normals, local, part))
+        if part.casts_shadow:
+            lit = lit * _unshadowed(local, part)
+    facing = _wrapped(normals @ KEY.direction, 0.18)
+    up = 0.5 + 0.5 * normals[:, 1:2]
+    ambient = daylight.fill * (SKY * up + GROUND * (1 - up))
+    return (
+        KEY.color * (facing * lit * (0.4 + 0.6 * open_sky))[:, None]
+        + RIM.color * _wrapped(normals @ RIM.direction, 0.3)[:, None] * open_sky[:, None]
+        + ambient * open_sky[:, None]
+    )
+
+
+def develop(linear: Tensor) -> Tensor:
+    """Linear light as sRGB with a soft shoulder: highlights bend towards white. [...,3] -> [...,3] in 0..1"""
+    bent = 1 - torch.exp(-linear.clamp_min(0))
+    return torch.where(
+        bent <= 0.0031308, bent * 12.92, 1.055 * bent.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    )
+
+
+def linear_from_srgb(rgb: Tensor) -> Tensor:
+    """sRGB 0..1 as linear light. [...,3] -> [...,3]"""
+    return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def sheen(normals: Tensor, velvet: float, gloss: float, color: Tensor) -> tuple[Tensor, Tensor]:
+    """View-dependent light that one SH band can hold.
+
+    With d the direction from the eye: velvet adds velvet·(1 + n·d), brighter where the surface turns away, as
+    short hair does; gloss adds −gloss·(r·d), brighter where the eye meets the key light's mirror direction r.
+
+    Args:
+        normals: unit. [N,3]
+        velvet, gloss: how much, in sRGB units
+        color: colour of both. [N,3]
+
+    Returns:
+        what to add to the colour [N,3], and the coefficients of band 1 [N,3,3].
+    """
+    mirror = 2 * (normals @ KEY.direction)[:, None] * normals - KEY.direction
+    slope = velvet * normals - gloss * mirror
+    band = torch.stack([-slope[:, 1], slope[:, 2], -slope[:, 0]], dim=1) / _SH_C1
+    return velvet * color, band[:, :, None] * color[:, None, :]
+
+
+def _wrapped(cosine: Tensor, softness: float) -> Tensor:
+    return ((cosine + softness) / (1 + softness)).clamp_min(0)
+
+
+def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Tensor:
+    """Share of the sky that a part hides, as a sphere of its size at its distance would. [N] in 0..1"""
+    away = part.shape.nearest(local) @ part.matrix.T + part.centre - points
+    gap = away.norm(dim=1)
+    size = float(torch.linalg.svdvals(part.matrix)[1]) * part.shape.girth
+    towards = torch.where(gap[:, None] > 1e-3, away / gap[:, None].clamp_min(1e-3), normals)
+    outside = part.shape.level(local) > 1
+    cosine = torch.where(outside, (normals * towards).sum(1), torch.ones_like(gap))
+    near = size / (size + 2.0 * torch.where(outside, gap, torch.zeros_like(gap)))
+    hidden: Tensor = 0.9 * (0.25 + 0.75 * cosine).clamp(0, 1) * near * near
+    return hidden
+
+
+def _unshadowed(local: Tensor, part: Part) -> Tensor:
+    """How much of the key light passes a part: the ray's closest approach to it, blurred. [N] in 0..1"""
+    towards: Tensor = torch.linalg.inv(part.matrix) @ KEY.direction
+    reach = float(towards.norm())
+    towards = towards / reach
+    ahead = -(local @ towards)
+    closest = (local + ahead[:, None] * towards).norm(dim=1)
+    world_ahead = ahead.clamp_min(0) / reach
+    blur = 0.06 + 0.16 * world_ahead
+    share = ((closest - 1 + blur) / (2 * blur)).clamp(0, 1)
+    passed = share * share * (3 - 2 * share)
+    begins = (world_ahead / 0.03).clamp(0, 1)
+    left: Tensor = 1 - (1 - passed) * begins
+    return left

@@ -1,0 +1,88 @@
+"""Another slider over the same edit: what was shown at one strength is shown at another, that is all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from .baked import BakedField
+
+_NEAR = 1 / 80
+"""A knot so close to a node is not worth a row of coefficients."""
+
+
+@dataclass(frozen=True)
+class Dial:
+    """Where on a new slider lies what the old one showed, linear between knots.
+
+    Args:
+        old, new: strengths of the knots, ascending from 0 to 1. [K] float64
+
+    Raises:
+        ValueError: the knots do not ascend from 0 to 1, or are not as many.
+    """
+
+    old: Tensor
+    new: Tensor
+
+    def __post_init__(self) -> None:
+        if self.old.shape != self.new.shape:
+            raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
+        for knots in (self.old, self.new):
+            if float(knots[0]) != 0.0 or float(knots[-1]) != 1.0 or bool((knots.diff() <= 0).any()):
+                raise ValueError("the knots of a dial must ascend from 0 to 1")
+
+    def __call__(self, s: Tensor) -> Tensor:
+        """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
+        return interpolated(s.double(), self.old, self.new)
+
+    def at(self, s: float) -> float:
+        """The same of one strength."""
+        return float(self(torch.tensor([s], dtype=torch.float64)))
+
+
+def same() -> Dial:
+    """The dial that changes nothing."""
+    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    return Dial(ends, ends)
+
+
+def interpolated(x: Tensor, nodes: Tensor, values: Tensor) -> Tensor:
+    """Piecewise linear through (nodes, values). [n], [k], [k] -> [n]"""
+    right = torch.searchsorted(nodes, x).clamp(1, len(nodes) - 1)
+    share = (x - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
+    return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
+
+
+def dialled(field: BakedField, dial: Dial) -> BakedField:
+    """The field under another dial: its nodes move, and where the dial bends far from any, it gets one more.
+
+    No base is touched: the bytes per member are the same, and so are both ends, bit for bit.
+
+    Args:
+        field: no network, whose slider is learned
+        dial: from the field's strengths to the wanted ones
+
+    Raises:
+        ValueError: the field is a network's.
+    """
+    if field.origin is not None:
+        raise ValueError("a network's slider is its own; only separable and keyframe fields take another")
+    nodes = field.nodes.double()
+    far = (dial.old[:, None] - nodes).abs().amin(dim=1) > _NEAR
+    asked = torch.cat([nodes, dial.old[far]]).sort().values
+    moved = dial(asked).float()
+    kept = torch.ones(len(asked), dtype=torch.bool)
+    kept[1:] = moved.diff() > 0  # single precision may close a gap
+    kept[:-1] &= moved[:-1] < 1.0
+    kept[-1] = True
+    attributes = {
+        name: replace(
+            bases, coefficients=torch.stack([field.coefficients(name, float(s)) for s in asked[kept]])
+        )
+        for name, bases in field.attributes.items()
+    }
+    ticks = dial(torch.tensor(field.recorded, dtype=torch.float64)).tolist()
+    return replace(field, nodes=moved[kept], attributes=attributes, recorded=tuple(ticks))

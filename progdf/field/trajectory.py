@@ -1,0 +1,180 @@
+"""The recorded trajectory of an edit: how every member moved, and at which slider value it was where.
+
+Training leaves it in the run folder as trajectory.safetensors. `progdf fit` makes new fields of it, and the
+viewer shows it beside the field that was made of it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import open_failure, written_whole
+from progdf.io.json_values import decode_json, typed
+from progdf.io.tensors import read_tensors, write_tensors
+
+from .baked import BakedField
+from .keyframes import fit_lossless
+
+FILE_NAME = "trajectory.safetensors"
+"""Its name in a run folder, beside the .gdf."""
+
+_FORMAT = "progdf-trajectory-1"
+_NEEDED_FORMS = (
+    ("s", torch.float32, 1),
+    ("offsets", torch.float16, 3),
+    ("end", torch.float32, 2),
+    ("steps", torch.int64, 1),
+    ("stage_ends", torch.int64, 1),
+    ("strengths", torch.float64, 1),
+)
+_NEEDED = {name for name, _, _ in _NEEDED_FORMS}
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """S recordings of the members' offsets along the slider.
+
+    Args:
+        s: slider value of each recording, ascending, first 0, last 1. [S] float32
+        offsets: raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
+        end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
+        steps: optimiser steps done at each recording. [S] int64
+        stage_ends: recording at which each stage ends, ascending, the last S − 1
+        strengths: what the editor was asked for, of each stage; `s[stage_ends]` is where that is
+    """
+
+    s: Tensor
+    offsets: Tensor
+    end: Tensor
+    steps: Tensor
+    stage_ends: tuple[int, ...]
+    strengths: tuple[float, ...]
+
+    def __len__(self) -> int:
+        return int(self.s.shape[0])
+
+    @property
+    def asked(self) -> tuple[tuple[float, float], ...]:
+        """Slider value of each stage's end, and the strength that the editor was asked for there."""
+        return tuple((float(self.s[e]), s) for e, s in zip(self.stage_ends, self.strengths, strict=True))
+
+    def at(self, s: float) -> Tensor:
+        """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
+        right = int(torch.searchsorted(self.s, torch.tensor(s, dtype=self.s.dtype), right=True))
+        right = min(max(right, 1), len(self) - 1)
+        low, high = float(self.s[right - 1]), float(self.s[right])
+        share = min(max((s - low) / (high - low), 0.0), 1.0)
+        return torch.lerp(self.node(right - 1), self.node(right), share)
+
+    def node(self, index: int) -> Tensor:
+        """Offsets of one recording. [M,C] float32"""
+        return self.end if index == len(self) - 1 else self.offsets[index].float()
+
+
+def save_trajectory(
+    path: Path, trajectory: Trajectory, extra: Mapping[str, Tensor], about: Mapping[str, Any]
+) -> None:
+    """Write a trajectory with what a refit needs.
+
+    Args:
+        path: trajectory.safetensors
+        trajectory: what to save
+        extra: further tensors by name (members, score, cameras)
+        about: JSON values (scene, options, …)
+    """
+    tensors = {
+        "s": trajectory.s,
+        "offsets": trajectory.offsets,
+        "end": trajectory.end,
+        "steps": trajectory.steps,
+        "stage_ends": torch.tensor(trajectory.stage_ends),
+        "strengths": torch.tensor(trajectory.strengths, dtype=torch.float64),
+        **extra,
+    }
+    header = {"format": _FORMAT, "about": json.dumps(dict(about))}
+    with written_whole(path) as beside:
+        write_tensors(beside, tensors, header, checksum=True)
+
+
+def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_trajectory` wrote: trajectory, extra tensors, about.
+
+    Raises:
+        ProgdfError: the file is absent, damaged or something else.
+    """
+    tensors, about = _read(path)
+    for name, dtype, sides in _NEEDED_FORMS:
+        found = tensors[name]
+        if found.dtype != dtype or found.ndim != sides:
+            raise _damaged(path, f"{name} is {list(found.shape)} {found.dtype}")
+    trajectory = Trajectory(
+        tensors.pop("s"),
+        tensors.pop("offsets"),
+        tensors.pop("end"),
+        tensors.pop("steps"),
+        tuple(tensors.pop("stage_ends").tolist()),
+        tuple(tensors.pop("strengths").tolist()),
+    )
+    _check(path, trajectory)
+    return trajectory, tensors, about
+
+
+def peek_trajectory(path: Path) -> tuple[Tensor, Tensor]:
+    """Slider values [S] and members [M] of a file, without its recordings: enough to tell whose they are.
+
+    Raises:
+        ProgdfError: see `load_trajectory`.
+    """
+    tensors, _ = _read(path, ("s", "members"))
+    return tensors["s"], tensors["members"]
+
+
+def recorded_field(trajectory: Trajectory) -> BakedField:
+    """The recording as a field: `Trajectory.at` bit for bit at the recordings, straight between them."""
+    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    return fit_lossless(trajectory.s, offsets)
+
+
+def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors, all of them where none are named, and what the file tells about itself."""
+    try:
+        tensors, header = read_tensors(path, names)
+        if header.get("format") != _FORMAT:
+            raise ProgdfError(f"{path} is no recorded trajectory; give a run folder of progdf train")
+        if not names and (missing := _NEEDED - set(tensors)):
+            raise _damaged(path, f"it has no {min(missing)}")
+        return tensors, typed(decode_json(header["about"]), dict[str, Any])
+    except OSError as error:
+        raise open_failure(path, error) from error
+    except ProgdfError:
+        raise
+    except (KeyError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _check(path: Path, found: Trajectory) -> None:
+    s, shape = found.s, found.offsets.shape
+    fits = s.ndim == 1 and len(s) >= 2 and len(shape) == 3 and len(s) == shape[0]
+    if not fits or found.end.shape != shape[1:]:
+        raise _damaged(path, "its tensors do not fit each other")
+    if float(s[0]) != 0.0 or float(s[-1]) != 1.0 or not bool((s.diff() > 0).all()):
+        raise _damaged(path, "its slider values do not ascend from 0 to 1")
+    ends = found.stage_ends
+    ascend = all(before < after for before, after in pairwise((0, *ends)))
+    if not ends or len(ends) != len(found.strengths) or not ascend or ends[-1] != len(s) - 1:
+        raise _damaged(path, "its stages do not fit its recordings")
+    if len(found.steps) != len(s) or not bool(found.offsets.isfinite().all() & found.end.isfinite().all()):
+        raise _damaged(path, "it has numbers that are not finite, or not one step a recording")
+
+
+def _damaged(path: Path, reason: object) -> ProgdfError:
+    return ProgdfError(f"{path} is damaged ({reason}); train again")

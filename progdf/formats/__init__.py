@@ -1,0 +1,1 @@
+"""Scenes in every format that people have."""

@@ -1,0 +1,182 @@
+""".ksplat (the format of GaussianSplats3D) → Gaussians.
+
+A header of 4096 bytes, one of 1024 for each section, then the sections: buckets' centres and rows. Level 0
+keeps float32; levels 1 and 2 keep positions as shares of their bucket, and half floats, SH of level 2 as
+bytes. Colours and opacities are bytes; SH stands band by band, channel-major within a band.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.io.atomic import open_failure
+from progdf.sh import C0
+
+_HEADER, _SECTION = 4096, 1024
+_SH_REST = (0, 9, 24, 45)
+_SH_TYPES = ("<f4", "<f2", "u1")
+_LEAST_SCALE = 2e-9
+"""In place of a scale of 0, whose logarithm is not finite; see `repair.FLAT_LOG_SCALE`."""
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Section:
+    """A section's header, and where its parts begin in the file."""
+
+    rows: int
+    bucket_size: int
+    full_buckets: int
+    degree: int
+    block: float
+    quantum: int
+    sizes_at: int
+    partial_buckets: int
+    centers_at: int
+    buckets: int
+    bucket_bytes: int
+    rows_at: int
+
+
+def is_ksplat(start: bytes) -> bool:
+    """Whether a file may begin like this: version 0.1 and later."""
+    return len(start) >= 2 and start[0] == 0 and start[1] >= 1
+
+
+def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
+    """The scene as it stands in the file, and its compression level 0..2.
+
+    Raises:
+        ProgdfError: it is no .ksplat, or cut short or damaged.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise open_failure(path, error) from None
+    if len(content) < _HEADER or not is_ksplat(content):
+        raise ProgdfError(f"{path} is not a .ksplat scene; export it again")
+    level = _number(content, 20, "<u2")
+    sections = _number(content, 4, "<u4")
+    if level > 2 or _HEADER + sections * _SECTION > len(content):
+        raise _damaged(path)
+    low, high = (float(np.frombuffer(content, "<f4", 1, at)[0]) for at in (36, 40))
+    sh_range = (low or -1.5, high or 1.5)
+    at, parts = _HEADER + sections * _SECTION, []
+    for k in range(sections):
+        head = _HEADER + k * _SECTION
+        if not _number(content, head, "<u4") and not _number(content, head + 4, "<u4"):
+            continue
+        section, row, at = _section(path, content, head, level, at)
+        parts.append(_rows(path, content, section, row, level, sh_range))
+    count = sum(len(part["means"]) for part in parts)
+    if not count or count != _number(content, 16, "<u4"):
+        raise _damaged(path)
+    most = max(part["shN"].shape[1] for part in parts)
+    for part in parts:
+        part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    tensors: dict[str, Any] = {
+        name: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for name, v in whole.items()
+    }
+    return Gaussians(**tensors), level
+
+
+def _section(
+    path: str | os.PathLike[str], content: bytes, head: int, level: int, at: int
+) -> tuple[_Section, np.dtype[np.void], int]:
+    """A section's header, the layout of its rows, and where the next section begins."""
+    degree = _number(content, head + 40, "<u2")
+    if degree > 3:
+        raise _damaged(path)
+    small = [("xyz", "<u2", 3), ("scale", "<f2", 3), ("quat", "<f2", 4), ("rgba", "u1", 4)]
+    large = [("xyz", "<f4", 3), ("scale", "<f4", 3), ("quat", "<f4", 4), ("rgba", "u1", 4)]
+    row = np.dtype([*(small if level else large), ("sh", _SH_TYPES[level], _SH_REST[degree])])
+    partial, buckets = _number(content, head + 36, "<u4"), _number(content, head + 12, "<u4")
+    bucket_bytes = _number(content, head + 20, "<u2")
+    rows_at = at + 4 * partial + bucket_bytes * buckets
+    end = rows_at + row.itemsize * _number(content, head + 4, "<u4")
+    rows = _number(content, head, "<u4")
+    if end > len(content) or rows > _number(content, head + 4, "<u4"):
+        raise _damaged(path)
+    section = _Section(
+        rows=rows,
+        bucket_size=_number(content, head + 8, "<u4"),
+        full_buckets=_number(content, head + 32, "<u4"),
+        degree=degree,
+        block=float(np.frombuffer(content, "<f4", 1, head + 16)[0]),
+        quantum=_number(content, head + 24, "<u4") or 32767,
+        sizes_at=at,
+        partial_buckets=partial,
+        centers_at=at + 4 * partial,
+        buckets=buckets,
+        bucket_bytes=bucket_bytes,
+        rows_at=rows_at,
+    )
+    return section, row, end
+
+
+def _rows(
+    path: str | os.PathLike[str],
+    content: bytes,
+    section: _Section,
+    row: np.dtype[np.void],
+    level: int,
+    sh_range: tuple[float, float],
+) -> dict[str, Floats]:
+    rows = np.frombuffer(content, row, section.rows, section.rows_at)
+    means: Floats = rows["xyz"].astype(np.float32)
+    if level:
+        inside = (means - section.quantum) * (section.block / 2 / section.quantum)
+        means = np.asarray(inside + _centers(path, content, section), np.float32)
+    scales = rows["scale"].astype(np.float32)
+    share = rows["rgba"].astype(np.float32) / 255
+    sh = rows["sh"].astype(np.float32).reshape(section.rows, -1)
+    if level == 2:
+        sh = np.asarray(sh_range[0] + sh / 255 * (sh_range[1] - sh_range[0]), np.float32)
+    bands = [sh[:, 3 * (l * l - 1) : 3 * ((l + 1) ** 2 - 1)] for l in range(1, section.degree + 1)]
+    higher = [band.reshape(section.rows, 3, -1).transpose(0, 2, 1) for band in bands]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logits = np.log(share[:, 3]) - np.log1p(-share[:, 3])
+        log_scales = np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales))
+    return {
+        "means": means,
+        "quats": rows["quat"].astype(np.float32),
+        "log_scales": log_scales,
+        "logit_opacities": logits,
+        "sh0": (share[:, :3] - 0.5) / np.float32(C0),
+        "shN": np.concatenate([np.zeros((section.rows, 0, 3), np.float32), *higher], axis=1),
+    }
+
+
+def _centers(path: str | os.PathLike[str], content: bytes, section: _Section) -> Floats:
+    """The centre of each row's bucket: full buckets first, then those whose sizes stand in the file. [N,3]"""
+    sizes = np.frombuffer(content, "<u4", section.partial_buckets, section.sizes_at).astype(np.int64)
+    full = section.full_buckets * section.bucket_size
+    ends = np.concatenate([[full], full + np.cumsum(sizes)])
+    index = np.arange(section.rows)
+    later = section.full_buckets + np.searchsorted(ends[1:], index, side="right")
+    bucket = np.where(index < full, index // max(section.bucket_size, 1), later)
+    if section.bucket_bytes < 12 or (section.rows and int(bucket.max()) >= section.buckets):
+        raise _damaged(path)
+    kind = np.dtype({"names": ["xyz"], "formats": [("<f4", 3)], "itemsize": section.bucket_bytes})
+    centers = np.frombuffer(content, kind, section.buckets, section.centers_at)["xyz"]
+    found: Floats = centers[bucket]
+    return found
+
+
+def _number(content: bytes, at: int, kind: str) -> int:
+    return int(np.frombuffer(content, kind, 1, at)[0])
+
+
+def _damaged(path: str | os.PathLike[str]) -> ProgdfError:
+    return ProgdfError(f"{path} is a .ksplat that is cut short or damaged; copy or export it again")

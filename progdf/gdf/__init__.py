@@ -1,0 +1,1 @@
+"""The .gdf file: one edit, bound to its scene."""

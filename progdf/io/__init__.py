@@ -1,0 +1,1 @@
+"""How is it read and written, whole or not at all?"""

@@ -1,0 +1,196 @@
+"""The session file: which scene and edits were open, and the state of the window, as JSON one can read.
+
+    {
+      "progdf_session": 1,
+      "scene": {"file": "robot.ply", "sha256": "…"},
+      "edits": [{"file": "shirt/shirt.gdf", "sha256": "…"}],
+      "view": {…},
+      "snapshots": […]
+    }
+
+Paths are relative to the session's folder (absolute where they share no folder with it, as on another
+Windows drive), hashes are of whole files. What `view` and `snapshots` hold is the viewer's. Nothing in the
+file is ever executed; a file that changed since, a newer version and an unknown key are refused in one line.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import msgspec
+
+from progdf.errors import ProgdfError
+
+from .atomic import check_regular, open_failure, written_whole
+from .json_values import decode_json, typed
+
+VERSION = 1
+MARK = "progdf_session"
+"""The first key of every session file, by which its kind is told."""
+SUFFIX = ".session.json"
+_LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a few megabytes
+
+
+class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file that a session needs.
+
+    Args:
+        file: as written, with forward slashes; relative to the session's folder
+        sha256: of the file's bytes, lower-case hexadecimal
+    """
+
+    file: str
+    sha256: str
+
+    def __post_init__(self) -> None:
+        if not self.file or "\0" in self.file:
+            raise ValueError("the name of a file is none")
+
+    def path(self, folder: Path) -> Path:
+        """Where it is, for a session in `folder`."""
+        return Path(os.path.normpath(folder / self.file))
+
+
+@dataclass(frozen=True)
+class SessionFile:
+    """What a session file holds, its state as plain JSON values.
+
+    Args:
+        scene: the .ply
+        edits: the .gdf files, in the order in which layers count them
+        view: the state on screen
+        snapshots: states that were kept
+    """
+
+    scene: FileRef
+    edits: tuple[FileRef, ...] = ()
+    view: Mapping[str, Any] = field(default_factory=dict)
+    snapshots: Sequence[Mapping[str, Any]] = ()
+
+
+class _Table(msgspec.Struct, forbid_unknown_fields=True):
+    """The file without its version."""
+
+    scene: FileRef
+    edits: list[FileRef] = []
+    view: dict[str, Any] = {}
+    snapshots: list[dict[str, Any]] = []
+
+
+def reference(path: Path, folder: Path) -> FileRef:
+    """A file as a session in `folder` names it.
+
+    Raises:
+        ProgdfError: it cannot be read.
+    """
+    whole = path.resolve()
+    try:
+        name = os.path.relpath(whole, folder.resolve())
+    except ValueError:  # another drive
+        name = str(whole)
+    return FileRef(str(PurePosixPath(Path(name))), sha256(whole))
+
+
+def write_session(path: Path, session: SessionFile) -> None:
+    """Write it whole or not at all.
+
+    Raises:
+        ProgdfError: the folder does not exist.
+    """
+    table = {
+        MARK: VERSION,
+        "scene": msgspec.structs.asdict(session.scene),
+        "edits": [msgspec.structs.asdict(edit) for edit in session.edits],
+        "view": session.view,
+        "snapshots": list(session.snapshots),
+    }
+    text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False)
+    # short lists of numbers on one line; a text holds no line break of its own, so none is hit
+    text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    with written_whole(path) as beside:
+        beside.write_text(text + "\n", encoding="utf-8")
+
+
+def read_session(path: str | os.PathLike[str]) -> SessionFile:
+    """Read it; the files it names are not touched, see `verified`.
+
+    Raises:
+        ProgdfError: it cannot be read, is no session, of a newer version, or holds what no session holds.
+    """
+    name = Path(path).name
+    check_regular(path)
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(_LARGEST + 1)
+    except OSError as error:
+        raise open_failure(path, error) from None
+    if len(content) > _LARGEST:
+        raise ProgdfError(
+            f"{name} has more than {_LARGEST >> 20} MB, too much for a session; give one saved with Ctrl+S"
+        )
+    try:
+        table = decode_json(content)
+    except ValueError as error:
+        raise ProgdfError(f"{name} is not valid JSON ({error}); save the session anew") from None
+    if not isinstance(table, dict) or MARK not in table:
+        raise ProgdfError(f"{name} is no session; give a file that progdf view saved with Ctrl+S")
+    version = table.pop(MARK)
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise ProgdfError(f"{name} is a damaged session: its version is {version!r}; save it anew")
+    if version > VERSION:
+        raise ProgdfError(
+            f"{name} is a session of version {version}; this progdf reads up to {VERSION}, update it"
+        )
+    try:
+        found = typed(table, _Table)
+    except ValueError as error:
+        raise ProgdfError(f"{name} is a damaged session ({error}); save it anew or update progdf") from None
+    return SessionFile(found.scene, tuple(found.edits), found.view, tuple(found.snapshots))
+
+
+def verified(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
+    """The scene and the edits of the session at `path`, each found and with the content it had then.
+
+    Raises:
+        ProgdfError: one is missing or has changed.
+    """
+    found = []
+    for ref in (session.scene, *session.edits):
+        file = ref.path(path.resolve().parent)
+        if not os.path.isfile(file):  # pathlib's raises where a name is too long
+            raise ProgdfError(f"{path.name} needs {file}, which is not there; put it back or save anew")
+        if sha256(file) != ref.sha256.lower():
+            raise ProgdfError(
+                f"{path.name} was saved with another {file.name} than {file} holds now; "
+                "put that file back or save a new session"
+            )
+        found.append(file)
+    return found[0], tuple(found[1:])
+
+
+def sha256(path: Path) -> str:
+    """Of the file's bytes; read once as long as the file does not change.
+
+    Raises:
+        ProgdfError: it cannot be read.
+    """
+    check_regular(path)
+    try:
+        state = path.stat()
+        return _sha256(str(path), state.st_size, state.st_mtime_ns, state.st_ino)
+    except OSError as error:
+        raise open_failure(path, error) from None
+
+
+@lru_cache(maxsize=256)
+def _sha256(path: str, *_: int) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

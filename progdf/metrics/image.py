@@ -1,0 +1,92 @@
+"""Errors between images: PSNR and SSIM; see also `progdf.metrics.lpips` and `progdf.metrics.slider`."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+WINDOW, SIGMA = 11, 1.5
+"""SSIM's Gaussian window in pixels (Wang et al. 2004)."""
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio for images of range 0..1, dB; infinite where nothing differs.
+
+    Args:
+        image, target: the same shape. [H,W,3] or [...]
+        mask: what counts, bool or weights 0..1; broadcast over the colours. [H,W]
+
+    Raises:
+        ValueError: shapes differ, or the mask counts nothing.
+    """
+    _check_pair(image, target)
+    squares = (image.detach().double() - target.detach().double()).square()
+    if mask is None:
+        error = float(squares.mean()) if squares.numel() else 0.0
+    else:
+        weights = _mask(mask, image)
+        error = float((squares.mean(dim=-1) * weights).sum() / weights.sum())
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Structural similarity (Wang et al. 2004): Gaussian window 11 px, σ 1.5, range 1, per colour;
+    differentiable.
+
+    Args:
+        image, target: range 0..1. [H,W,C]
+        mask: pixels over which the map is averaged, bool or weights; None is all whose window lies in the
+            image, or, in images smaller than the window, all. [H,W]
+
+    Returns:
+        Mean similarity, at most 1. []
+
+    Raises:
+        ValueError: shapes differ, or the mask counts nothing.
+    """
+    _check_pair(image, target)
+    x, y = (v.movedim(-1, 0)[:, None] for v in (image, target))
+    # beyond the border the window is cut off and its weights scaled back to a sum of 1
+    share = _blurred(torch.ones_like(x[:1]))
+    mean_x, mean_y = _blurred(x) / share, _blurred(y) / share
+    var_x = (_blurred(x * x) / share - mean_x * mean_x).clamp(min=0)
+    var_y = (_blurred(y * y) / share - mean_y * mean_y).clamp(min=0)
+    covariance = _blurred(x * y) / share - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    similarity = similarity / ((mean_x * mean_x + mean_y * mean_y + c1) * (var_x + var_y + c2))
+    per_pixel = similarity[:, 0].mean(dim=0)
+    if mask is not None:
+        weights = _mask(mask, image).to(per_pixel.dtype)
+        return (per_pixel * weights).sum() / weights.sum()
+    edge = WINDOW // 2
+    if min(per_pixel.shape) >= WINDOW:
+        per_pixel = per_pixel[edge:-edge, edge:-edge]
+    return per_pixel.mean()
+
+
+def _blurred(planes: Tensor) -> Tensor:
+    """Weighted sums over the window, zero beyond the border. [C,1,H,W]"""
+    offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
+    kernel = torch.exp(-offsets.square() / (2 * SIGMA**2))
+    kernel = kernel / kernel.sum()
+    edge = WINDOW // 2
+    across = conv2d(planes, kernel[None, None, None], padding=(0, edge))
+    return conv2d(across, kernel[None, None, :, None], padding=(edge, 0))
+
+
+def _check_pair(image: Tensor, target: Tensor) -> None:
+    if image.shape != target.shape:
+        raise ValueError(f"the images have shapes {list(image.shape)} and {list(target.shape)}")
+
+
+def _mask(mask: Tensor, image: Tensor) -> Tensor:
+    if mask.shape != image.shape[:-1]:
+        raise ValueError(f"mask has shape {list(mask.shape)}, expected {list(image.shape[:-1])}")
+    weights = mask.double()
+    if not float(weights.sum()) > 0:
+        raise ValueError("the mask counts no pixel")
+    return weights

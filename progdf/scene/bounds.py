@@ -1,0 +1,148 @@
+"""How a scene lies in space: where its bulk and its front are, whether it can be seen from outside."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from progdf.camera import NEAR
+from progdf.gaussians import Gaussians
+
+_SAMPLE = 100_000
+"""Rows that are looked at; a scene with more is sampled evenly."""
+
+
+_LONG_TAIL = 5.0
+_CEILING_COVER = 0.8
+_LEAST_CELLS = 16
+_ENOUGH = 64
+"""Fewer Gaussians tell nothing about the shape of a scene."""
+
+_SOLID, _CORE = 0.1, 2.5
+"""Haze is less opaque; background lies farther, in median distances from the middle."""
+
+
+def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
+    """Centre [3] and radius (> 0) of the bulk of a scene, world units.
+
+    The median of the means, and the distance within which 97 % of them lie: far strays do not count. A scene
+    of one or a few Gaussians is as large as these are: twice the median of their longest axes at least.
+    """
+    scene = _sample(scene)
+    means = scene.means
+    centre = means.median(dim=0).values
+    distances = (means - centre).norm(dim=1)
+    nearest = max(round(0.97 * len(means)), 1)
+    size = 2 * float(scene.log_scales.amax(dim=1).median().exp())
+    return centre, max(float(distances.kthvalue(nearest).values), size, 1e-6)
+
+
+def near_plane(radius: float) -> float:
+    """Least depth at which a scene is drawn whose bulk has this radius, both in world units.
+
+    `NEAR` down to a radius of 1, as trainings draw; smaller scenes would vanish before it.
+    """
+    return NEAR * min(1.0, radius)
+
+
+def front(up: Tensor) -> Tensor:
+    """The level direction from a scene to someone who looks at its front. [3] -> [3], unit length
+
+    +z for y up, −z for y down (the side the cameras of a COLMAP scene mostly look from), −y for z up; the
+    same as azimuth 0 in the viewer.
+    """
+    largest = int(up.abs().argmax())
+    towards = torch.zeros(3)
+    towards[1 if largest == 2 else 2] = math.copysign(1.0, float(up[largest])) * (
+        -1.0 if largest == 2 else 1.0
+    )
+    level = towards - (towards @ up) * up
+    return torch.nn.functional.normalize(level, dim=0)
+
+
+def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
+    """Whether the scene is probably one to stand inside, which no ring of cameras around it can show.
+
+    Two signs: a ceiling (a slab at the top that covers most of the ground plan), or a long tail (the
+    far 3 % begin more than five times as far out as the middle, as in outdoor captures with a background).
+    """
+    sample = _sample(scene)
+    centre, radius = scene_sphere(sample)
+    typical = float((sample.means - centre).norm(dim=1).median())
+    return len(sample) >= _ENOUGH and (radius > _LONG_TAIL * typical or has_ceiling(sample, up))
+
+
+def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
+    """Whether a slab at the top covers most of the ground plan, so that all is hidden from above."""
+    sample = _sample(scene)
+    if len(sample) < _ENOUGH:
+        return False
+    height = sample.means @ up
+    low, high = (_quantile(height, q) for q in (0.02, 0.98))
+    cells = plan_cells(sample, up)
+    covered = len(torch.unique(cells))
+    ceiling = len(torch.unique(cells[height > high - 0.06 * (high - low)]))
+    return covered >= _LEAST_CELLS and ceiling >= _CEILING_COVER * covered
+
+
+def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
+    """The cell of a square grid over the ground plan that each Gaussian's mean falls in. [N] int64"""
+    ahead = front(up)
+    plan = scene.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
+    low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
+    place = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
+    return place[:, 0] * per_side + place[:, 1]
+
+
+def without_background(scene: Gaussians) -> Gaussians | None:
+    """An even sample of what is visible and near the middle; None where that tells nothing of a shape."""
+    sample = _sample(scene)
+    sample = sample[(sample.opacities > _SOLID).nonzero()[:, 0]]
+    if len(sample) < _ENOUGH:
+        return None
+    distances = (sample.means - sample.means.median(dim=0).values).norm(dim=1)
+    return sample[(distances <= _CORE * distances.median()).nonzero()[:, 0]]
+
+
+def plane_facing(scene: Gaussians, axis: int) -> tuple[Tensor, Tensor]:
+    """How high each Gaussian lies along a world axis, and how much flat area it turns that way.
+
+    Returns:
+        height over the centre, in radii of the bulk, −1.5..1.5 [N]; share of the scene's flat area [N]
+    """
+    centre, radius = scene_sphere(scene)
+    flat = _flatness(scene)
+    facing = flat * normals_of(scene)[:, axis].abs() ** 4 / flat.sum().clamp_min(1e-30)
+    return ((scene.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5), facing
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values
+
+
+def _sample(scene: Gaussians) -> Gaussians:
+    return scene[:: -(-len(scene) // _SAMPLE)] if len(scene) > _SAMPLE else scene
+
+
+def _areas(scene: Gaussians) -> Tensor:
+    """Area of each Gaussian's two longer axes, the largest per cent cut off so that no giant decides. [N]"""
+    areas = scene.log_scales.sort(dim=1).values[:, 1:].sum(dim=1).exp()
+    return areas.clamp_max(float(_quantile(areas, 0.99)))
+
+
+def _flatness(scene: Gaussians) -> Tensor:
+    """Visible flat area of each Gaussian: nothing for needles and balls. [N]"""
+    ordered = scene.log_scales.sort(dim=1).values
+    flat = 1 - (ordered[:, 0] - ordered[:, 1]).exp()
+    return _areas(scene) * scene.opacities * flat
+
+
+def normals_of(scene: Gaussians) -> Tensor:
+    """The shortest axis of each Gaussian in the world, of either sign. [N,3], unit length"""
+    axes = torch.eye(3)[scene.log_scales.argmin(dim=1)]
+    w, xyz = scene.unit_quats[:, :1], scene.unit_quats[:, 1:]
+    twice = 2 * torch.linalg.cross(xyz, axes)
+    normals: Tensor = axes + w * twice + torch.linalg.cross(xyz, twice)
+    return normals

@@ -1,0 +1,241 @@
+"""The language in which a region is written: `labels:bear.npy:3,4-box:0,0,0,1,2,1`.
+
+    REGION  = PART (('+' | '-') PART)*          from left to right: '+' adds, '-' takes away
+    PART    = 'all'
+            | 'labels:' FILE '.npy:' ID (',' ID)*
+            | 'box:' x0,y0,z0,x1,y1,z1           two opposite corners, world units
+            | 'sphere:' x,y,z,r                  centre and radius, world units
+            | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
+            | KIND ':' …                         other kinds that the caller knows, e.g. masks:, text:
+
+Numbers and file names hold '-' and '+' themselves, so a '+' or '-' joins two parts only where a kind and its
+colon (or a whole 'all') follow. Blanks around parts do not count.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.io.npy import open_npy
+from progdf.region import (
+    Region,
+    everything,
+    from_labels,
+    from_mask,
+    inside_box,
+    inside_sphere,
+    union,
+    without,
+)
+
+Kind = Callable[[str, Gaussians], Region]
+"""Makes a region from what stands behind `KIND:`."""
+
+Check = Callable[[str], object]
+"""Raises ProgdfError where what stands behind `KIND:` cannot be, whatever the scene."""
+
+_NOTHING: Mapping[str, Kind] = {}
+_UNCHECKED: Mapping[str, Check] = {}
+
+
+def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str, Kind] = _NOTHING) -> Region:
+    """The region that `spec` describes in `scene`.
+
+    Args:
+        spec: see the head of this file
+        name: the region's name; the spec itself if empty
+        kinds: further kinds by name, e.g. {"masks": lift_from_folder}
+
+    Raises:
+        ProgdfError: the spec cannot be read, a file does not fit the scene, or nothing is in the region.
+    """
+    known: dict[str, Kind] = {"labels": _labels, "box": _box, "sphere": _sphere, "file": _file, **kinds}
+    region = from_mask("", torch.zeros(len(scene), dtype=torch.bool))
+    for sign, part in split_spec(spec, tuple(known)):
+        kind, colon, rest = part.partition(":")
+        if part == "all":
+            found = everything(scene)
+        elif colon and kind in known:
+            found = known[kind](rest, scene)
+        else:
+            raise _unknown(part, known)
+        region = (union if sign == "+" else without)(region, found)
+    if not len(region):
+        raise ProgdfError(f"region '{spec}' holds no Gaussian; the scene reaches {_extent(scene)}")
+    return Region(name or spec.strip(), region.members, region.score)
+
+
+def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
+    """ProgdfError if no scene can have this region: all that is to be known before one is loaded.
+
+    Args:
+        spec: see the head of this file
+        checks: of further kinds by name
+    """
+    known: dict[str, Check] = {
+        "labels": _check_labels,
+        "box": _corners,
+        "sphere": _ball,
+        "file": _check_file,
+        **checks,
+    }
+    for _, part in split_spec(spec, tuple(known)):
+        kind, colon, rest = part.partition(":")
+        if colon and kind in known:
+            known[kind](rest)
+        elif part != "all":
+            raise _unknown(part, known)
+
+
+def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
+    choice = ", ".join(["all", *(f"{word}:…" for word in known)])
+    return ProgdfError(f"region '{part}' is of no known kind; write {choice}")
+
+
+def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
+    """('+' or '-', part) for each part of a spec, the first one with '+'."""
+    words = "|".join(re.escape(kind) for kind in kinds)
+    joint = re.compile(rf"\s*([+-])\s*(?=(?:{words}):|all\s*(?:$|[+-]))")
+    pieces = joint.split(spec.strip())
+    if not all(pieces[0::2]):
+        raise ProgdfError(f"region '{spec}' lacks a part; write for example all-sphere:0,0,0,1")
+    return list(zip(["+", *pieces[1::2]], (piece.strip() for piece in pieces[0::2]), strict=True))
+
+
+def read_labels(path: str, count: int) -> Tensor:
+    """One integer label per Gaussian from a .npy file. [count] int64
+
+    Raises:
+        ProgdfError: no such file, no .npy, not integers, or not one per Gaussian.
+    """
+    labels = _open_labels(path)
+    if labels.shape not in ((count,), (count, 1)):
+        shape = "x".join(str(side) for side in labels.shape) or "1"
+        raise ProgdfError(
+            f"{path} holds {shape} labels, the scene {count} Gaussians; one each would be right"
+        )
+    return torch.from_numpy(labels.reshape(-1).astype(np.int64))
+
+
+def read_members(path: str, count: int) -> Tensor:
+    """The rows that a .npy file names, sorted and each once: integers, or a bool per Gaussian. [M] int64
+
+    Raises:
+        ProgdfError: no such file, no .npy, of another kind, or rows that the scene does not have.
+    """
+    stored = _open_members(path)
+    if stored.dtype.kind == "b":
+        if stored.shape != (count,):
+            shape = "x".join(str(side) for side in stored.shape) or "1"
+            raise ProgdfError(f"{path} is a mask of {shape}, the scene has {count} Gaussians; give its own")
+        return torch.from_numpy(np.flatnonzero(stored))
+    if stored.dtype.kind not in "iu" or stored.ndim != 1:
+        raise ProgdfError(
+            f"{path} holds {stored.dtype} numbers of {stored.ndim} dimensions; "
+            "give a list of integer rows, or a bool for each Gaussian"
+        )
+    if len(stored) and not 0 <= int(stored.min()) <= int(stored.max()) < count:
+        raise ProgdfError(
+            f"{path} names row {int(stored.min() if stored.min() < 0 else stored.max())}, "
+            f"the scene has rows 0 to {count - 1}; it was made for another scene"
+        )
+    return torch.from_numpy(np.unique(stored).astype(np.int64))
+
+
+def _open_members(path: str) -> NDArray[Any]:
+    return open_npy(path, "rows, as progdf region … -o FILE.npy writes them")
+
+
+def _check_file(rest: str) -> None:
+    if not rest:
+        raise ProgdfError("file: names no file; write file:MEMBERS.npy, as progdf region … -o writes it")
+    _open_members(rest)
+
+
+def _file(rest: str, scene: Gaussians) -> Region:
+    _check_file(rest)
+    mask = torch.zeros(len(scene), dtype=torch.bool)
+    mask[read_members(rest, len(scene))] = True
+    return from_mask(f"file:{rest}", mask)
+
+
+def _open_labels(path: str) -> NDArray[Any]:
+    labels = open_npy(path, "labels, which are integers")
+    if labels.dtype.kind not in "iub":
+        raise ProgdfError(f"{path} holds {labels.dtype} numbers; integer labels would be right")
+    return labels
+
+
+def _check_labels(rest: str) -> None:
+    _open_labels(_labels_wanted(rest)[0])
+
+
+def _labels_wanted(rest: str) -> tuple[str, list[int]]:
+    """The file and the labels of FILE.npy:ID[,ID…]."""
+    path, colon, ids = rest.rpartition(":")
+    if not colon or not path:
+        raise ProgdfError(f"region 'labels:{rest}' names no label; write labels:FILE.npy:ID[,ID…]")
+    try:
+        return path, [int(word) for word in ids.split(",")]
+    except ValueError:
+        raise ProgdfError(
+            f"'{ids}' in region 'labels:{rest}' is no list of integers; write labels:FILE.npy:ID[,ID…]"
+        ) from None
+
+
+def _labels(rest: str, scene: Gaussians) -> Region:
+    path, wanted = _labels_wanted(rest)
+    labels = read_labels(path, len(scene))
+    present = torch.unique(labels).tolist()
+    absent = [wanted_id for wanted_id in wanted if wanted_id not in present]
+    if absent:
+        shown = ", ".join(str(label) for label in present[:12]) + (" …" if len(present) > 12 else "")
+        raise ProgdfError(f"{path} has no Gaussian with label {absent[0]}; it has {shown}")
+    return from_labels(f"labels:{rest}", labels, wanted)
+
+
+def _corners(rest: str) -> list[float]:
+    return _numbers("box", rest, "x0,y0,z0,x1,y1,z1")
+
+
+def _box(rest: str, scene: Gaussians) -> Region:
+    numbers = torch.tensor(_corners(rest))
+    return inside_box(f"box:{rest}", scene, numbers[:3], numbers[3:])
+
+
+def _ball(rest: str) -> list[float]:
+    numbers = _numbers("sphere", rest, "x,y,z,r")
+    if numbers[3] <= 0:
+        raise ProgdfError(f"the radius in region 'sphere:{rest}' is {numbers[3]:g}; it must be positive")
+    return numbers
+
+
+def _sphere(rest: str, scene: Gaussians) -> Region:
+    numbers = _ball(rest)
+    return inside_sphere(f"sphere:{rest}", scene, torch.tensor(numbers[:3]), numbers[3])
+
+
+def _numbers(kind: str, rest: str, form: str) -> list[float]:
+    words = rest.split(",")
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != form.count(",") + 1 or not all(math.isfinite(number) for number in numbers):
+        raise ProgdfError(f"region '{kind}:{rest}' is not {form.count(',') + 1} numbers; write {kind}:{form}")
+    return numbers
+
+
+def _extent(scene: Gaussians) -> str:
+    low, high = scene.means.amin(dim=0).tolist(), scene.means.amax(dim=0).tolist()
+    return ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", low, high, strict=True))

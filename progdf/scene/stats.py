@@ -1,0 +1,128 @@
+"""What a scene is like: where it lies, how large its Gaussians are, which of them are odd."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.formats.load_report import counted
+from progdf.gaussians import Gaussians
+
+from .bounds import is_surrounding, scene_sphere
+from .up_axis import UpAxis, find_up
+
+GIANT = 0.5
+"""Of the scene's radius: a Gaussian with a longer axis (one standard deviation) covers most of a picture."""
+
+NEEDLE = 30.0
+LONG = 0.05
+"""A needle's longest axis is 30 times its middle one and at least a twentieth of the scene's radius."""
+
+INVISIBLE = 1 / 255
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A scene in numbers.
+
+    Args:
+        count: Gaussians N
+        centre: median of the means, world units
+        radius: distance from the centre within which 97 % of the means lie, world units
+        farthest: distance of the farthest mean from the centre, world units
+        box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis
+        up: which way is up, and how that was decided
+        surrounding: it looks like a scene to stand inside, which cameras around it cannot frame
+        median_size: median of the longest axes, one standard deviation, world units
+        largest_size: the longest axis of all
+        invisible: Gaussians with an opacity under 1/255, which no rasteriser draws
+        giants: see `GIANT`
+        needles: see `NEEDLE`
+    """
+
+    count: int
+    centre: tuple[float, float, float]
+    radius: float
+    farthest: float
+    box: tuple[float, ...]
+    bulk_box: tuple[float, ...]
+    up: UpAxis
+    surrounding: bool
+    median_size: float
+    largest_size: float
+    invisible: int
+    giants: int
+    needles: int
+
+    def lines(self) -> list[str]:
+        """The survey for a person, a line per fact."""
+        x, y, z = self.centre
+        lines = [
+            f"place: centre {x:.4g} {y:.4g} {z:.4g}, radius {self.radius:.4g} (97 % of the Gaussians), "
+            f"farthest {self.farthest:.4g}",
+            f"up: {self.up.name}, {self.up.reason}",
+            f"bulk, 95 % along each axis: --region {_box(self.bulk_box)}",
+            f"all: --region {_box(self.box)}",
+            f"size: median {self.median_size:.3g}, largest {self.largest_size:.3g} "
+            "(longest axis, one standard deviation)",
+        ]
+        odd = (
+            (self.invisible, "Gaussian", "too transparent to be drawn (opacity under 1/255)"),
+            (self.giants, "giant", f"(longer than {GIANT:g} of the scene's radius)"),
+            (self.needles, "needle", f"({NEEDLE:g} times as long as wide, and long)"),
+        )
+        lines += [f"odd: {counted(rows, noun)} {what}" for rows, noun, what in odd if rows]
+        if self.surrounding:
+            lines.append(
+                "cameras: a scene to stand inside, which cameras around it cannot frame; give its own, "
+                "or keep views with F4 in progdf view"
+            )
+        return lines
+
+
+def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
+    """Measure a scene of at least one Gaussian, every number in it finite, as `load_ply` makes them.
+
+    Args:
+        scene: N Gaussians
+        up: which way is up; None finds it
+    """
+    centre, radius = scene_sphere(scene)
+    up = find_up(scene) if up is None else up
+    axes = scene.log_scales.sort(dim=1).values
+    longest = axes[:, 2].exp()
+    needles = (axes[:, 2] - axes[:, 1] > torch.tensor(NEEDLE).log()) & (longest > LONG * radius)
+    x, y, z = centre.tolist()
+    return Survey(
+        count=len(scene),
+        centre=(x, y, z),
+        radius=radius,
+        farthest=float((scene.means - centre).norm(dim=1).max()),
+        box=_corners(scene.means, 0.0),
+        bulk_box=_corners(scene.means, 0.025),
+        up=up,
+        surrounding=is_surrounding(scene, up.direction),
+        median_size=float(longest.median()),
+        largest_size=float(longest.max()),
+        invisible=int((scene.opacities < INVISIBLE).sum()),
+        giants=int((longest > GIANT * radius).sum()),
+        needles=int(needles.sum()),
+    )
+
+
+def _corners(means: Tensor, left_out: float) -> tuple[float, ...]:
+    """Least x, y, z and largest x, y, z of what is left without a share of the means on each side."""
+    ordered = means.sort(dim=0).values
+    cut = int(left_out * len(ordered))
+    return tuple(torch.cat([ordered[cut], ordered[len(ordered) - 1 - cut]]).tolist())
+
+
+def _box(corners: tuple[float, ...]) -> str:
+    """The corners as a region, rounded outwards to a hundred-thousandth of the box."""
+    step = 10.0 ** math.floor(math.log10(max(math.dist(corners[:3], corners[3:]), 1e-12)) - 4)
+    places = max(0, -round(math.log10(step)))
+    rounded = [(math.floor, math.ceil)[i // 3](corner / step) * step for i, corner in enumerate(corners)]
+    return "box:" + ",".join(f"{corner:.{places}f}" for corner in rounded)

@@ -1,0 +1,221 @@
+"""What a picture of a scene is about, and where to stand to see it.
+
+The subject is what stands on the ground: neither the ground nor what floats far off. A ground is a smooth
+surface under most of the scene, wider than what stands on it. Things are measured in cells of space, so that
+neither a lawn's many blades nor a sky's few giants decide.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians
+
+from .bounds import front, has_ceiling
+
+_SAMPLE = 60_000
+_ENOUGH = 64
+_SOLID = 0.1
+"""Opacity below which a Gaussian is haze."""
+
+_CORE = 2.5
+"""Of the median distance: what lies farther is background, where a scene has any."""
+
+_PLAN = 24
+_ABOVE = 0.05
+"""Of the plan's half diagonal: so far above the ground begins what stands on it."""
+
+_UNDER, _SHOWN, _COVERED = 0.03, 0.5, 0.6
+"""A ground has no more of the scene under it, shows in no fewer cells of the plan, and what stands on it
+covers no more of them."""
+
+_ACROSS = 32
+_LEAST = 0.06
+"""Of the cells of the largest thing: what fills fewer is a tuft or a stray. The toy robot's hands fill .11 of
+its body's, the largest tuft of its ground .03."""
+
+
+def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
+    """The Gaussians that the first picture of a scene should be filled by.
+
+    Args:
+        scene: N Gaussians, finite; of many an even sample is looked at
+        up: see `framing.guess_up`. [3]
+
+    Returns:
+        Sorted rows, at least one where there is one at all. [M] int64
+    """
+    rows = _sample(scene)
+    solid = rows[scene.opacities[rows] > _SOLID]
+    if len(solid) < _ENOUGH:
+        return rows
+    rows = _without_background(scene, solid)
+    height, plan = _upright(scene.means[rows], up)
+    standing = _standing(height, plan)
+    if standing is not None:
+        rows, height, plan = rows[standing], height[standing], plan[standing]
+    return rows[_of_large_things(torch.cat([plan, height[:, None]], dim=1))]
+
+
+def fitted_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, float]) -> Tensor:
+    """Where the eye stands that looks along −back and has the points in its picture, as near as can be. [3]
+
+    Args:
+        points: to be seen, world units; all but a half per cent on each side are. [P,3], P ≥ 1
+        radius: of a ball about each point, world units
+        axes: rows right, up and back (from the scene to the eye) of the picture, unit vectors. [3,3]
+        tangents: of half the angle that is to be filled, along the width and along the height
+    """
+    right, up, back = (points.double() @ axes.double().T).unbind(1)
+    place, away = [], -math.inf
+    for along, tangent in ((right, tangents[0]), (up, tangents[1])):
+        # |along − place| ≤ tangent · (away − back) for every point: two planes, which meet at the eye
+        margin = radius * math.sqrt(1 + tangent**2)
+        high = float(_quantile(along + tangent * back, 0.995)) + margin
+        low = float(_quantile(tangent * back - along, 0.995)) + margin
+        place.append(0.5 * (high - low))
+        away = max(away, 0.5 * (high + low) / tangent)
+    return torch.tensor([*place, away], dtype=torch.float64) @ axes.double()
+
+
+def is_room(scene: Gaussians, up: Tensor) -> bool:
+    """Whether a ceiling, which a sky far above is not, covers most of it: it can be seen from inside only."""
+    return has_ceiling(scene[_without_background(scene, _sample(scene))], up)
+
+
+def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
+    """Where to stand inside a room, and what to look at: across it, from where the least is in the way.
+
+    Returns:
+        eye [3], target [3]
+    """
+    means = scene.means[_sample(scene)]
+    ahead = front(up)
+    axes = torch.stack([ahead, torch.linalg.cross(up, ahead), up])
+    inside = means @ axes.T
+    low, high = (torch.stack([_quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    target = (middle - half * torch.tensor([0.0, 0.0, 0.2])) @ axes
+    best, eye = -1.0, target
+    for turn in range(8):  # the corners and the middles of the walls, at the height of eyes
+        angle = math.radians(45 * turn)
+        level = torch.tensor([math.cos(angle), math.sin(angle)])
+        aside = 0.75 * level / level.abs().max()
+        stand = (middle + half * torch.tensor([*aside.tolist(), 0.2])) @ axes
+        offsets = means - stand
+        apart = offsets.norm(dim=1).clamp_min(1e-12)
+        ray = torch.nn.functional.normalize(target - stand, dim=0)
+        shown = apart[(offsets @ ray) > 0.8 * apart]
+        clear = float(_quantile(shown, 0.02)) if len(shown) else 0.0
+        if clear > best:
+            best, eye = clear, stand
+    return eye, target
+
+
+def _sample(scene: Gaussians) -> Tensor:
+    return torch.arange(0, len(scene), max(1, -(-len(scene) // _SAMPLE)))
+
+
+def _without_background(scene: Gaussians, rows: Tensor) -> Tensor:
+    """Without shells of sky, mountains, strays; a scene that has none stays whole."""
+    for _ in range(3):
+        means = scene.means[rows]
+        distances = (means - means.median(dim=0).values).norm(dim=1)
+        kept = distances <= _CORE * distances.median()
+        if bool(kept.all()):
+            break
+        rows = rows[kept]
+    return rows
+
+
+def _upright(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+    """Heights [R] and places in plan [R,2], both over the plan's half diagonal, the plan about its middle."""
+    ahead = front(up)
+    plan = means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
+    low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.01, 0.99))
+    unit = (0.5 * (high - low)).norm().clamp_min(1e-12)
+    height = means @ up
+    return (height - height.median()) / unit, (plan - 0.5 * (low + high)) / unit
+
+
+def _standing(height: Tensor, plan: Tensor) -> Tensor | None:
+    """Which rows stand above a ground. [R], [R,2] -> [R] bool; None where there is no ground to speak of."""
+    cells = ((plan + 1.0) * 0.5 * _PLAN).long().clamp(0, _PLAN - 1)
+    taken, cell, counts = torch.unique(
+        cells[:, 0] * _PLAN + cells[:, 1], return_inverse=True, return_counts=True
+    )
+    form = _powers(plan)
+    if len(taken) < form.shape[1]:
+        return None
+    order = torch.argsort(height, stable=True)
+    order = order[torch.argsort(cell[order], stable=True)]  # by cell, from low to high in each
+    lowest = order[counts.cumsum(0) - counts + counts // 10]
+    ground = form @ _ground(height[lowest], form[lowest])
+    above = height - ground
+    standing = above > _ABOVE
+    covered = torch.zeros(len(taken)).index_add(0, cell, standing.float()) > 0.1 * counts
+    found = (
+        int(standing.sum()) >= _ENOUGH
+        and float((above < -_ABOVE).float().mean()) <= _UNDER
+        and float((above[lowest].abs() < _ABOVE).float().mean()) >= _SHOWN
+        and float(covered.float().mean()) <= _COVERED
+    )
+    return standing if found else None
+
+
+def _ground(low: Tensor, form: Tensor) -> Tensor:
+    """The surface through the low points of most cells of the plan. [Q], [Q,6] -> coefficients [6]
+
+    Robust regression (Cauchy weights), in which what lies above the surface counts for less: under what
+    stands no ground shows.
+    """
+    weights = torch.ones_like(low)
+    for _ in range(20):
+        # numpy's own: torch's threads spin over a few hundred rows, and this is in the way of a first picture
+        fit = np.linalg.lstsq((form * weights[:, None]).numpy(), (low * weights).numpy(), rcond=None)
+        surface = torch.from_numpy(fit[0])
+        left = low - form @ surface
+        weights = 1.0 / (1.0 + (left / torch.where(left > 0, 0.5 * _ABOVE, _ABOVE)) ** 2)
+    return surface
+
+
+def _powers(plan: Tensor) -> Tensor:
+    """Of the second order: level, slope (up is known to an axis only), hill or hollow. [R,2] -> [R,6]"""
+    x, y = plan.unbind(1)
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
+
+
+def _of_large_things(places: Tensor) -> Tensor:
+    """Which rows belong to large connected things. [R,3] -> [R] bool, at least one"""
+    low, high = (torch.stack([_quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
+    side = float((high - low).amax().clamp_min(1e-9)) / _ACROSS
+    span = 2 * _ACROSS + 2
+    keys = ((places - low) / side + 0.5 * _ACROSS).clamp(0, span - 3).long() + 1
+    boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
+    thing = _connected(boxes, span)
+    size = torch.zeros(len(boxes)).index_add(0, thing, torch.ones(len(boxes)))
+    return (size[thing] >= _LEAST * size.max())[box]
+
+
+def _connected(boxes: Tensor, span: int) -> Tensor:
+    """Which thing each cell belongs to; cells that touch, corners included, are one. [B] ascending -> [B]"""
+    steps = torch.tensor([-1, 0, 1])
+    around = boxes[:, None] + ((steps[:, None, None] * span + steps[:, None]) * span + steps).flatten()
+    place = torch.searchsorted(boxes, around).clamp_max(len(boxes) - 1)
+    own = torch.arange(len(boxes))
+    near = torch.where(boxes[place] == around, place, own[:, None])
+    thing = own
+    while True:
+        least = thing[near].amin(dim=1)
+        least = least[least]  # halves the way to the first of the thing
+        if torch.equal(least, thing):
+            return thing
+        thing = least
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values

@@ -1,0 +1,230 @@
+"""`python -m benchmarks ablate`: which variants make sense, what is shared, what is kept."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+import benchmarks.ablation.ablate
+from benchmarks.ablation.ablate import ablate
+from benchmarks.ablation.options import AblateOptions
+from benchmarks.ablation.setup import run_options
+from benchmarks.ablation.table import Outcome, table_of
+from benchmarks.ablation.variants import chosen, sensible
+from progdf.compose.reference import Layer, compose
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import Trajectory
+from progdf.formats.ply import load_ply
+from progdf.gdf.file import load_gdf
+from tests.helpers.trained import quick_options, write_bear
+from trainer import cli
+from trainer.options import TrainOptions, settled
+from trainer.pipeline.reopen import reopened
+from trainer.pipeline.run import train
+from trainer.store.run_folder import RunFolder
+
+ONLY = "base,2-keyframes,one-target,slider-time"
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
+    """Of a run of a second or two on a small bear, which is finished."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    options = settled(quick_options(made, steps=100, views=5, image_size=64))
+    train(options, quiet=True)
+    return options
+
+
+@pytest.fixture(scope="module")
+def run(options: TrainOptions) -> Path:
+    """The folder of that run, with an ablation of four variants in it."""
+    ablate(AblateOptions(options.out, only=ONLY, threads=1), quiet=True)
+    return options.out
+
+
+def _nothing_trains(*_: object, **__: object) -> tuple[Trajectory, object]:
+    raise AssertionError("it trains again")
+
+
+def _names(options: TrainOptions, *about: object) -> set[str]:
+    return {variant.name for variant in sensible(options, *about)}  # type: ignore[arg-type]
+
+
+def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
+    colour = _names(options, "colour", 4, 1)
+    assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "paper"} <= colour
+    assert "no-lpips" not in colour, "colors are solved for, without LPIPS"
+    assert "no-lpips" in _names(replace(options, perceptual_weight=0.1), "colour", 4, 1)
+    assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & colour
+    style = _names(options, "style", 4, 1)
+    assert "sharpness-off" in style
+    assert "sharpness-hinge" not in style
+    assert "no-groups" in _names(options, "geometry", 4, 1)
+    assert not {"one-target", "slider-stages"} & _names(options, "colour", 1, 1)
+    assert "no-sh" not in _names(options, "colour", 4, 0)
+    without = replace(options, perceptual_weight=0.0, progressive="warmup")
+    assert "no-lpips" not in _names(without, "style", 4, 1)
+    assert "progressive-off" in _names(without, "colour", 4, 1)
+
+
+def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
+    variants = sensible(options, "colour", 4, 1)
+    assert [v.name for v in chosen(variants, "no-sh, base")] == ["base", "no-sh"]
+    with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
+        chosen(variants, "base,warmup")
+    with pytest.raises(ProgdfError, match="'sharpness-off' makes no difference to this run; "):
+        chosen(variants, "sharpness-off")
+    with pytest.raises(ProgdfError, match="--only ' ,' names no variant; choose of base,"):
+        chosen(variants, " ,")
+
+
+def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
+    options: TrainOptions, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
+    (copy / "ablation").touch()
+    with pytest.raises(ProgdfError, match="ablation is a file; give the name of a folder"):
+        ablate(AblateOptions(copy, threads=1), quiet=True)
+
+
+def test_the_options_of_a_run_are_read_back_as_they_were(options: TrainOptions) -> None:
+    assert run_options(reopened(options.out)) == replace(options, group_steps=0), "as the run resolved it"
+
+
+def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to_open(
+    options: TrainOptions, run: Path
+) -> None:
+    found = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))
+    assert [row["name"] for row in found["variants"]] == ONLY.split(",")
+    markdown = (run / "ablation" / "ablation.md").read_text(encoding="utf-8")
+    assert all(f"| {name} |" in markdown for name in ONLY.split(","))
+    with Image.open(run / "ablation" / "ablation.png") as picture:
+        assert picture.width > 5 * 176
+        assert picture.height > 5 * 100
+    scene = load_ply(options.scene)
+    for name in ONLY.split(","):
+        gdf = load_gdf(run / "ablation" / name / f"{name}.gdf", scene)
+        assert not torch.equal(compose(scene, [Layer(gdf, 1.0)]).sh0, scene.sh0)
+    assert not list((run / "ablation").glob("*/state"))
+
+
+def test_variants_of_the_slider_share_one_optimisation_and_end_alike(run: Path) -> None:
+    rows = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))["variants"]
+    base, linear, plain, by_time = rows
+    assert base["psnr"] == linear["psnr"] == by_time["psnr"] != plain["psnr"]
+    assert linear["between"] != base["between"]
+    assert by_time["between"] == base["between"], "judged where each shows it"
+    assert by_time["uniformity"] < base["uniformity"]
+    assert "going on at step 12 of 12" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
+    assert "going on" not in (run / "ablation/one-target/log.txt").read_text(encoding="utf-8")
+
+
+def test_a_variant_is_judged_at_strengths_that_it_was_never_shown(run: Path) -> None:
+    rows = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))["variants"]
+    for row in rows:
+        assert set(row["between"]) == {"0.25", "0.5", "0.75"}
+    assert rows[0]["between"]["0.5"] > rows[2]["between"]["0.5"] + 3  # stages are for what lies between
+
+
+def test_what_is_done_is_not_done_again_until_the_edited_views_change(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", _nothing_trains)
+    again = ablate(AblateOptions(run, only="base,one-target", threads=1), quiet=True)
+    assert [outcome.name for outcome in again.outcomes] == ONLY.split(",")
+    name = reopened(run).about["held_out"][0]
+    path = RunFolder(run).view("edited", name)
+    kept = path.read_bytes()
+    try:
+        with Image.open(path) as opened:
+            Image.new("RGB", opened.size, "red").save(path)
+        with pytest.raises(AssertionError, match="trains again"):
+            ablate(AblateOptions(run, only="base", threads=1), quiet=True)
+    finally:
+        path.write_bytes(kept)
+
+
+def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = benchmarks.ablation.ablate.trained
+
+    def interrupted(*arguments: object, **more: object) -> object:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=r"1 of 2 variants are done and kept in .*; give the same"):
+        ablate(AblateOptions(run, only="base,no-sh", threads=1), quiet=True)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", real)
+    done = ablate(AblateOptions(run, only="base,no-sh", threads=1), quiet=True)
+    assert "no-sh" in [outcome.name for outcome in done.outcomes]
+
+
+def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> object:
+        raise ProgdfError("training broke down") from FloatingPointError("the loss is nan at step 7")
+
+    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", broken)
+    done = ablate(AblateOptions(run, only="paper", threads=1), quiet=True)
+    assert done.outcomes[-1].failed == "the loss is nan at step 7"
+    markdown = (run / "ablation" / "ablation.md").read_text(encoding="utf-8")
+    assert "paper: the loss is nan at step 7." in markdown
+
+
+def test_what_is_no_finished_run_is_one_line(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ProgdfError, match="give a folder that progdf train finished"):
+            cli.ablate([str(folder)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_prints_a_table_that_fits_a_terminal(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", _nothing_trains)
+    assert cli.ablate([str(run), "--only", "base", "--threads", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    assert any(line.startswith("2-keyframes ") for line in lines)
+    assert not any("…" in line for line in lines)
+
+
+def test_a_failure_has_dashes_for_figures_and_its_reason_below() -> None:
+    table = table_of([Outcome("paper", "as printed", failed="the loss is nan")], "title", "LPIPS")
+    assert set(table.rows[0][2:]) == {"–"}
+    assert len(table.rows[0]) == len(table.columns)
+    assert "paper: the loss is nan." in table.note
+
+
+def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
+    options: TrainOptions, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[TrainOptions] = []
+
+    def noted(wanted: TrainOptions, *_: object) -> object:
+        asked.append(wanted)
+        raise ProgdfError("enough") from FloatingPointError("enough")
+
+    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", noted)
+    monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STEPS", 40)
+    monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STAGES", 2)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "_keep", _forgets)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "_publish", _published)
+    ablate(AblateOptions(run, only="base", quick=True, threads=1), quiet=True)
+    assert (asked[0].steps, asked[0].stages) == (40, 2)
+
+
+def _forgets(*_: object) -> None:
+    """Keeps nothing."""
+
+
+def _published(*_: object) -> benchmarks.ablation.ablate.Ablation:
+    return benchmarks.ablation.ablate.Ablation("t", [Outcome("base", "b")], "LPIPS")

@@ -1,0 +1,82 @@
+"""Hard cases drawn by either engine, with their gradients, and how far two drawings are apart."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.rasterize import RasterInfo, rasterize
+from tests.helpers.scenes import hard_cases
+
+INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
+CASES = hard_cases()
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A picture and the gradients of a fixed random weighting of it, by input name."""
+
+    image: Tensor
+    transmittance: Tensor
+    info: RasterInfo
+    gradients: dict[str, Tensor]
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    engine: str,
+    crop: tuple[int, int, int, int] | None = None,
+) -> Drawn:
+    dtype = torch.float64 if engine == "reference" else torch.float32
+    inputs = (
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        camera.viewmat,
+        camera.K,
+        torch.tensor([0.2, 0.4, 0.6]),
+    )
+    leaves = {
+        name: tensor.to(dtype).clone().requires_grad_() for name, tensor in zip(INPUTS, inputs, strict=True)
+    }
+    image, transmittance, info = rasterize(
+        **leaves,
+        width=camera.width,
+        height=camera.height,
+        sh_degree=gaussians.sh_degree,
+        antialiased=gaussians.antialiased,
+        engine=engine,
+        crop=crop,
+    )
+    rng = torch.Generator().manual_seed(11)
+    weights = torch.randn(camera.height, camera.width, 4, generator=rng).to(dtype)
+    if crop is not None:
+        weights = weights[crop[1] : crop[3], crop[0] : crop[2]]
+    ((image * weights[..., :3]).sum() + (transmittance * weights[..., 3]).sum()).backward()
+    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return Drawn(image.detach(), transmittance.detach(), info, gradients)
+
+
+@functools.cache
+def drawn_case(name: str, engine: str) -> Drawn:
+    case = CASES[name]
+    return draw(case.gaussians, case.camera, engine)
+
+
+def relative_errors(found: Drawn, expected: Drawn) -> dict[str, float]:
+    """Largest gradient error over the largest gradient, by input; below 1e-6 a gradient counts as zero."""
+    errors = {}
+    for name, reference in expected.gradients.items():
+        difference = (found.gradients[name] - reference).abs()
+        errors[name] = (
+            float(difference.max() / reference.abs().max().clamp_min(1e-6)) if len(reference) else 0.0
+        )
+    return errors

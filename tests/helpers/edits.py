@@ -1,0 +1,81 @@
+"""Builders of trajectories, fields and edits that tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import torch
+from torch import Tensor
+
+from progdf.field import BakedField, fit_separable
+from progdf.field.rendered import Render
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
+from progdf.gdf.file import Gdf, fingerprint
+from progdf.region import Region
+
+
+def curved_trajectory(
+    members: int,
+    seed: int = 0,
+    channels: int = BASE_CHANNELS,
+    moving: Collection[str] = ATTRIBUTES,
+    snapshots: int = 9,
+) -> tuple[Tensor, Tensor]:
+    """Strengths [T] and offsets [T,M,C] of members that bend away from the straight way in two manners."""
+    rng = torch.Generator().manual_seed(seed)
+    strengths = torch.linspace(0, 1, snapshots)
+    bend, wave = torch.sin(torch.pi * strengths), torch.sin(2 * torch.pi * strengths)
+    offsets = torch.zeros(snapshots, members, channels)
+    for course, size in ((strengths, 1.0), (bend, 0.5), (wave, 0.2)):
+        offsets += course[:, None, None] * size * torch.randn(members, channels, generator=rng)
+    for name, columns in attribute_slices(channels).items():
+        if name not in moving:
+            offsets[:, :, columns] = 0.0
+    offsets[0] = 0.0
+    return strengths, offsets
+
+
+def curved_field(
+    members: int,
+    seed: int = 0,
+    channels: int = BASE_CHANNELS,
+    moving: Collection[str] = ATTRIBUTES,
+    rank: int = 2,
+    rest_type: torch.dtype = torch.int8,
+) -> BakedField:
+    """A separable field of `curved_trajectory`."""
+    strengths, offsets = curved_trajectory(members, seed, channels, moving)
+    return fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), rest_type=rest_type)
+
+
+def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
+    """The field's offsets at these strengths. [T,M,C]"""
+    return torch.stack([field.offsets(float(s)) for s in strengths])
+
+
+def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
+    """A stand-in for a renderer: shows colour well, geometry little, half of the members not at all."""
+    rng = torch.Generator().manual_seed(seed)
+    shown = torch.randn(90, members, channels, generator=rng) / (members * channels) ** 0.5
+    shown[:, ::2] = 0.0
+    for name, size in (("means", 0.02), ("log_scales", 0.02), ("quats", 0.0), ("sh0", 0.2)):
+        shown[:, :, attribute_slices(channels)[name]] *= size
+    return lambda offsets: (shown.flatten(1) @ offsets.flatten()).reshape(30, 3)
+
+
+def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "shirt") -> Gdf:
+    """An edit of these rows ([M] int64, sorted)."""
+    score = torch.zeros(len(scene))
+    score[members] = 1.0
+    return Gdf(name, Region(name, members, score), field, fingerprint(scene), "recolor:#3060d0")
+
+
+def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:
+    """`count` different rows, sorted. [M] int64"""
+    rng = torch.Generator().manual_seed(seed)
+    return torch.randperm(len(scene), generator=rng)[:count].sort().values
+
+
+def bits(gaussians: Gaussians) -> dict[str, bytes]:
+    """Every attribute's bytes, so that 0.0 and −0.0 differ."""
+    return {name: getattr(gaussians, name).contiguous().numpy().tobytes() for name in ATTRIBUTES}

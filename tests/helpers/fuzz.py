@@ -1,0 +1,203 @@
+"""Hostile inputs for every reader: `python -m tests.helpers.fuzz READER COUNT SEED FOLDER`.
+
+Bytes are flipped, cut, doubled and put in; values of JSON are replaced by what no program writes, with the
+checksums made to fit. Each input must give an object or a ProgdfError of one line, within a few seconds and a
+gigabyte. Failures are printed, one a line, and their inputs are kept in FOLDER.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from progdf.cli.info import _DESCRIBE, kind_of
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import load_trajectory, save_trajectory
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gdf.file import load_gdf, save_gdf
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.images import open_picture
+from progdf.io.npy import open_npy
+from tests.helpers.edits import curved_field, edit_of, some_rows
+from tests.helpers.fuzz_changes import Change, changed_bytes, changed_gdf, changed_json, changed_parts
+from tests.helpers.fuzz_folders import COSTLY, more_inputs
+from tests.helpers.ply_files import camera_element, face_element, scene_of, write
+from tests.helpers.ply_files import table_of as columns_of
+from tests.helpers.scenes import orbit_camera, random_gaussians
+from tests.helpers.sessions import bear_files, saved_session
+from tests.helpers.stacks import recording_of
+from trainer.store.state import StateFolder
+from viewer.files import session, timeline_file
+
+SECONDS, BYTES = 10, 1 << 30
+"""What one input may take, at most."""
+
+
+def read_info(path: Path) -> None:
+    """All lines of `progdf info`."""
+    for line in _DESCRIBE[kind_of(path)](path):
+        assert isinstance(line, str)
+
+
+def read_gdf(path: Path) -> None:
+    """The edit, which must not move anything to where no number is."""
+    gdf = load_gdf(path)
+    for s in (0.0, 0.5, 1.0):
+        assert bool(gdf.field.offsets(s).isfinite().all())
+
+
+def read_state(path: Path) -> None:
+    """A part of a stopped run."""
+    StateFolder(path.parent).load(path.stem)
+
+
+def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], Any], list[Change]]]:
+    """By reader: the file's name, the reader, and what is done to a good file."""
+    scene = random_gaussians(40, seed=1, sh_degree=1)
+    edit = edit_of(scene, some_rows(scene, 12), curved_field(12, channels=14 + 9))
+    edit = replace(edit, options={"name": "shirt", "steps": 600}, report={"a": {"b": [1.0, 2.0]}, "c": None})
+    save_gdf(folder / "a.gdf", edit)
+    save_ply(folder / "a.ply", scene_of(1, count=6))
+    write(
+        folder / "b.ply",
+        columns_of(scene_of(0, 5)),
+        text=True,
+        before=[camera_element()],
+        after=[face_element()],
+    )
+    write(folder / "c.ply", columns_of(scene_of(0, 5)), byte_order=">", before=[face_element()])
+    plys = [changed_bytes((folder / f"{name}.ply").read_bytes()) for name in "abc"]
+    save_cameras(folder / "own.json", [orbit_camera(), orbit_camera()])
+    eye = np.eye(4).tolist()
+    frame = {"file_path": "a.png", "transform_matrix": eye}
+    nerf = {"fl_x": 50.0, "w": 64, "h": 48, "k1": 0.1, "camera_model": "OPENCV", "frames": [frame, frame]}
+    inria = [
+        {"img_name": "a", "width": 64, "height": 48, "position": [0, 0, 1], "rotation": np.eye(3).tolist(),
+         "fx": 50.0, "fy": 50.0}
+    ]  # fmt: skip
+    camera_files = [(folder / "own.json").read_bytes(), json.dumps(nerf).encode(), json.dumps(inria).encode()]
+    timeline = {
+        "progdf_timeline": 1, "fps": 24, "length": 72, "ping_pong": False,
+        "keys": [{"frame": 0, "strengths": {}, "camera": {"pivot": [0, 1, 0], "distance": 4}}, {"frame": 9}],
+    }  # fmt: skip
+    np.save(folder / "a.npy", np.arange(40, dtype=np.float32))
+    Image.fromarray(np.random.default_rng(1).integers(0, 255, (20, 30, 3), np.uint8)).save(folder / "a.png")
+    save_trajectory(
+        folder / "t.safetensors",
+        recording_of(edit),
+        {"members": edit.region.members, "score": edit.region.score},
+        {"scene": "a.ply", "held_out": ["a"], "background": [1, 1, 1], "options": {"name": "a"}},
+    )
+    state = StateFolder(folder / "state")
+    state.begin({"options": {"steps": 4}, "scene": "", "cameras": None, "threads": 1, "torch": "2"})
+    state.save("part", {"a": torch.arange(4.0)}, {"pgs": {"step": 3}, "list": [1, 2.5]})
+    (folder / "s").mkdir()
+    saved = saved_session(bear_files(folder / "s"))
+    read: Callable[[Path], bytes] = Path.read_bytes
+
+    def both(content: bytes) -> list[Change]:
+        return [changed_json(content), changed_json(content), changed_bytes(content)]
+
+    gdf, parts = read(folder / "a.gdf"), read(folder / "t.safetensors")
+    part = read(folder / "state" / "part.safetensors")
+    return {
+        **more_inputs(folder, reader),
+        "ply": ("x.ply", load_ply, plys),
+        "gdf": ("x.gdf", read_gdf, [changed_gdf(gdf), changed_gdf(gdf), changed_bytes(gdf)]),
+        "session": ("s/x.session.json", session.open_session, both(read(saved))),
+        "timeline": ("x.json", lambda p: timeline_file.load(p, ()), both(json.dumps(timeline).encode())),
+        "cameras": ("x.json", load_cameras, [c for content in camera_files for c in both(content)]),
+        "npy": ("x.npy", open_npy, [changed_bytes(read(folder / "a.npy"))]),
+        "png": ("x.png", open_picture, [changed_bytes(read(folder / "a.png"))]),
+        "trajectory": (
+            "x.safetensors",
+            load_trajectory,
+            [changed_parts(parts, "about"), changed_bytes(parts)],
+        ),
+        "state": ("state/x.safetensors", read_state, [changed_parts(part, "values"), changed_bytes(part)]),
+        "run.json": (
+            "state/run.json",
+            lambda p: StateFolder(p.parent).identity(),
+            both(read(folder / "state" / "run.json")),
+        ),
+        "info": (
+            "s/x",
+            read_info,
+            [
+                *plys,
+                changed_gdf(gdf),
+                changed_gdf(gdf),
+                *both(read(saved)),
+                *both(json.dumps(timeline).encode()),
+            ],
+        ),
+    }
+
+
+READERS = (
+    "ply",
+    "gdf",
+    "session",
+    "timeline",
+    "cameras",
+    "npy",
+    "png",
+    "trajectory",
+    "state",
+    "run.json",
+    "info",
+    "compressed",
+    "ksplat",
+    "masks",
+    "labels",
+    "members",
+    *COSTLY,
+)
+
+
+def failures(reader: str, count: int, seed: int, folder: Path) -> Iterator[str]:
+    """What got through, a line each; the inputs are kept."""
+    name, read, changes = inputs(folder, reader)[reader]
+
+    def late(*_: object) -> None:
+        raise TimeoutError
+
+    signal.signal(signal.SIGALRM, late)
+    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (taken + BYTES, taken + BYTES))
+    path = folder / name
+    for i in range(count):
+        rng = random.Random(f"{seed} {reader} {i}")
+        rng.choice(changes)(rng, path)
+        signal.alarm(SECONDS * (10 if reader in COSTLY else 1))
+        try:
+            read(path)
+            wrong = ""
+        except ProgdfError as refused:
+            wrong = "" if "\n" not in str(refused) else f"of two lines: {refused!r}"
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            wrong = f"{type(error).__name__}: {str(error)[:100]} ({Path(last.filename).name}:{last.lineno})"
+        signal.alarm(0)
+        if wrong:
+            kept = folder / f"kept-{reader}-{seed}-{i}{path.suffix}"
+            kept.write_bytes(path.read_bytes())
+            yield f"{reader} {i}: {' '.join(wrong.split())}"
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    for line in failures(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])):
+        print(line, flush=True)

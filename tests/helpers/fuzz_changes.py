@@ -1,0 +1,175 @@
+"""What `tests.helpers.fuzz` does to good files: bytes, values of JSON and tensors are changed."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+
+from progdf.gdf.file import _checksum
+from progdf.gdf.header import head_checksum
+from progdf.io.tensors import table_of, write_tensors
+from tests.helpers.hostile import JSON_TEXTS
+
+VALUES: list[Any] = [
+    *(
+        None,
+        True,
+        False,
+        0,
+        -1,
+        1,
+        7,
+        2**31,
+        2**63,
+        -(2**70),
+        1e-300,
+        1e300,
+        0.5,
+        "",
+        "a",
+        "means",
+        "\0",
+        "/",
+    ),
+    *("\x1b[2J\n", "ä" * 300, "9" * 5000, [], {}, [[]], [0] * 5000, {"a": {"b": []}}, "../../../etc/passwd"),
+]
+"""In place of what a file holds."""
+
+Change = Callable[[random.Random, Path], None]
+"""Writes another input to a path."""
+
+
+def changed_bytes(content: bytes) -> Change:
+    """Damage as of disks and downloads."""
+
+    def change(rng: random.Random, path: Path) -> None:
+        data = bytearray(content)
+        for _ in range(rng.choice([1, 1, 1, 2, 6])):
+            at = (
+                rng.randrange(len(data) + 1) if rng.random() < 0.5 else rng.randrange(min(len(data), 400) + 1)
+            )
+            length = rng.choice([1, 1, 2, 4, 8, 100])
+            kind = rng.randrange(6)
+            if kind == 0:
+                data[at : at + 1] = bytes([rng.randrange(256)])
+            elif kind == 1:
+                data[at : at + length] = rng.choice([b"\xff", b"\0", b"9", b"["]) * length
+            elif kind == 2:
+                data[at:at] = rng.randbytes(length)
+            elif kind == 3:
+                data[at:at] = data[at : at + 50 * length]
+            elif kind == 4:
+                del data[at : at + length]
+            else:
+                del data[at:]
+        path.write_bytes(bytes(data))
+
+    return change
+
+
+def changed_value(rng: random.Random, value: Any) -> Any:
+    """A JSON value with one to three places of it replaced, removed or doubled."""
+    value = json.loads(json.dumps(value))
+    for _ in range(rng.choice([1, 1, 2, 3])):
+        inner, place = None, None
+        found = value
+        while isinstance(found, dict | list) and found and rng.random() < 0.8:
+            inner, place = found, rng.choice(list(found) if isinstance(found, dict) else range(len(found)))
+            found = inner[place]
+        other = copy.deepcopy(rng.choice(VALUES))  # which may be put into itself
+        if inner is None or place is None:
+            value = other if rng.random() < 0.2 else value
+        elif (kind := rng.randrange(6)) == 0:
+            del inner[place]
+        elif kind == 1 and isinstance(inner, dict):
+            inner[rng.choice(["extra", "", "a" * 5000, "\x1b"])] = other
+        elif kind == 2 and isinstance(inner, list):
+            inner.append(inner[place])
+        elif kind == 3 and isinstance(found, int | float):
+            inner[place] = rng.choice([-found, found * 1e30, found + 1, str(found), [found]])
+        else:
+            inner[place] = other
+    return value
+
+
+def changed_json(content: bytes) -> Change:
+    """Damage as by somebody who knows the form: other values, and now and then what is no JSON at all."""
+
+    def change(rng: random.Random, path: Path) -> None:
+        text = json.dumps(changed_value(rng, json.loads(content)))
+        if rng.random() < 0.1:
+            at = rng.randrange(len(text))
+            text = text[:at] + rng.choice(list(JSON_TEXTS.values())) + text[at + 1 :]
+        path.write_text(text)
+
+    return change
+
+
+def changed_tensors(rng: random.Random, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Tensors of which one has other numbers, another type, shape or name, or is gone."""
+    tensors = dict(tensors)
+    name = rng.choice(sorted(tensors))
+    tensor = tensors.pop(name)
+    kind = rng.randrange(7)
+    if kind == 0:
+        tensors[name] = tensor[: len(tensor) // 2] if tensor.ndim else tensor
+    elif kind == 1:
+        tensors[name] = tensor.to(
+            rng.choice([torch.float64, torch.int8, torch.uint8, torch.int64, torch.float16])
+        )
+    elif kind == 2:
+        tensors[name] = tensor.reshape(
+            rng.choice([(-1,), (1, -1), (-1, 1)]) if tensor.numel() else tensor.shape
+        )
+    elif kind == 3:
+        tensors[name] = tensor.clone()
+        tensors[name].reshape(-1)[: rng.choice([1, 5, 10**6])] = rng.choice([0, -1, 1, 100])
+    elif kind == 4 and tensor.is_floating_point():
+        filled = tensor.clone().reshape(-1)
+        filled[: rng.choice([1, 10**6])] = rng.choice([3e38, -3e38, float("nan"), float("inf"), 1e-40])
+        tensors[name] = filled.reshape(tensor.shape)
+    elif kind == 5:
+        tensors["extra"] = tensor
+    return tensors
+
+
+def changed_gdf(content: bytes) -> Change:
+    """An edit with another header or other tensors, signed as if progdf had written it."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
+    tensors = safetensors.torch.load(content)
+
+    def change(rng: random.Random, path: Path) -> None:
+        text = json.dumps(changed_value(rng, header) if rng.random() < 0.7 else header)
+        found = changed_tensors(rng, tensors) if rng.random() < 0.5 else tensors
+        found = {name: tensor.contiguous() for name, tensor in found.items()}
+        metadata = {"progdf": text, "sha256": _checksum(text, found)}
+        if rng.random() < 0.7:
+            metadata["header_sha256"] = head_checksum(text, table_of(found))
+        path.write_bytes(safetensors.torch.save(found, metadata))
+
+    return change
+
+
+def changed_parts(content: bytes, key: str) -> Change:
+    """A tensor file with another JSON text among its metadata, or other tensors, its checksum made to fit."""
+    size = int.from_bytes(content[:8], "little")
+    metadata = json.loads(content[8 : 8 + size])["__metadata__"]
+    metadata.pop("crc32", None)
+    tensors = safetensors.torch.load(content)
+
+    def change(rng: random.Random, path: Path) -> None:
+        told = metadata
+        if rng.random() < 0.6:
+            told = {**metadata, key: json.dumps(changed_value(rng, json.loads(metadata[key])))}
+        found = changed_tensors(rng, tensors) if rng.random() < 0.6 else tensors
+        write_tensors(path, found, told, checksum=rng.random() < 0.8)
+
+    return change

@@ -1,0 +1,218 @@
+"""More for `fuzz.py`: converted scenes, COLMAP models, masks, compiled kernels, folders of runs."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import random
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from progdf.formats.scene_file import load_scene
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.rasterize import jit
+from progdf.scene.region_spec import parse_region
+from tests.helpers.fuzz_changes import Change, changed_bytes, changed_json, changed_parts
+from tests.helpers.hostile import NPY_HEADERS
+from tests.helpers.hostile import npy as write_npy
+from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
+from tests.helpers.scenes import orbit_camera, random_gaussians
+from tests.helpers.trained import quick_options, write_bear
+from trainer.options import FitOptions, TrainOptions
+from trainer.pipeline.run import refit, train
+from trainer.regions.from_pictures import RegionSettings, region_kinds
+from trainer.store.state import Autosave
+
+Reader = tuple[str, Callable[[Path], Any], list[Change]]
+
+FILES_OF_RUNS = {
+    "resume run.json": "state/run.json",
+    "resume training": "state/training.safetensors",
+    "resume region": "state/region.safetensors",
+    "resume recordings": "state/recordings/000001.safetensors",
+    "fit trajectory": "trajectory.safetensors",
+    "fit cameras": "cameras.json",
+    "fit report": "report.json",
+}
+"""What is damaged in a run's folder before `progdf train --resume` or `progdf fit` is called on it."""
+
+COSTLY = ("spz", "splat", "sog", "colmap", "kernels", *FILES_OF_RUNS)
+"""A second or so for each input."""
+
+KERNEL = """
+from progdf.rasterize.jit import kernel
+
+@kernel(cache=True)
+def twice(number):
+    return 2 * number
+"""
+
+
+def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
+    """The one of these readers that is asked for, as `fuzz.inputs` has it; none, if it is another's."""
+    makers: dict[str, Callable[[Path], Reader]] = {
+        **{kind: partial(_converted, kind) for kind in ("spz", "splat", "sog", "ksplat", "compressed")},
+        "colmap": _colmap,
+        "masks": _masks,
+        "labels": partial(_numbers, "labels:{}:1"),
+        "members": partial(_numbers, "file:{}"),
+        "kernels": _kernels,
+        **{name: partial(_run, name) for name in FILES_OF_RUNS},
+    }
+    return {reader: makers[reader](folder)} if reader in makers else {}
+
+
+def _converted(kind: str, folder: Path) -> Reader:
+    scene = random_gaussians(60, seed=2, sh_degree=1 if kind in ("spz", "ksplat") else 0)
+    good = folder / f"good.{'ply' if kind == 'compressed' else kind}"
+    if kind == "compressed":
+        write_compressed_ply(good, scene)
+    elif kind == "ksplat":
+        write_ksplat(good, scene, level=1)
+    else:
+        write_scene(good, scene)
+
+    def read(path: Path) -> None:
+        found = load_scene(path)
+        for tensor in (found.means, found.log_scales, found.quats, found.logit_opacities, found.sh0):
+            assert bool(tensor.isfinite().all())
+
+    return f"x{good.suffix}", read, [changed_bytes(good.read_bytes())]
+
+
+def _colmap(folder: Path) -> Reader:
+    from tests.progdf.io.test_colmap import views, write_model
+
+    models = {text: write_model(folder / f"m{text}", views(), text=text) for text in (False, True)}
+    files = [(text, path.name) for text, model in models.items() for path in sorted(model.iterdir())]
+
+    def change(rng: random.Random, path: Path) -> None:
+        text, name = rng.choice(files)
+        changed_bytes((models[text] / name).read_bytes())(rng, path)
+        where = json.dumps([text, name]).encode()
+        path.write_bytes(len(where).to_bytes(2, "little") + where + path.read_bytes())
+
+    def read(path: Path) -> None:
+        content = path.read_bytes()
+        end = 2 + int.from_bytes(content[:2], "little")
+        text, name = json.loads(content[2:end])
+        shutil.rmtree(folder / "m", ignore_errors=True)
+        shutil.copytree(models[text], folder / "m")
+        (folder / "m" / name).write_bytes(content[end:])
+        load_cameras(folder / "m")
+
+    return "x.colmap", read, [change]
+
+
+def _masks(folder: Path) -> Reader:
+    scene, cameras = random_gaussians(60, seed=2), [orbit_camera(azimuth=i) for i in range(3)]
+    (folder / "masks").mkdir()
+    save_cameras(folder / "cameras.json", [replace(c, name=f"v{i}") for i, c in enumerate(cameras)])
+    mask = np.full((cameras[0].height, cameras[0].width), 255, np.uint8)
+    for i in range(3):
+        Image.fromarray(mask).save(folder / "masks" / f"v{i}.png")
+    settings = RegionSettings(folder / "cameras.json", 3, kept=lambda: folder / "kept", quiet=True)
+
+    def read(path: Path) -> None:
+        parse_region(f"masks:{path.parent}", scene, "a", region_kinds(settings))
+
+    return "masks/v1.png", read, [changed_bytes((folder / "masks" / "v1.png").read_bytes())]
+
+
+def _numbers(spec: str, folder: Path) -> Reader:
+    scene = random_gaussians(60, seed=2)
+    np.save(folder / "good.npy", np.arange(60) % 3 if "labels" in spec else np.arange(0, 60, 3))
+
+    def claim(rng: random.Random, path: Path) -> None:
+        write_npy(path, rng.choice(list(NPY_HEADERS.values())))
+
+    changes = [changed_bytes((folder / "good.npy").read_bytes())] * 3
+    return "x.npy", lambda path: parse_region(spec.format(path), scene, "a"), [*changes, claim]
+
+
+def _kernels(folder: Path) -> Reader:
+    """A damaged file of the cache costs a compilation; what is drawn stays right."""
+    (folder / "kernels.py").write_text(KERNEL)
+    jit.CACHE = folder / "cache"
+
+    def twice() -> Callable[[int], int]:
+        spec = importlib.util.spec_from_file_location("kernels", folder / "kernels.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        found: Callable[[int], int] = module.twice
+        return found
+
+    assert twice()(4) == 8
+    jit.record_cache(jit.CACHE)
+    good = folder / "good"
+    shutil.copytree(jit.CACHE, good)
+    files = [path.relative_to(good) for path in sorted(good.rglob("*")) if path.is_file()]
+
+    def change(rng: random.Random, path: Path) -> None:
+        shutil.rmtree(jit.CACHE)
+        shutil.copytree(good, jit.CACHE)
+        name = rng.choice(files)
+        changed_bytes((good / name).read_bytes())(rng, path)
+        shutil.copyfile(path, jit.CACHE / name)
+
+    def read(_: Path) -> None:
+        jit.drop_damaged(jit.CACHE)
+        assert twice()(4) == 8
+
+    return "x", read, [change]
+
+
+def _run(name: str, folder: Path) -> Reader:
+    """A run, stopped or finished, of which one file is changed each time."""
+    write_bear(folder, 400)
+    options = quick_options(folder, views=4, image_size=48, steps=64, stages=2, save_every=0.0)
+    resumes, file = name.startswith("resume"), FILES_OF_RUNS[name]
+    _train(options, stop_at=5 if resumes else None)
+    good = folder / "good"
+    options.out.rename(good)
+    content = (good / file).read_bytes()
+    changes: dict[str, list[Change]] = {".json": [changed_json(content)] * 3}
+    if file.endswith(".safetensors"):
+        key = "about" if file.startswith("trajectory") else "values"
+        changes[".safetensors"] = [changed_parts(content, key)] * 3
+
+    def read(path: Path) -> None:
+        shutil.rmtree(options.out, ignore_errors=True)
+        shutil.copytree(good, options.out)
+        shutil.copyfile(path, options.out / file)
+        if resumes:
+            train(replace(options, resume=True), quiet=True)
+        else:
+            refit(FitOptions(options.out, threads=1), quiet=True)
+
+    suffix = Path(file).suffix
+    return f"x{suffix}", read, [*changes[suffix], changed_bytes(content)]
+
+
+def _train(options: TrainOptions, stop_at: int | None) -> None:
+    """Train, or begin to: Ctrl-C comes after so many steps."""
+    calls, done = 0, Autosave.step_done
+
+    def step_done(self: Autosave) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == stop_at:
+            os.kill(os.getpid(), signal.SIGINT)
+        done(self)
+
+    with pytest.MonkeyPatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
+        patch.setattr(Autosave, "step_done", step_done)
+        train(options, quiet=True)

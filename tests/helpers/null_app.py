@@ -1,0 +1,45 @@
+"""The application on a window of glfw's null platform: all of it, without a screen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from viewer.app.app import App
+from viewer.camera.inputs import Keys, Press
+from viewer.files.document import Document
+from viewer.state.view_state import ViewState
+
+
+@contextmanager
+def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]:
+    """The application on `document`, after its first frame; pictures and memory go to `folder`."""
+    from viewer.ui.window import Window, glfw
+
+    glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
+    if not glfw.init():
+        pytest.skip("glfw has no null platform here")
+    glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
+    try:
+        window = Window("test", (900, 640))
+    finally:
+        glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
+    app = App(window, document, view, folder, memory=folder / "memory")
+    app.draw()
+    yield app
+    app.close()
+    window.close()
+
+
+def press(app: App, *chords: str) -> None:
+    """Keys as the window hears them."""
+    for chord in chords:
+        app.window.take_keys = lambda c=chord: Keys((Press(c),))  # type: ignore[method-assign]
+        app.stage.wake()
+        app.draw()
+        app.window.take_keys = lambda: Keys()  # type: ignore[method-assign]
+        for _ in range(3):
+            app.draw()

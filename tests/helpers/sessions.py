@@ -1,0 +1,66 @@
+"""A session of the bear on disk, and the same with something spoilt."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from progdf.compose.layers import Gains
+from tests.helpers.ui_rig import bear, first_view
+from viewer.files import document, session
+from viewer.files.session import Session
+from viewer.state import paint, snapshots
+from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
+
+
+def full_view() -> ViewState:
+    """A view in which nothing is as it is by default."""
+    view = first_view(bear(), 0.25, 0.75)
+    ears = bear().gdfs[1].region
+    painted = paint.encoded(np.linspace(0, 1, len(ears)))
+    layers = (
+        replace(view.layers[1], name="ears → gold", gains=Gains(0.5, 0.25, 0.125), solo=True, paint=painted),
+        replace(view.layers[0], enabled=False),
+    )
+    camera = replace(view.camera, azimuth=33.5, mode="fly")
+    film = Timeline((Keyframe(3, ((0, 0.5),), camera, "linear"),), length=30)
+    compare = Comparison("split", 0.3, 8.0)
+    return replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
+
+
+def bear_files(folder: Path) -> Path:
+    """The bear's scene in a folder, and its edits in another below."""
+    (folder / "edits").mkdir()
+    scene, *edits = bear().save(folder)
+    for edit in edits:
+        edit.rename(folder / "edits" / edit.name)
+    assert scene.name == "bear.ply"
+    return folder
+
+
+def opened_document(folder: Path) -> document.Document:
+    return document.load(folder / "bear.ply", [folder / "edits" / f"{g.name}.gdf" for g in bear().gdfs])
+
+
+def saved_session(folder: Path) -> Path:
+    """The session of `full_view` on the files of `bear_files`, with a snapshot."""
+    view = full_view()
+    kept = snapshots.taken((), replace(view, blend="sum"))
+    session.save(folder / "work.session.json", Session(opened_document(folder), view, kept))
+    return folder / "work.session.json"
+
+
+def spoilt(path: Path, *keys: str | int, value: Any = None) -> Path:
+    """The session with another value at a place, under another name."""
+    table = json.loads(path.read_text())
+    place = table
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = value
+    other = path.with_name("spoilt.session.json")
+    other.write_text(json.dumps(table))
+    return other

@@ -1,0 +1,119 @@
+"""A bear with two edits made by hand, for tests of the viewer: a green scarf, and golden ears that grow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from progdf.demo_scenes import DemoScene, bear
+from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.trajectory import FILE_NAME, Trajectory, save_trajectory
+from progdf.formats.ply import save_ply
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, fingerprint, save_gdf
+from progdf.region import Region
+from progdf.sh import rgb_to_sh0
+from viewer.camera.view_camera import first_camera
+from viewer.state.view_state import LayerState, ViewState
+
+NODES = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
+SCARF, EARS = 0, 1  # a change of colour, and one of geometry and colour
+GREEN, GOLD = (0.10, 0.62, 0.24), (0.90, 0.66, 0.15)
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A scene and its edits."""
+
+    demo: DemoScene
+    gdfs: tuple[Gdf, ...]
+
+    @property
+    def scene(self) -> Gaussians:
+        return self.demo.gaussians
+
+    def save(self, folder: Path) -> list[Path]:
+        """bear.ply, scarf.gdf, ears.gdf in `folder`; their paths in this order."""
+        paths = [folder / "bear.ply", *(folder / f"{gdf.name}.gdf" for gdf in self.gdfs)]
+        save_ply(paths[0], self.scene)
+        for path, gdf in zip(paths[1:], self.gdfs, strict=True):
+            save_gdf(path, gdf)
+        return paths
+
+    def save_runs(self, folder: Path) -> list[Path]:
+        """bear.ply, and each edit in a run folder of its name with what was recorded; their paths."""
+        save_ply(folder / "bear.ply", self.scene)
+        paths = [folder / "bear.ply"]
+        for gdf in self.gdfs:
+            (folder / gdf.name).mkdir()
+            paths.append(folder / gdf.name / f"{gdf.name}.gdf")
+            save_gdf(paths[-1], gdf)
+            extra = {"members": gdf.region.members, "score": gdf.region.score}
+            save_trajectory(paths[-1].with_name(FILE_NAME), recording_of(gdf), extra, {})
+        return paths
+
+
+def recording_of(gdf: Gdf) -> Trajectory:
+    """What a run that led to this edit may have recorded: on the way, more of it than the field shows."""
+    s = torch.tensor(gdf.field.recorded)
+    rows = [(1.0 + 0.5 * float(x) * (1.0 - float(x))) * gdf.field.offsets(float(x)) for x in s]
+    ends = (len(s) - 1,)
+    return Trajectory(s, torch.stack(rows).half(), rows[-1], torch.arange(len(s)), ends, (1.0,))
+
+
+def bear_stack(size: int = 4000) -> Stack:
+    """The scene is the same every time; the recorded strengths are uneven, as in a real run."""
+    demo = bear(size)
+    scene = demo.gaussians
+    scarf, ears = demo.members("scarf"), demo.members("ears")
+    centre = scene.means[ears].mean(0)
+    return Stack(
+        demo,
+        (
+            _gdf(scene, "scarf", scarf, "recolor:#1a9e3d", {"sh0": _towards(scene, scarf, GREEN)}),
+            _gdf(
+                scene,
+                "ears",
+                ears,
+                "grow",
+                {
+                    "sh0": _towards(scene, ears, GOLD),
+                    "means": 0.35 * (scene.means[ears] - centre),
+                    "log_scales": torch.full((len(ears), 3), 0.3),
+                },
+            ),
+        ),
+    )
+
+
+def _towards(scene: Gaussians, members: Tensor, rgb: tuple[float, float, float]) -> Tensor:
+    return 0.9 * (rgb_to_sh0(torch.tensor(rgb)) - scene.sh0[members])
+
+
+def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets: dict[str, Tensor]) -> Gdf:
+    """Offsets that grow evenly, but for a swing of a tenth half way."""
+    score = torch.zeros(len(scene))
+    score[members] = 1.0
+    coefficients = torch.stack([NODES, torch.sin(torch.pi * NODES).round(decimals=6)], dim=1)
+    coefficients[-1] = torch.tensor([1.0, 0.0])
+    attributes = {
+        attribute: AttributeBases(
+            full=full,
+            rest=(0.1 * full)[None].half(),
+            step=torch.ones(1, full.shape[1]),
+            coefficients=coefficients.clone(),
+        )
+        for attribute, full in offsets.items()
+    }
+    field = BakedField("separable", NODES, attributes, 14, recorded=(0.0, 0.12, 0.31, 0.5, 0.74, 1.0))
+    return Gdf(name, Region(name, members, score), field, fingerprint(scene), instruction)
+
+
+def view_of(stack: Stack, scarf: float = 0.0, ears: float = 0.0) -> ViewState:
+    """The bear's head and scarf from the front, its edits at these strengths."""
+    layers = (LayerState(SCARF, "scarf", scarf), LayerState(EARS, "ears", ears))
+    camera = replace(first_camera(stack.scene, stack.demo.cameras), pivot=(0.0, 0.75, 0.2), distance=5.5)
+    return ViewState(camera=camera, layers=layers)

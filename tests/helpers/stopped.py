@@ -1,0 +1,96 @@
+"""Training commands that are stopped in every way there is, and what they must have in common afterwards.
+
+    python -m tests.helpers.stopped SCENE_FOLDER OPTIONS MOMENT[,MOMENT…]
+
+trains with these OPTIONS, a JSON table, into the folder `run` of the current one, again and again with
+--resume, and is killed -9 each time: at a whole MOMENT just before (even) or after (odd) that many files were
+put in place, at a broken one after so many seconds. The processes are forked from one that has imported
+everything. After the last moment nothing is killed. Prints a line for each: the moment and how it ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from tests.helpers.trained import quick_options
+from trainer.options import TrainOptions
+from trainer.pipeline.run import train
+
+OUT = Path("run")
+
+
+def small_run(scene_folder: Path, **more: object) -> TrainOptions:
+    """Options of a run of a second or two into `run`, on the bear of `write_bear` in `scene_folder`."""
+    settings = {"views": 6, "image_size": 64, "steps": 24, "stages": 2, "field": "keyframes"}
+    settings |= {"perceptual_weight": 0.1, **more}  # descends view by view, in steps of a few milliseconds
+    return replace(quick_options(scene_folder, **settings), out=OUT)
+
+
+def bits(root: Path) -> dict[str, str]:
+    """Hashes of all that a run leaves; of the report, everything but times and memory."""
+    found = {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.name not in ("log.txt", "report.json")
+    }
+    report = json.loads((root / "report.json").read_text(encoding="utf-8"))
+    return found | {"report": json.dumps(_timeless(report), sort_keys=True)}
+
+
+def _timeless(report: Mapping[str, object]) -> dict[str, object]:
+    return {name: value for name, value in report.items() if not name.startswith(("time", "memory"))}
+
+
+def _killed_at_file(number: int) -> None:
+    """Let this process kill itself at its N-th `os.replace`: before it where N is even, else after it."""
+    put, calls = os.replace, 0
+
+    def counting(source: str, target: str) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == number and number % 2 == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        put(source, target)
+        if calls == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    os.replace = counting  # type: ignore[assignment]
+
+
+def killed_again_and_again(options: TrainOptions, moments: Sequence[float]) -> list[int]:
+    """How each process ended, −9 for a killed one; stops at the first that comes to its end."""
+    ended: list[int] = []
+    for number, moment in enumerate([*moments, 0.0]):
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                if moment and moment == int(moment):
+                    _killed_at_file(int(moment))
+                train(replace(options, resume=number > 0), quiet=True)
+                status = 0
+            except BaseException as error:
+                print(f"{type(error).__name__}: {error}", flush=True)
+            os._exit(status)
+        if moment != int(moment):
+            time.sleep(moment)
+            os.kill(child, signal.SIGKILL)
+        ended.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        print(moment, ended[-1], flush=True)
+        if ended[-1] >= 0:
+            break
+    return ended
+
+
+if __name__ == "__main__":
+    run = small_run(Path(sys.argv[1]), **json.loads(sys.argv[2]))
+    ends = killed_again_and_again(run, [float(moment) for moment in sys.argv[3].split(",") if moment])
+    sys.exit(ends[-1])

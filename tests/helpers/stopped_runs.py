@@ -1,0 +1,137 @@
+"""Runs that were stopped, as fixtures, and what stops them: keys, a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import trainer.pipeline.run
+from progdf.field.trajectory import load_trajectory
+from tests.helpers.paths import ROOT
+from tests.helpers.stopped import OUT, small_run
+from tests.helpers.trained import write_bear
+from trainer.optimize.retime import before_fit
+from trainer.pipeline.run import train
+from trainer.store.run_folder import RunFolder
+from trainer.store.state import Autosave
+
+NEVER = 1e6  # seconds between saves
+
+
+@pytest.fixture(scope="session")
+def bear_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small bear."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made
+
+
+@pytest.fixture(scope="session")
+def uninterrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder that all others must equal."""
+    made = tmp_path_factory.mktemp("uninterrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        train(small_run(bear_folder), quiet=True)
+    return made / OUT
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test trains into `run` of its own folder: the path stands in the files."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def interrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder that was left with Ctrl-C in its tenth step."""
+    made = tmp_path_factory.mktemp("interrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        at_step(patch, 9, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(small_run(bear_folder, save_every=NEVER), quiet=True)
+    return made / OUT
+
+
+@pytest.fixture
+def stopped(interrupted: Path, elsewhere: None) -> None:
+    """The folder `run` holds a run that was stopped at step 10."""
+    shutil.copytree(interrupted, OUT)
+
+
+def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], object]) -> None:
+    """Let something happen when the optimiser has done so many steps in this process."""
+    calls, done = 0, Autosave.step_done
+
+    def step_done(self: Autosave) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == number:
+            happens()
+        done(self)
+
+    monkeypatch.setattr(Autosave, "step_done", step_done)
+
+
+def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
+    """Go on to the trajectory, which must be the uninterrupted run's, and no further; the log."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer.run, "finished", lambda *_: None)
+        train(replace(small_run(bear_folder, **more), resume=True), quiet=True)
+    found, expected = (_recorded(root / "trajectory.safetensors") for root in (OUT, uninterrupted))
+    assert found[0].keys() == expected[0].keys()
+    assert all(torch.equal(found[0][name], tensor) for name, tensor in expected[0].items())
+    assert more or found[1] == expected[1]  # the options stand in the header
+    return (OUT / "log.txt").read_text(encoding="utf-8")
+
+
+def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and header of a trajectory, without the slider that a finished run laid over it."""
+    trajectory, extra, about = load_trajectory(path)
+    made = before_fit(trajectory, extra)
+    extra.pop("s_before_fit", None)
+    return {**extra, "s": made.s, "offsets": made.offsets, "end": made.end, "steps": made.steps}, about
+
+
+def words(bear_folder: Path, *more: str) -> list[str]:
+    """The command line of `small_run`."""
+    options = small_run(bear_folder)
+    names = ("region", "editor", "views", "image_size", "steps", "stages", "field", "threads")
+    names = (*names, "perceptual_weight")
+    pairs = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in names]
+    return ["train", str(options.scene), "--out=run", *pairs, *more]
+
+
+def saved_step() -> int:
+    """How far the saved state is."""
+    saved = RunFolder(OUT).state.load("training")
+    assert saved is not None
+    return int(saved.values["pgs"]["step"])
+
+
+def killed(bear_folder: Path, where: Path, moments: Sequence[float], **options: object) -> list[str]:
+    """`python -m tests.helpers.stopped`; its lines."""
+    arguments = [str(bear_folder), json.dumps(options), ",".join(map(str, moments))]
+    told = subprocess.run(
+        [sys.executable, "-m", "tests.helpers.stopped", *arguments],
+        cwd=where,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert told.returncode == 0, told.stdout + told.stderr
+    return told.stdout.splitlines()

@@ -1,0 +1,97 @@
+"""A small bear and its edits, for the tests of the trainer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.demo_scenes import bear
+from progdf.formats.ply import save_ply
+from progdf.gaussians import Gaussians, pack
+from progdf.region import Region, from_mask
+from trainer.editors import make_editor
+from trainer.optimize.losses import GradientL1
+from trainer.optimize.objective import LossWeights, Objective
+from trainer.optimize.pgs import PgsSettings, Stage, learning_rates
+from trainer.options import TrainOptions
+from trainer.views.choose import choose_views
+from trainer.views.crops import CropScene, crop_scene
+from trainer.views.view import View, crop, drawn, region_rig
+
+WHITE = torch.ones(3)
+
+
+@dataclass(frozen=True)
+class Small:
+    """A scene, a region of it, and views that look at the region."""
+
+    scene: Gaussians
+    region: Region
+    views: tuple[View, ...]
+
+
+@cache
+def small(part: str = "scarf", size: int = 1500, count: int = 6, image_size: int = 72) -> Small:
+    """A bear with `part` as its region, seen in `count` views of `image_size` pixels."""
+    demo = bear(size)
+    mask = torch.zeros(size, dtype=torch.bool)
+    mask[demo.members(part)] = True
+    region = from_mask(part, mask)
+    cameras = region_rig(demo.gaussians, region, count + count // 2, image_size)
+    return Small(demo.gaussians, region, choose_views(demo.gaussians, region, cameras, count, WHITE).views)
+
+
+Course = tuple[Tensor, list[CropScene], list[CropScene], list[Stage], Objective, PgsSettings]
+
+
+def course(case: Small, steps: int = 40, **more: object) -> Course:
+    """What `optimise` needs to recolour a small bear's part in two stages."""
+    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    original = pack(case.scene[case.region.members], with_shN=True)
+    crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
+    stages = [Stage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in (0.5, 1.0)]
+    settings = replace(PgsSettings(learning_rates("colour", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
+    return original, crops, crops[:2], stages, Objective(GradientL1(), LossWeights()), settings
+
+
+def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:
+    """Where the members [N] bool make up more than half of what a pixel shows. [H,W] bool"""
+    white = member.float()[:, None].expand(-1, 3).contiguous()
+    return drawn(scene, white, camera, torch.zeros(3))[..., 0] > 0.5
+
+
+def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:
+    """scene.ply and labels.npy of a small bear."""
+    demo = bear(size)
+    save_ply(folder / "scene.ply", demo.gaussians)
+    np.save(folder / "labels.npy", demo.labels.numpy())
+    return folder / "scene.ply", folder / "labels.npy"
+
+
+def quick_options(folder: Path, out: str = "run", part: str = "body", **more: object) -> TrainOptions:
+    """Options of a run that takes a few seconds on the bear of `write_bear` in `folder`."""
+    number = bear(400).label_names.index(part)
+    settings: dict[str, object] = {
+        "scene": folder / "scene.ply",
+        "out": folder / out,
+        "region": f"labels:{folder / 'labels.npy'}:{number}",
+        "editor": "recolor:#3060d0",
+        "views": 10,
+        "image_size": 72,
+        "steps": 200,
+        "stages": 4,
+        "threads": 1,
+        **more,
+    }
+    return TrainOptions(**settings)  # type: ignore[arg-type]
+
+
+def masked_psnr(image: Tensor, target: Tensor, mask: Tensor) -> float:
+    """PSNR over the pixels of a mask, dB. [H,W,3], [H,W,3], [H,W] bool"""
+    return float(-10 * torch.log10((image[mask] - target[mask]).square().mean()))

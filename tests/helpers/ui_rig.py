@@ -1,0 +1,175 @@
+"""The whole window without a window: stage and engine in a headless context, and a hand that moves in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from imgui_bundle import imgui
+from numpy.typing import NDArray
+
+from tests.helpers.stacks import Stack, bear_stack
+from viewer.app.main_view import Stage
+from viewer.camera.inputs import NO_KEYS, Keys, Press
+from viewer.camera.view_camera import first_camera
+from viewer.files.document import Document
+from viewer.gl.screen import read_rgb
+from viewer.panel import panel
+from viewer.render.engine import Engine
+from viewer.render.headless import headless_context
+from viewer.state.view_state import LayerState, ViewState
+
+STEP_S = 1.0 / 60.0
+
+
+@cache
+def bear(size: int = 1500) -> Stack:
+    return bear_stack(size)
+
+
+def first_view(stack: Stack, *strengths: float) -> ViewState:
+    """The bear from the front, its edits at these strengths; never coarse, however slow the machine is."""
+    layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
+    camera = first_camera(stack.scene, stack.demo.cameras)
+    return ViewState(camera=camera, layers=layers, background=stack.demo.background, draft="off")
+
+
+class Rig:
+    """A hand on the stage: each move, press and key is followed by one frame, as in the window."""
+
+    def __init__(self, stage: Stage, points: tuple[int, int], density: float) -> None:
+        self.stage, self.points = stage, points
+        self.pixels = (round(points[0] * density), round(points[1] * density))
+        self.screen = stage.context.simple_framebuffer(self.pixels)
+        self.io = imgui.get_io()
+        self.io.display_size = imgui.ImVec2(*points)
+        self.io.display_framebuffer_scale = imgui.ImVec2(density, density)
+        self.settle()
+
+    def frame(self, count: int = 1, keys: Keys = NO_KEYS) -> None:
+        for _ in range(count):
+            self.stage.frame(self.screen, self.pixels, STEP_S, keys)
+
+    def settle(self) -> None:
+        """What the window's loop does while the stage has no patience."""
+        while self.stage.patience() == 0.0:
+            self.frame()
+
+    def rest(self, seconds: float = 3.0) -> None:
+        """What the window's loop does for so long while nothing comes in."""
+        while seconds > 0.0 and (wait := self.stage.patience()) is not None:
+            passed = max(min(wait, seconds), STEP_S)
+            self.stage.frame(self.screen, self.pixels, passed)
+            seconds -= passed
+
+    def event(self) -> None:
+        """Something came in: the window wakes the stage and draws."""
+        self.stage.wake()
+        self.frame()
+
+    def move(self, x: float, y: float) -> None:
+        self.io.add_mouse_pos_event(x, y)
+        self.event()
+
+    def press(self, button: int = 0) -> None:
+        self.io.add_mouse_button_event(button, True)
+        self.event()
+
+    def release(self, button: int = 0) -> None:
+        self.io.add_mouse_button_event(button, False)
+        self.event()
+        self.settle()
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: int = 0) -> None:
+        self.move(*start)
+        self.press(button)
+        for share in (0.25, 0.5, 0.75, 1.0):
+            self.move(*(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+        self.release(button)
+
+    def click(self, x: float, y: float) -> None:
+        self.move(x, y)
+        self.press()
+        self.release()
+
+    def double_click(self, x: float, y: float) -> None:
+        self.move(x, y)
+        for _ in range(2):
+            self.press()
+            self.release()
+
+    def wheel(self, x: float, y: float, steps: float) -> None:
+        self.move(x, y)
+        self.io.add_mouse_wheel_event(0.0, steps)
+        self.event()
+        self.settle()
+
+    def key(self, chord: str) -> None:
+        """Press a chord of `controls.KEYS` and let go."""
+        name = chord.rpartition("+")[2]
+        self.stage.wake()
+        self.frame(keys=Keys((Press(chord),), frozenset({name})))
+        self.frame()
+        self.settle()
+
+    def modifier(self, key: imgui.Key, down: bool = True) -> None:
+        """Hold a modifier for the mouse, or let it go."""
+        self.io.add_key_event(key, down)
+        self.event()
+
+    def image(self) -> NDArray[np.uint8]:
+        """What is on screen. [H,W,3]"""
+        return read_rgb(self.screen, self.pixels)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The part of it that shows the splats."""
+        return self.image()[:, : self.pixels[0] - round(panel.WIDTH_PX * self.pixels[0] / self.points[0])]
+
+    @property
+    def strengths(self) -> list[float]:
+        return [layer.strength for layer in self.stage.work.view.layers]
+
+    def slider(self, layer: int, strength: float) -> tuple[float, float]:
+        """Where on the window (at 1×) the handle of a layer stands at a strength; the top one is the last."""
+        inset = 12 + 10 + 7  # the panel's and the card's padding, the handle's radius
+        span = panel.WIDTH_PX - 2 * inset
+        row = len(self.stage.work.view.layers) - 1 - layer
+        return self.points[0] - panel.WIDTH_PX + inset + strength * span, 136.0 + 97.0 * row
+
+
+@contextmanager
+def rig(
+    view: ViewState | None = None,
+    points: tuple[int, int] = (640, 540),
+    density: float = 1.0,
+    scale: float = 1.0,
+    stack: Stack | None = None,
+    pictures: Path = Path(),
+    draw: str = "cpu",
+    edit_pass: str = "auto",
+    gdf_paths: Sequence[Path] = (),
+) -> Iterator[Rig]:
+    """A stage on the bear.
+
+    Args:
+        view: the first state; the bear with both edits half way if None
+        points: size of the window in its own coordinates
+        density: framebuffer pixels per window coordinate, as on a Mac
+        scale: window coordinates per design pixel, as on Windows and X11
+        draw, edit_pass: what draws the splats and what edits them, as for the engine
+        gdf_paths: where the edits were opened from, one for each; none is not from files
+    """
+    stack = stack or bear()
+    context = headless_context()
+    engine = Engine(context, stack.scene, stack.gdfs, draw, edit_pass)
+    facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
+    stage = Stage(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
+    try:
+        yield Rig(stage, points, density)
+    finally:
+        stage.close()
+        engine.release()
+        context.release()

@@ -1,0 +1,166 @@
+"""`progdf check` and `progdf info`: what a person reads about a file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.__main__ import main
+from progdf.formats.load_report import counted
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import Gaussians
+from progdf.io.cameras import save_cameras
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.stats import survey
+from tests.helpers.scenes import random_gaussians
+from tests.helpers.stacks import bear_stack
+
+FAR = 1e6
+
+
+def tidy(count: int = 300) -> Gaussians:
+    """Small round Gaussians of unit quaternions, none of them odd."""
+    scene = random_gaussians(count, seed=6)
+    return replace(
+        scene,
+        quats=scene.unit_quats,
+        log_scales=torch.full((count, 3), 0.02).log(),
+        logit_opacities=torch.ones(count),
+    )
+
+
+def lines_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> list[str]:
+    assert main(list(arguments)) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    return captured.out.splitlines()
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(list(arguments)) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("progdf: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_check_says_how_many_and_that_nothing_was_repaired(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_ply(tmp_path / "scene.ply", tidy(1200))
+    lines = lines_of(capsys, "check", str(tmp_path / "scene.ply"))
+    assert lines[0] == "scene.ply: 1 200 Gaussians, SH degree 0, binary little-endian, 82.0 kB"
+    assert "repaired: nothing" in lines
+    assert not [line for line in lines if line.startswith(("ignored", "normalised", "odd"))]
+
+
+def test_check_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.ply"
+    scene = tidy()
+    scene.means[3] = FAR
+    scene.means[5] = FAR
+    scene.quats[7] = 0
+    save_ply(path, scene)
+    far, nan = (torch.tensor(value).numpy().tobytes() for value in (FAR, float("nan")))
+    path.write_bytes(path.read_bytes().replace(far, nan))
+    lines = lines_of(capsys, "check", str(path))
+    assert "repaired: 2 Gaussians made invisible: 2 with NaN, infinite or absurd position" in lines
+    assert "repaired: 1 Gaussian with a zero quaternion, taken as no rotation" in lines
+    assert "repaired: nothing" not in lines
+
+
+def test_check_points_at_odd_gaussians(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tidy()
+    scene.log_scales[0] = torch.tensor(50.0).log()
+    scene.log_scales[1:4, 0] = torch.tensor(1.0).log()
+    scene.logit_opacities[4:9] = -9.0
+    save_ply(tmp_path / "scene.ply", scene)
+    text = "\n".join(lines_of(capsys, "check", str(tmp_path / "scene.ply")))
+    assert "odd: 1 giant " in text
+    assert "odd: 3 needles" in text
+    assert "odd: 5 Gaussians too transparent" in text
+
+
+def test_the_survey_is_about_the_bulk_of_the_scene() -> None:
+    scene = tidy(2000)
+    scene.means[0] = torch.tensor([500.0, 0.0, 0.0])
+    found = survey(scene)
+    assert found.farthest == pytest.approx(500, rel=0.01)
+    assert 2.5 < found.radius < 3.5
+    assert max(abs(x) for x in found.centre) < 0.2
+    assert found.median_size == pytest.approx(0.02)
+    assert not found.surrounding
+
+
+def test_check_of_a_broken_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(path, tidy())
+    path.write_bytes(path.read_bytes()[:-10])
+    assert "cut short" in error_of(capsys, "check", str(path))
+    assert "cut short" in error_of(capsys, "info", str(path))
+
+
+def test_info_tells_files_by_content_and_not_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack = bear_stack(2000)
+    scene, scarf, _ = stack.save(tmp_path)
+    save_cameras(tmp_path / "c.json", orbit_rig(stack.scene, 3, 64, 48))
+    expected = {scene: "2 000 Gaussians", scarf: "the edit 'scarf'", tmp_path / "c.json": "3 cameras"}
+    for path, said in expected.items():
+        disguised = path.rename(tmp_path / f"{path.stem}.txt")
+        assert said in lines_of(capsys, "info", str(disguised))[0]
+
+
+def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from progdf.gdf.file import save_gdf
+
+    stack = bear_stack(2000)
+    report = {"field": {"psnr_worst": 46.91234, "psnr_mean": 50.0}, "edit": {"clip_direction": None}}
+    gdf = replace(stack.gdfs[0], options={"steps": 600, "slider": "even"}, report=report)
+    save_gdf(tmp_path / "scarf.gdf", gdf)
+    lines = lines_of(capsys, "info", str(tmp_path / "scarf.gdf"))
+    assert f"asked for: {gdf.instruction}" in lines
+    assert f"scene: 2 000 Gaussians, fingerprint {gdf.scene.means_sha256[:12]}" in lines
+    members = len(gdf.region)
+    assert any(line.startswith(f"region: scarf, {members} Gaussians") for line in lines)
+    assert any(
+        line.startswith(f"field: {gdf.field.kind}, ") and "bytes per Gaussian" in line for line in lines
+    )
+    assert any(line.endswith(", 5 nodes; bases: sh0 1 exact + 1 fitted") for line in lines)
+    assert {"option: steps 600", "option: slider even"} <= set(lines)
+    assert {"report: field.psnr_worst 46.91", "report: edit.clip_direction not measured"} <= set(lines)
+
+
+def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    assert "nothing progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.png"))
+    (tmp_path / "a.gdf").write_bytes(b"")
+    assert "not a .gdf" in error_of(capsys, "info", str(tmp_path / "a.gdf"))
+    (tmp_path / "a.ply").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    assert "git lfs pull" in error_of(capsys, "info", str(tmp_path / "a.ply"))
+    assert "is a folder" in error_of(capsys, "info", str(tmp_path))
+
+
+def test_every_real_file_is_described_or_refused_in_one_line(
+    shared_data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = sorted(shared_data.glob("*/*.ply"))
+    assert files
+    for path in files:
+        for command in ("check", "info"):
+            status = main([command, str(path)])
+            captured = capsys.readouterr()
+            if status == 0:
+                assert captured.err == ""
+                assert captured.out.startswith(f"{path.name}: {counted(len(load_ply(path)))}, ")
+            else:
+                assert status == 2
+                assert captured.out == ""
+                assert captured.err.count("\n") == 1

@@ -1,0 +1,221 @@
+"""The front door: what a person sees who types something wrong."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from progdf.__main__ import COMMANDS, main
+from progdf.formats.ply import save_ply
+from progdf.io.atomic import written_whole
+from tests.helpers.scenes import random_gaussians
+
+
+def stderr_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    status = main(list(arguments))
+    captured = capsys.readouterr()
+    assert status == 2, captured
+    assert captured.err.startswith("progdf: ")
+    assert captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+def test_without_a_command_it_lists_them_all(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in COMMANDS)
+
+
+def test_an_unknown_command_is_one_line_that_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "train" in stderr_of(capsys, "trian")
+
+
+@pytest.mark.parametrize("command", ["check", "info", "render", "export", "train", "fit", "view"])
+def test_a_missing_file_is_one_line_and_exit_2(
+    command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    missing = str(tmp_path / "nowhere.ply")
+    more = {
+        "render": ["--orbit", "0,10", "-o", str(tmp_path / "a.png")],
+        "export": ["-o", str(tmp_path / "a.ply")],
+        "train": ["--out", str(tmp_path / "run"), "--region", "all", "--editor", "recolor:#3060d0"],
+    }
+    assert "nowhere.ply" in stderr_of(capsys, command, missing, *more.get(command, []))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_says_what_to_do(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(argv: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("progdf.cli.check.main", full)
+    assert "free some space" in stderr_of(capsys, "check", "scene.ply")
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        raise SystemExit(main([command, "--help"]))
+    assert stop.value.code in (0, None)
+    assert "usage" in capsys.readouterr().out.lower()
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_an_option_that_does_not_exist_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = stderr_of(capsys, command, "--no-such-option")
+    assert f"see progdf {command} --help" in said
+
+
+@pytest.mark.parametrize("command", ["fit", "ablate"])
+@pytest.mark.parametrize("threads", ["-1", "99999"])
+def test_a_number_of_threads_that_cannot_be_is_told(
+    command: str, threads: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert "--threads is" in stderr_of(capsys, command, str(tmp_path), "--threads", threads)
+
+
+@pytest.mark.parametrize("psnr", ["nan", "inf", "0", "-3", "99.1", "1e99"])
+def test_a_refit_to_what_no_field_can_measure_is_refused(
+    psnr: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert "--target-psnr is" in stderr_of(capsys, "fit", str(tmp_path), "--target-psnr", psnr)
+    out = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "night", "--target-psnr", psnr)
+    assert "--target-psnr is" in stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *out)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("option", "number"),
+    [
+        ("--seed", "-1"),
+        ("--seed", "9" * 20),
+        ("--edit-seed", "9" * 20),
+        ("--steps", "9" * 20),
+        ("--steps", "-1"),
+    ],
+)
+def test_a_run_of_numbers_that_cannot_be_is_not_begun(
+    option: str, number: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    save_ply(tmp_path / "scene.ply", random_gaussians(20))
+    words = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "instruct:make it blue")
+    said = stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *words, option, number)
+    assert said.startswith(f"progdf: {option} is {number}; ")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "editor", ["recolor:#30", "tint:", "stripes:red", "darken:nan", "style:99", "folder:nope"]
+)
+def test_an_editor_that_cannot_be_is_told_before_a_folder_is_made(
+    editor: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    save_ply(tmp_path / "scene.ply", random_gaussians(20))
+    stderr_of(
+        capsys, "train", str(tmp_path / "scene.ply"), "--out", str(run), "--region", "all", "--editor", editor
+    )
+    assert not run.exists()
+
+
+def test_a_mistake_of_ours_is_one_line_and_a_file_with_the_details(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def wrong(argv: object) -> None:
+        raise IndexError("list index\nout of range")
+
+    monkeypatch.setattr("progdf.cli.check.main", wrong)
+    monkeypatch.setattr("progdf.__main__.state_folder", lambda: tmp_path / "progdf")
+    assert main(["check", "scene.ply"]) == 70
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert told.startswith("progdf: a mistake in progdf itself (IndexError: list index out of range); ")
+    details = (tmp_path / "progdf" / "crash.txt").read_text()
+    assert str(tmp_path / "progdf" / "crash.txt") in told
+    assert "Traceback" in details
+    assert "in wrong" in details
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError(
+            "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"
+        ),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 9 bytes."),
+    ],
+)
+def test_too_little_memory_is_one_line(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def large(argv: object) -> None:
+        raise error
+
+    monkeypatch.setattr("progdf.cli.check.main", large)
+    assert "more memory than there is; " in stderr_of(capsys, "check", "scene.ply")
+
+
+@pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
+def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
+    number: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def writing(argv: object) -> None:
+        with written_whole(tmp_path / "a.txt") as beside:
+            beside.write_text("half")
+            os.kill(os.getpid(), getattr(signal, number))
+
+    monkeypatch.setattr("progdf.cli.check.main", writing)
+    assert main(["check", "scene.ply"]) == 130
+    assert capsys.readouterr().err == "progdf: interrupted\n"
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(getattr(signal, number)) == signal.SIG_DFL
+
+
+def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("progdf.cli.check.main", lambda argv: os.kill(os.getpid(), signal.SIGHUP))
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        assert main(["check", "scene.ply"]) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(
+    "name", ["a\x1b[2J", "a\nb", "a\\b", "a/b", ".a", "n" * 252, "\N{CJK UNIFIED IDEOGRAPH-4E16}" * 90]
+)
+def test_a_name_that_cannot_be_a_file_is_told_before_a_folder_is_made(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "night", "--name", name)
+    assert "--name" in stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *out)
+    assert not list(tmp_path.iterdir())
+
+
+STREAMS = "import sys; from progdf.__main__ import main; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.parametrize(
+    ("shell", "status"),
+    [
+        ('"$0" -c "$1" --help >&-', 0),
+        ('"$0" -c "$1" --help <&- >&- 2>&-', 0),
+        ('"$0" -c "$1" check nowhere.ply 2>&-', 2),
+        ('"$0" -c "$1" --help > /dev/full', 2),
+        ('LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 "$0" -c "$1" --help', 0),
+        ('LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 "$0" -c "$1" check $(printf "\\351.ply")', 2),
+    ],
+)
+def test_streams_that_are_closed_full_or_of_few_letters_end_no_command(shell: str, status: int) -> None:
+    ran = subprocess.run(["sh", "-c", shell, sys.executable, STREAMS], capture_output=True)
+    assert ran.returncode == status, ran
+    assert b"Traceback" not in ran.stderr
+    assert ran.stderr.count(b"\n") <= 1

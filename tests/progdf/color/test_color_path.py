@@ -1,0 +1,119 @@
+"""What lies between a colour and its edit: between the ends, never grey, the same way for neighbours."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.color import edits as colour
+from progdf.color.edits import parse_color, recolor
+from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
+from progdf.color.path import ColorPath, bend_of, between
+
+PAIRS = {
+    "skin to blue": ("#e0ac88", "#3060d0"),
+    "brown to blue": ("#8b5a2b", "#3060d0"),
+    "brown to sky": ("#8b5a2b", "#62b3ea"),  # 178 degrees, and the shorter way is the one over green
+    "orange to blue": ("#ff8c1a", "#3060d0"),
+    "red to green": ("#c02020", "#20a040"),
+    "grey to red": ("#808080", "#c02020"),
+    "pale pink to deep blue": ("#f0d0bc", "#101880"),
+}
+STRENGTHS = torch.linspace(0, 1, 21)
+ORANGE, BLUE = torch.tensor([0.85, 0.45, 0.10]), torch.tensor([0.19, 0.38, 0.82])
+CHROMA_OF_GREY = 0.01
+BIT = 2 / 255  # two channels that lie closer are as good as equal
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_every_strength_lies_between_the_ends(name: str) -> None:
+    start, end = (parse_color(text) for text in PAIRS[name])
+    way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
+    lab = srgb_to_oklab(way)
+    detour = ((lab - lab[0]).norm(dim=1) + (lab - lab[-1]).norm(dim=1)) / (lab[-1] - lab[0]).norm()
+    assert float(detour.max()) <= 1.10
+    chroma = lab[:, 1:].norm(dim=1)
+    assert float(chroma.min()) >= 0.4 * min(float(chroma[0]), float(chroma[-1]))
+    strongest = {int(way[i].argmax()) for i in (0, 20) if float(chroma[i]) > CHROMA_OF_GREY}
+    assert {int(i) for i in way[1:-1].argmax(dim=1)} <= strongest
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        above = way[:, a] - way[:, b]
+        if min(float(above[0]), float(above[-1])) > BIT:
+            assert float(above.min()) > -BIT
+        if max(float(above[0]), float(above[-1])) < -BIT:
+            assert float(above.max()) < BIT
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_the_ends_are_exact_and_the_way_is_even(name: str) -> None:
+    start, end = (parse_color(text) for text in PAIRS[name])
+    way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
+    assert torch.equal(way[0], start)
+    assert torch.equal(way[-1], colour.recolored(start.expand(21, 3), end, start)[-1])
+    steps = srgb_to_oklab(way).diff(dim=0).norm(dim=1)
+    assert float(steps.max()) < 2.5 * float(steps.min())
+
+
+def test_the_hue_path_turns_along_the_circle_and_keeps_its_chroma() -> None:
+    lab = srgb_to_oklab(recolor(ORANGE.expand(21, 3), BLUE, STRENGTHS, ORANGE, path="hue"))
+    hue = torch.rad2deg(torch.atan2(lab[10, 2], lab[10, 1]))
+    assert 130 < float(hue) < 200, "over green"
+    chroma = lab[:, 1:].norm(dim=1)
+    # sRGB has no teal as rich as these two
+    assert float(chroma.min()) > 0.6 * float(torch.minimum(chroma[0], chroma[-1]))
+
+
+def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
+    """sRGB colours all around the hue circle. [count,3]"""
+    angle = torch.linspace(0, 2 * math.pi, count + 1)[:-1]
+    lab = torch.stack([torch.full_like(angle, lightness), chroma * angle.cos(), chroma * angle.sin()], dim=1)
+    return oklab_to_srgb(lab).clamp(0, 1)
+
+
+@pytest.mark.parametrize("path", ["bowed", "hue"])
+@pytest.mark.parametrize("reference", ["#d9731a", "#8b5a2b", "#d9a012", "#20a040", "#808080"])
+def test_neighbouring_hues_stay_neighbours_on_the_way(reference: str, path: ColorPath) -> None:
+    circle = hues(0.65, 0.11)
+    for s in (0.25, 0.5, 0.75):
+        way = recolor(circle, BLUE, s, parse_color(reference), path)
+        apart = (way - way.roll(1, dims=0)).abs().amax(dim=1)
+        # a degree of hue is up to .008 before the edit; where two ways part, a few times that
+        assert float(apart.max()) < (0.03 if path == "bowed" else 0.07)
+
+
+def test_a_region_on_both_sides_of_the_opposite_hue_goes_one_way() -> None:
+    lab = srgb_to_oklab(BLUE)
+    opposite = math.atan2(-float(lab[2]), -float(lab[1]))
+    angle = opposite + torch.deg2rad(torch.linspace(-15, 15, 31))
+    region = oklab_to_srgb(torch.stack([torch.full((31,), 0.65), 0.12 * angle.cos(), 0.12 * angle.sin()], 1))
+    for reference in region[[7, 23]]:
+        half = srgb_to_oklab(recolor(region, BLUE, 0.5, reference))
+        hue = torch.atan2(half[:, 2], half[:, 1])
+        assert float((hue - hue.mean()).abs().max()) < math.radians(30)
+        assert float(hue.mean().abs()) < math.radians(60), "by way of rose, as green is nobody's half"
+
+
+def test_the_greys_of_a_thing_do_not_shine_when_its_colour_turns() -> None:
+    for s in (0.2, 0.4, 0.6, 0.8):
+        warm, cool = recolor(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE)
+        assert float((warm - cool).abs().max()) < 0.06, "they were neighbours and stay so"
+
+
+@pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
+@pytest.mark.parametrize("path", ["bowed", "hue"])
+def test_hues_near_the_target_take_their_own_short_way(s: float, path: ColorPath) -> None:
+    eyes = torch.tensor([[0.10, 0.70, 0.85], [0.15, 0.60, 0.95], [0.25, 0.45, 0.95]])  # cyan to blue
+    way = recolor(eyes, BLUE, s, ORANGE, path)
+    assert bool((way[:, 2] > way[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
+    assert bool((way[:, 2] > way[:, 1]).all())
+
+
+def test_a_straight_and_a_bent_way_have_the_same_lightness() -> None:
+    start, end = parse_color("#e0ac88").expand(21, 3), BLUE.expand(21, 3)
+    lab = srgb_to_oklab(between(start, end, STRENGTHS, bend_of(start[0], BLUE)))
+    expected = torch.lerp(srgb_to_oklab(start), srgb_to_oklab(end), STRENGTHS[:, None])
+    # colours on the edge of the gamut are known to a thousandth
+    assert torch.allclose(lab[:, 0], expected[:, 0], atol=2e-3)

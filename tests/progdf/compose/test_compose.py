@@ -1,0 +1,434 @@
+"""The rules of several edits on one scene, and that dragging a slider follows them to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.compose.composer import Composer
+from progdf.compose.coverage import coverage
+from progdf.compose.reference import BLENDS, Gains, Layer, compose
+from progdf.errors import ProgdfError
+from progdf.field import fit_keyframes
+from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
+from progdf.gdf.file import Gdf
+from progdf.rasterize import set_threads
+from tests.helpers.edits import bits, curved_field, edit_of, some_rows
+from tests.helpers.scenes import random_gaussians
+
+COLOUR = ("sh0", "shN")
+
+
+def scene_with_signed_zeros(count: int = 400) -> Gaussians:
+    scene = random_gaussians(count, seed=3, sh_degree=1)
+    return replace(
+        scene, sh0=scene.sh0 * (scene.sh0.abs() > 0.4), means=scene.means.index_fill(0, torch.arange(9), -0.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Gaussians:
+    return scene_with_signed_zeros()
+
+
+@pytest.fixture(scope="module")
+def shirt(scene: Gaussians) -> Gdf:
+    return edit_of(scene, some_rows(scene, 150, 1), curved_field(150, 1), "shirt")
+
+
+@pytest.fixture(scope="module")
+def hat(scene: Gaussians) -> Gdf:
+    return edit_of(scene, some_rows(scene, 120, 2), curved_field(120, 2, moving=("sh0",)), "hat")
+
+
+def change(scene: Gaussians, edited: Gaussians) -> torch.Tensor:
+    return pack(edited, True).double() - pack(scene, True).double()
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_strength_zero_is_the_original_bit_for_bit(
+    scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str
+) -> None:
+    assert bits(compose(scene, [Layer(shirt, 0.0), Layer(hat, -0.0)], blend)) == bits(scene)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_one_layer_at_full_strength_is_the_recorded_end_exactly(
+    scene: Gaussians, shirt: Gdf, blend: str
+) -> None:
+    edited = compose(scene, [Layer(shirt, 1.0)], blend)
+    full = torch.cat([bases.full for bases in shirt.field.attributes.values()], dim=1)
+    expected = scene.replace_rows(shirt.region.members, pack(scene)[shirt.region.members] + full)
+    assert bits(edited) == bits(expected)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_rows_outside_all_members_keep_their_bytes(
+    scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str
+) -> None:
+    outside = torch.ones(len(scene), dtype=torch.bool)
+    outside[shirt.region.members] = False
+    outside[hat.region.members] = False
+    edited = compose(scene, [Layer(shirt, 0.7), Layer(hat, 0.9)], blend)
+    assert bits(edited[outside]) == bits(scene[outside])
+
+
+def test_attributes_that_no_layer_moves_are_the_scenes_own(scene: Gaussians, hat: Gdf) -> None:
+    edited = compose(scene, [Layer(hat, 0.5)])
+    assert edited.means is scene.means
+    assert edited.shN is scene.shN
+
+
+def test_rows_of_weight_zero_keep_their_bytes(scene: Gaussians, shirt: Gdf) -> None:
+    weights = torch.ones(150)
+    weights[::2] = 0.0
+    edited = compose(scene, [Layer(shirt, 0.6, weights=weights)])
+    untouched = shirt.region.members[::2]
+    assert bits(edited[untouched]) == bits(scene[untouched])
+
+
+def test_weights_scale_the_change(scene: Gaussians, shirt: Gdf) -> None:
+    whole = change(scene, compose(scene, [Layer(shirt, 0.6)]))
+    half = change(scene, compose(scene, [Layer(shirt, 0.6, weights=torch.full((150,), 0.5))]))
+    assert torch.allclose(half, whole / 2, atol=1e-6)
+
+
+def test_gains_scale_their_own_kind_of_attribute_only(scene: Gaussians, shirt: Gdf) -> None:
+    whole = change(scene, compose(scene, [Layer(shirt, 0.6)]))
+    found = change(
+        scene, compose(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, colour=2.0))])
+    )
+    slices = attribute_slices(whole.shape[1])
+    for names, gain in ((("means", "log_scales", "quats"), 0.5), (("logit_opacities",), 0.0), (COLOUR, 2.0)):
+        for name in names:
+            assert torch.allclose(found[:, slices[name]], gain * whole[:, slices[name]], atol=1e-6), name
+
+
+def test_disabled_layers_do_nothing(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    assert bits(compose(scene, [Layer(shirt, 0.8), Layer(hat, 1.0, enabled=False)])) == bits(
+        compose(scene, [Layer(shirt, 0.8)])
+    )
+
+
+@pytest.mark.parametrize("blend", ["normalised", "sum"])
+def test_the_order_of_layers_does_not_matter(scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str) -> None:
+    layers = [Layer(shirt, 0.8), Layer(hat, 0.9)]
+    a, b = (change(scene, compose(scene, order, blend)) for order in (layers, layers[::-1]))
+    assert torch.allclose(a, b, atol=1e-6)
+
+
+def test_normalised_is_the_plain_sum_while_strengths_add_up_to_one(
+    scene: Gaussians, shirt: Gdf, hat: Gdf
+) -> None:
+    layers = [Layer(shirt, 0.5), Layer(hat, 0.5)]
+    assert bits(compose(scene, layers, "normalised")) == bits(compose(scene, layers, "sum"))
+
+
+def test_normalised_shares_where_strengths_add_up_to_more(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    layers = [Layer(shirt, 1.0), Layer(hat, 0.5)]
+    both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
+    assert len(both) > 10
+    summed = change(scene, compose(scene, layers, "sum"))[both]
+    shared = change(scene, compose(scene, layers, "normalised"))[both]
+    assert torch.allclose(shared, summed / 1.5, atol=1e-6)
+
+
+def test_over_puts_what_the_last_layer_changes_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
+    hidden = both[coverage(scene, hat)["colour"][torch.searchsorted(hat.region.members, both)] == 1]
+    assert len(hidden) > 10
+    stacked = compose(scene, [Layer(shirt, 1.0), Layer(hat, 1.0)], "over")
+    alone = compose(scene, [Layer(hat, 1.0)])
+    assert torch.allclose(stacked.sh0[hidden], alone.sh0[hidden], atol=1e-6)
+
+
+def test_over_shows_the_layers_below_where_the_last_one_changes_nothing(scene: Gaussians, shirt: Gdf) -> None:
+    gold = compose(scene, [Layer(shirt, 0.8)])
+    for s in (0.3, 1.0):
+        stacked = compose(scene, [Layer(shirt, 0.8), Layer(striped(scene, shirt), s)], "over")
+        between = shirt.region.members[::2]
+        assert bits(stacked[between]) == bits(gold[between]), "between the stripes"
+        for name in ATTRIBUTES:
+            if name != "sh0":
+                assert torch.equal(getattr(stacked, name), getattr(gold, name)), "what stripes do not move"
+    stripe = shirt.region.members[1::2]
+    assert torch.allclose(stacked.sh0[stripe], scene.sh0[stripe] + 1.0, atol=1e-6)
+
+
+def striped(scene: Gaussians, below: Gdf) -> Gdf:
+    """Every other member of the edit below brighter by 1, the others as they are."""
+    changes = torch.zeros(3, len(below.region), 14)
+    changes[1:, 1::2, 11:14] = torch.tensor([0.5, 1.0])[:, None, None]
+    field = fit_keyframes(torch.tensor([0.0, 0.5, 1.0]), changes, 2)
+    return edit_of(scene, below.region.members, field, "stripes")
+
+
+@pytest.mark.parametrize("dragged", [0, 1])
+def test_over_moves_continuously_with_either_slider(scene: Gaussians, shirt: Gdf, dragged: int) -> None:
+    stripes = striped(scene, shirt)
+
+    def at(s: float) -> torch.Tensor:
+        strengths = [0.7, 0.7]
+        strengths[dragged] = s
+        layers = [Layer(gdf, own) for gdf, own in zip((shirt, stripes), strengths, strict=True)]
+        return pack(compose(scene, layers, "over"))
+
+    largest = float((at(1.0) - at(0.0)).abs().max())
+    steps = [float((at(s) - at(s - 0.01)).abs().max()) for s in (0.01, 0.02, 0.35, 0.7, 0.71, 1.0)]
+    # a bent course is up to a few times as fast as a straight one
+    assert max(steps) < 0.05 * largest
+
+
+def test_over_hides_as_much_of_a_kind_as_its_gain_lets_through(scene: Gaussians, shirt: Gdf) -> None:
+    top = striped(scene, shirt)
+    below = compose(scene, [Layer(shirt, 1.0)])
+    for gain in (0.0, 0.5):
+        stacked = compose(scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(colour=gain))], "over")
+        stripe = shirt.region.members[1::2]
+        expected = torch.lerp(below.sh0[stripe], scene.sh0[stripe] + 1.0, gain)
+        assert torch.allclose(stacked.sh0[stripe], expected, atol=1e-6)
+
+
+def test_coverage_rises_with_the_change_of_each_kind_and_ends_at_one(scene: Gaussians) -> None:
+    changes = torch.zeros(2, 40, 14)
+    changes[1, :, 0] = 0.001  # of a region some units wide: nobody sees it
+    changes[1, :, 11] = torch.linspace(0, 2, 40)
+    edit = edit_of(scene, torch.arange(40), fit_keyframes(torch.tensor([0.0, 1.0]), changes, 2))
+    covered = coverage(scene, edit)
+    assert set(covered) == {"geometry", "colour"}
+    assert float(covered["geometry"].max()) < 1e-3
+    assert float(covered["colour"][0]) == 0.0
+    assert bool((covered["colour"].diff() >= 0).all())
+    assert bool((covered["colour"][20:] == 1.0).all()), "half of the largest changes, and more"
+
+
+def test_an_overshooting_layer_alone_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:
+    assert bits(compose(scene, [Layer(shirt, 1.2)])) == bits(compose(scene, [Layer(shirt, 1.2)], "sum"))
+
+
+@pytest.mark.parametrize("strength", [float("nan"), float("inf")])
+def test_strengths_that_are_no_numbers_are_refused(scene: Gaussians, shirt: Gdf, strength: float) -> None:
+    with pytest.raises(ProgdfError, match="the strength of shirt is"):
+        compose(scene, [Layer(shirt, strength)])
+
+
+def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
+    with pytest.raises(ProgdfError, match="normalised, sum, over"):
+        compose(scene, [Layer(shirt)], "multiply")
+
+
+@pytest.mark.parametrize(
+    "weights", [torch.ones(149), torch.full((150,), 1.5), torch.full((150,), float("nan"))]
+)
+def test_weights_that_do_not_fit_are_refused(scene: Gaussians, shirt: Gdf, weights: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="weights of shirt"):
+        compose(scene, [Layer(shirt, 0.5, weights=weights)])
+
+
+def test_an_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> None:
+    with pytest.raises(ProgdfError, match="shirt was made for another scene: it has 400 Gaussians"):
+        compose(random_gaussians(30), [Layer(shirt)])
+
+
+# ---- the fast twin
+
+
+@pytest.fixture(scope="module")
+def wardrobe(scene: Gaussians, shirt: Gdf, hat: Gdf) -> list[Gdf]:
+    """Overlapping edits of every storage type: int8, one member of float32, everything in float16 with SH."""
+    channels = 14 + 9
+    single = edit_of(
+        scene, some_rows(scene, 1, 5), curved_field(1, 5, channels, rest_type=torch.float32), "pin"
+    )
+    night = curved_field(len(scene), 6, channels, ("means", "quats", "shN"), rest_type=torch.float16)
+    return [shirt, hat, single, edit_of(scene, torch.arange(len(scene)), night, "night")]
+
+
+def random_stack(rng: np.random.Generator, wardrobe: list[Gdf], order: np.ndarray) -> list[Layer]:
+    layers = []
+    for place in order:
+        gdf = wardrobe[place]
+        weights = (
+            torch.from_numpy(rng.random(len(gdf.region)).astype(np.float32)) if rng.random() < 0.4 else None
+        )
+        if weights is not None:
+            weights[torch.from_numpy(rng.random(len(weights)) < 0.3)] = 0.0
+        gains = Gains(*(float(gain) for gain in rng.choice([0.0, 1.0, 0.5], 3)))
+        strength = float(rng.choice([0.0, 1.0, 0.5, 1.2, rng.random()]))
+        layers.append(Layer(gdf, strength, bool(rng.random() < 0.9), gains, weights))
+    return layers
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_composer_gives_the_bits_of_compose_through_a_random_session(
+    scene: Gaussians, wardrobe: list[Gdf], blend: str
+) -> None:
+    rng = np.random.default_rng(BLENDS.index(blend))
+    composer = Composer(scene, wardrobe)
+    before = pack(scene, True)
+    for step in range(60):
+        if step % 5 == 0:
+            order = rng.permutation(4)[: rng.integers(0, 5)]
+        layers = random_stack(rng, wardrobe, order)
+        told = composer.update(layers, blend)
+        assert bits(composer.gaussians) == bits(compose(scene, layers, blend))
+        now = pack(composer.gaussians, True).clone()
+        moved = (now != before).any(dim=1).nonzero()[:, 0].numpy()
+        assert np.isin(moved, told.rows).all()
+        for name, columns in attribute_slices(now.shape[1]).items():
+            assert name in told.attributes or torch.equal(now[:, columns], before[:, columns])
+        farthest = float((now[:, :3].double() - before[:, :3].double()).norm(dim=1).max())
+        assert told.largest_move == pytest.approx(farthest, rel=1e-5, abs=1e-7)
+        before = now
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_edits_that_overlap_the_dragged_one_keep_their_part(
+    scene: Gaussians, wardrobe: list[Gdf], blend: str
+) -> None:
+    composer = Composer(scene, wardrobe)
+    weights = torch.linspace(0, 1, 120)
+    for strength in (0.5, 0.6, 1.0, 0.0):
+        layers = [
+            Layer(wardrobe[3], 0.3),
+            Layer(wardrobe[0], strength),
+            Layer(wardrobe[1], 0.4, weights=weights),
+            Layer(wardrobe[2], 0.8),
+        ]
+        composer.update(layers, blend)
+        assert bits(composer.gaussians) == bits(compose(scene, layers, blend))
+
+
+def test_the_composer_leaves_the_scene_alone(scene: Gaussians, shirt: Gdf) -> None:
+    before = bits(scene)
+    Composer(scene, [shirt]).update([Layer(shirt, 0.5)])
+    assert bits(scene) == before
+
+
+def test_a_slider_changes_the_rows_of_its_own_edit_only(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    composer = Composer(scene, [shirt, hat])
+    composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)])
+    told = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalised")
+    assert np.array_equal(told.rows, hat.region.members.numpy())
+
+
+def test_nothing_is_reported_where_nothing_changed(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    composer.update([Layer(shirt, 0.5)])
+    told = composer.update([Layer(shirt, 0.5)])
+    assert (len(told.rows), told.attributes, told.largest_move) == (0, (), 0.0)
+
+
+def test_a_colour_gain_does_not_ask_for_a_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    composer.update([Layer(shirt, 0.5)])
+    told = composer.update([Layer(shirt, 0.5, gains=Gains(colour=0.3))])
+    assert told.attributes == ("sh0",)
+    assert not told.means_moved
+    assert not told.covariance_moved
+
+
+def test_an_edit_of_colours_alone_does_not_ask_for_a_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
+    told = Composer(scene, [hat]).update([Layer(hat, 0.5)])
+    assert told.attributes == ("sh0",)
+    assert told.largest_move == 0.0
+
+
+@pytest.mark.parametrize("count", [255, 256, 257, 700])
+def test_blocks_of_any_length_give_the_bits_of_compose(count: int) -> None:
+    scene = random_gaussians(900, seed=count)
+    edits = [
+        edit_of(scene, some_rows(scene, count, 1), curved_field(count, 1), "first"),
+        edit_of(scene, torch.arange(count), curved_field(count, 2, rank=3), "second"),
+    ]
+    composer = Composer(scene, edits)
+    for layers in ([Layer(edits[0], 0.3)], [Layer(edits[0], 0.3), Layer(edits[1], 0.4)]):
+        composer.update(layers)
+        assert bits(composer.gaussians) == bits(compose(scene, layers))
+
+
+def test_rows_that_begin_within_a_block_give_the_bits_of_compose() -> None:
+    scene = random_gaussians(800, seed=8)
+    low, high = (
+        edit_of(scene, rows, curved_field(len(rows), 3)) for rows in torch.arange(700).split(300)[:2]
+    )
+    composer = Composer(scene, [low, high])
+    composer.update([Layer(low, 0.3)])
+    layers = [Layer(low, 0.3), Layer(high, 0.4)]
+    composer.update(layers)  # rewrites rows 300 to 599 alone
+    assert bits(composer.gaussians) == bits(compose(scene, layers))
+
+
+def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt: Gdf) -> None:
+    still = {
+        name: replace(bases, coefficients=bases.coefficients.index_fill(0, torch.tensor([4]), 0.0))
+        for name, bases in shirt.field.attributes.items()
+    }
+    edit = edit_of(scene, shirt.region.members, replace(shirt.field, attributes=still))
+    layers = [Layer(edit, 0.5)]
+    composer = Composer(scene, [edit])
+    composer.update(layers)
+    assert bits(composer.gaussians) == bits(compose(scene, layers))
+
+
+def test_weights_outside_their_range_are_refused_while_painting(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    weights = torch.ones(150)
+    composer.update([Layer(shirt, 0.5, weights=weights)])
+    weights[3] = 1.5
+    with pytest.raises(ValueError, match="weights of shirt has a number outside"):
+        composer.update([Layer(shirt, 0.5, weights=weights)])
+
+
+def test_weights_painted_in_place_are_seen(scene: Gaussians, shirt: Gdf) -> None:
+    composer = Composer(scene, [shirt])
+    weights = torch.ones(150)
+    composer.update([Layer(shirt, 0.5, weights=weights)])
+    weights[:75] = 0.25
+    composer.update([Layer(shirt, 0.5, weights=weights)])
+    assert bits(composer.gaussians) == bits(compose(scene, [Layer(shirt, 0.5, weights=weights)]))
+
+
+def test_one_thread_and_two_give_the_same_bits() -> None:
+    scene = random_gaussians(40_000, seed=9)
+    edit = edit_of(scene, torch.arange(40_000), curved_field(40_000, 9, moving=("means", "sh0"), rank=1))
+    found = []
+    try:
+        for count in (1, 2):
+            set_threads(count)
+            composer = Composer(scene, [edit])
+            composer.update([Layer(edit, 0.37)])
+            found.append(bits(composer.gaussians))
+    finally:
+        set_threads(None)
+    assert found[0] == found[1]
+
+
+def test_numbers_that_are_not_finite_stay_in_their_row(shirt: Gdf, scene: Gaussians) -> None:
+    spoiled = replace(scene, sh0=scene.sh0.index_fill(0, shirt.region.members[:1], float("nan")))
+    composer = Composer(spoiled, [shirt])
+    composer.update([Layer(shirt, 0.5)])
+    assert composer.gaussians.sh0.isnan().any(dim=1).sum() == 1
+
+
+def test_an_edit_without_any_change_is_an_edit(scene: Gaussians) -> None:
+    still = edit_of(scene, some_rows(scene, 7), curved_field(7, moving=()))
+    composer = Composer(scene, [still])
+    composer.update([Layer(still, 0.5)])
+    assert bits(composer.gaussians) == bits(compose(scene, [Layer(still, 0.5)])) == bits(scene)
+
+
+def test_a_stranger_is_refused_by_the_composer(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    with pytest.raises(ValueError, match="hat is not one of the composer's edits"):
+        Composer(scene, [shirt]).update([Layer(hat, 0.5)])
+
+
+def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
+    everything = curved_field(len(scene), 1, 14 + 9)
+    edit = edit_of(scene, torch.arange(len(scene)), everything)
+    mute = compose(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0))])
+    assert set(everything.attributes) == set(ATTRIBUTES)
+    assert bits(mute) == bits(scene)

@@ -1,0 +1,348 @@
+"""Fields: exact ends, errors that fall with rank, and a choice that needs few bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from progdf.field import AttributeBases, BakedField, FieldJudge, choose_field, fit_keyframes, fit_separable
+from progdf.field.choose import separable_within
+from progdf.field.rendered import rendered_courses
+from progdf.field.separable import channel_weights, stored_bases
+from progdf.gaussians import ATTRIBUTES, attribute_slices
+from tests.helpers.edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
+
+EVERYTHING = dict.fromkeys(ATTRIBUTES, 2)
+REST_TYPES = [torch.int8, torch.float16, torch.float32]
+
+
+# ---- both kinds
+
+
+@pytest.mark.parametrize("rest_type", REST_TYPES)
+def test_the_ends_of_a_separable_field_are_exact(rest_type: torch.dtype) -> None:
+    strengths, offsets = curved_trajectory(50, channels=14 + 24)
+    field = fit_separable(strengths, offsets, EVERYTHING, rest_type=rest_type)
+    assert not bool(field.offsets(0.0).any())
+    assert torch.equal(field.offsets(1.0), offsets[-1])
+
+
+@pytest.mark.parametrize("rest_type", REST_TYPES)
+@pytest.mark.parametrize("count", [2, 3, 4, 9, 40])
+def test_the_ends_of_a_keyframe_field_are_exact(rest_type: torch.dtype, count: int) -> None:
+    strengths, offsets = curved_trajectory(50)
+    field = fit_keyframes(strengths, offsets, count, rest_type=rest_type)
+    assert not bool(field.offsets(0.0).any())
+    assert torch.equal(field.offsets(1.0), offsets[-1])
+
+
+@pytest.mark.parametrize("kind", ["separable", "keyframes"])
+def test_attributes_that_never_move_are_absent(kind: str) -> None:
+    strengths, offsets = curved_trajectory(50, channels=14 + 9, moving=("sh0",))
+    made = (
+        fit_separable(strengths, offsets, EVERYTHING)
+        if kind == "separable"
+        else fit_keyframes(strengths, offsets, 4)
+    )
+    assert list(made.attributes) == ["sh0"]
+    assert made.bytes_per_member == 3 * (4 + 2) if kind == "separable" else 3 * 4 * 3
+
+
+@pytest.mark.parametrize("members", [0, 1, 2])
+def test_hardly_any_members_are_enough(members: int) -> None:
+    strengths, offsets = curved_trajectory(members)
+    for field in (fit_separable(strengths, offsets, EVERYTHING), fit_keyframes(strengths, offsets, 3)):
+        assert torch.equal(field.offsets(1.0), offsets[-1])
+
+
+def test_two_snapshots_are_a_straight_way() -> None:
+    strengths, offsets = curved_trajectory(20, snapshots=2)
+    field = fit_separable(strengths, offsets, EVERYTHING)
+    assert torch.allclose(field.offsets(0.25), 0.25 * offsets[-1])
+
+
+def test_an_edit_that_returns_to_its_start_is_followed() -> None:
+    strengths, offsets = curved_trajectory(40)
+    offsets[-1] = 0.0
+    field = fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, 7))
+    assert not bool(field.offsets(1.0).any())
+    assert float((at_snapshots(field, strengths) - offsets).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("strengths", "offsets", "message"),
+    [
+        (torch.tensor([0.0, 0.5]), torch.zeros(2, 3, 14), "run from 0 to 1"),
+        (torch.tensor([0.0, 0.6, 0.5, 1.0]), torch.zeros(4, 3, 14), "must ascend"),
+        (torch.tensor([0.0, 1.0]), torch.ones(2, 3, 14), "must be 0"),
+        (torch.tensor([0.0, 1.0]), torch.zeros(3, 3, 14), r"expected .T,M,C."),
+        (
+            torch.tensor([0.0, 1.0]),
+            torch.tensor([0.0, float("nan")])[:, None, None].expand(2, 3, 14),
+            "not finite",
+        ),
+    ],
+)
+def test_what_is_no_trajectory_is_refused(strengths: Tensor, offsets: Tensor, message: str) -> None:
+    for fit in (lambda: fit_separable(strengths, offsets, {}), lambda: fit_keyframes(strengths, offsets, 3)):
+        with pytest.raises(ValueError, match=message):
+            fit()
+
+
+# ---- separable
+
+
+def test_a_trajectory_of_two_bends_is_exact_with_two_bases() -> None:
+    strengths, offsets = curved_trajectory(80)
+    field = fit_separable(strengths, offsets, EVERYTHING, rest_type=torch.float32)
+    assert torch.allclose(at_snapshots(field, strengths), offsets, atol=1e-5)
+
+
+def test_int8_bases_stay_within_half_a_step_each() -> None:
+    exact = torch.randn(3, 100, 4, generator=torch.Generator().manual_seed(0))
+    rest, step = stored_bases(exact, torch.int8)
+    assert rest.dtype == torch.int8
+    assert bool(((rest.float() * step[:, None] - exact).abs() <= 0.5001 * step[:, None]).all())
+
+
+def test_error_falls_with_rank() -> None:
+    rng = torch.Generator().manual_seed(4)
+    strengths = torch.linspace(0, 1, 17)
+    offsets = torch.randn(17, 60, 14, generator=rng).cumsum(dim=0)
+    offsets -= offsets[:1].clone()
+    errors = []
+    for rank in (0, 1, 2, 4, 8, 15):
+        field = fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank))
+        errors.append(float((at_snapshots(field, strengths) - offsets).square().mean()))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1e-3 * errors[0]
+
+
+def test_between_snapshots_the_course_is_straight() -> None:
+    field = curved_field(30)
+    low, high = float(field.nodes[3]), float(field.nodes[4])
+    middle = field.offsets(0.25 * low + 0.75 * high)
+    assert torch.allclose(middle, 0.25 * field.offsets(low) + 0.75 * field.offsets(high), atol=1e-5)
+
+
+def test_beyond_the_end_the_last_stretch_goes_on() -> None:
+    field = curved_field(30)
+    last = field.offsets(1.0) - field.offsets(float(field.nodes[-2]))
+    assert torch.allclose(field.offsets(1.125), field.offsets(1.0) + last, atol=1e-4)
+
+
+def test_weights_turn_the_bases_to_what_shows() -> None:
+    strengths, offsets = curved_trajectory(60, seed=1)
+    offsets[:, 30:] += 3 * curved_trajectory(30, seed=2)[1][:, :, :]
+    weights = torch.ones(60)
+    weights[30:] = 1e-6
+    ranks = dict.fromkeys(ATTRIBUTES, 1)
+
+    def error(field: BakedField) -> float:
+        return float((at_snapshots(field, strengths) - offsets)[:, :30].square().sum())
+
+    assert error(fit_separable(strengths, offsets, ranks, weights)) < error(
+        fit_separable(strengths, offsets, ranks)
+    )
+
+
+def test_a_fit_is_the_same_every_time() -> None:
+    a, b = curved_field(40, seed=7), curved_field(40, seed=7)
+    for name, bases in a.attributes.items():
+        assert all(torch.equal(part, getattr(b.attributes[name], key)) for key, part in vars(bases).items())
+
+
+# ---- baked fields
+
+
+def test_bases_that_do_not_fit_each_other_are_refused() -> None:
+    bases = curved_field(5).attributes["means"]
+    for broken in (
+        {"full": bases.full[:4]},
+        {"step": bases.step[:1]},
+        {"coefficients": bases.coefficients[:, :1]},
+        {"coefficients": bases.coefficients + 0.1},
+        {"full": bases.full.double()},
+        {"rest": bases.rest.int()},
+    ):
+        with pytest.raises(ValueError, match=r"expected|fit|coefficients"):
+            replace(bases, **broken)
+
+
+def test_nodes_must_run_upwards_from_zero_to_one() -> None:
+    field = curved_field(5)
+    for nodes in (field.nodes * 2, field.nodes.flip(0), field.nodes.double(), field.nodes[:1]):
+        with pytest.raises(ValueError, match="nodes"):
+            replace(field, nodes=nodes)
+
+
+def test_attributes_must_have_the_same_members() -> None:
+    field, other = curved_field(5), curved_field(6)
+    with pytest.raises(ValueError, match="different numbers of members"):
+        replace(field, attributes={**field.attributes, "sh0": other.attributes["sh0"]})
+
+
+# ---- the choice
+
+
+def test_the_choice_meets_its_target_with_fewer_bytes_than_keyframes_need() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    render = linear_pictures(60, 14)
+    chosen = choose_field(strengths, offsets, render, target=45.0)
+    keyframes = choose_field(strengths, offsets, render, kind="keyframes", target=45.0)
+    assert chosen.met
+    assert chosen.best.worst >= 45.0
+    assert chosen.best.field.bytes_per_member < keyframes.best.field.bytes_per_member
+    assert torch.equal(chosen.best.field.offsets(1.0), offsets[-1])
+
+
+def test_the_choice_spends_no_byte_on_what_no_picture_shows() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    field = choose_field(
+        strengths, offsets, linear_pictures(60, 14), kind="separable", target=50.0
+    ).best.field
+    assert field.attributes["quats"].rest.shape[0] == 0
+    assert field.attributes["sh0"].rest.shape[0] > 0
+
+
+def test_a_straight_trajectory_needs_two_keyframes_only() -> None:
+    strengths, offsets = curved_trajectory(20)
+    straight = strengths[:, None, None] * offsets[-1]
+    chosen = choose_field(strengths, straight, linear_pictures(20, 14))
+    assert chosen.best.field.bytes_per_member == 56
+    assert chosen.best.worst > 90
+
+
+def test_a_target_out_of_reach_is_said_and_the_best_is_kept() -> None:
+    rng = torch.Generator().manual_seed(4)
+    offsets = torch.randn(33, 40, 14, generator=rng)
+    offsets[0] = 0
+    chosen = choose_field(
+        torch.linspace(0, 1, 33), offsets, linear_pictures(40, 14), target=80.0, budget=80.0
+    )
+    assert not chosen.met
+    assert chosen.best.worst == max(c.worst for c in chosen.tried if c.field.bytes_per_member <= 80)
+    assert chosen.best.field.bytes_per_member <= 80
+
+
+def test_a_budget_alone_gets_the_best_field_within_it_and_says_so() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    render = linear_pictures(60, 14)
+    chosen = choose_field(strengths, offsets, render, target=torch.inf, budget=70.0)
+    assert chosen.met
+    assert chosen.best.field.bytes_per_member <= 70
+    assert chosen.best.worst == max(c.worst for c in chosen.tried if c.field.bytes_per_member <= 70)
+    assert chosen.why == f"the best of {len(chosen.tried)} fields within 70 bytes"
+    more = choose_field(strengths, offsets, render, target=torch.inf, budget=90.0)
+    assert more.best.worst > chosen.best.worst
+
+
+def test_a_budget_that_nothing_fits_into_gets_the_smallest_and_says_so() -> None:
+    strengths, offsets = curved_trajectory(60)
+    chosen = choose_field(strengths, offsets, linear_pictures(60, 14), target=torch.inf, budget=20.0)
+    assert not chosen.met
+    assert chosen.best.field.bytes_per_member == 56
+    assert "none fits into 20 bytes" in chosen.why
+
+
+def test_the_choice_says_that_its_field_is_the_smallest_that_serves() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    chosen = choose_field(strengths, offsets, linear_pictures(60, 14), target=45.0)
+    assert chosen.why == f"the smallest of {len(chosen.tried)} fields that reaches 45 dB"
+    assert {c.field.kind for c in chosen.tried} == {"separable", "keyframes"}
+
+
+def test_a_lossless_field_can_be_asked_for_whatever_it_takes() -> None:
+    strengths, offsets = curved_trajectory(20)
+    chosen = choose_field(strengths, offsets, linear_pictures(20, 14), kind="lossless", target=45.0)
+    assert chosen.met
+    assert chosen.best.worst > 90
+    assert torch.equal(at_snapshots(chosen.best.field, strengths), offsets)
+
+
+def test_an_edit_that_moves_nothing_is_a_choice_too() -> None:
+    chosen = choose_field(torch.linspace(0, 1, 5), torch.zeros(5, 9, 14), linear_pictures(9, 14))
+    assert chosen.met
+    assert chosen.best.field.bytes_per_member == 0
+
+
+def test_an_edit_that_no_view_shows_gets_the_fewest_bytes() -> None:
+    strengths, offsets = curved_trajectory(20)
+    chosen = choose_field(strengths, offsets, lambda moved: torch.zeros(0, 3))
+    assert chosen.met
+    assert chosen.best.field.bytes_per_member == 56
+
+
+def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> None:
+    strengths, offsets = curved_trajectory(40, snapshots=17)
+    render = linear_pictures(40, 14)
+    seen = rendered_courses(offsets, channel_weights(None, 40, 14), render)
+    expected = seen.mse(seen.modes(torch.ones(17, dtype=torch.float64)), {})
+    field = fit_separable(strengths, offsets, {})
+    found = [
+        float((render(field.offsets(float(s))) - render(o)).square().mean())
+        for s, o in zip(strengths, offsets, strict=True)
+    ]
+    assert torch.allclose(expected, torch.tensor(found, dtype=torch.float64), rtol=1e-3, atol=1e-12)
+
+
+def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
+    _, offsets = curved_trajectory(40, snapshots=17)
+    render = linear_pictures(40, 14)
+    seen = rendered_courses(offsets, channel_weights(None, 40, 14), render)
+    modes = seen.modes(torch.ones(17, dtype=torch.float64))
+    left = torch.zeros_like(offsets)
+    for name, columns in attribute_slices(14).items():
+        mix, table = (part[:, :1].float() for part in modes[name])
+        residual = seen.courses[name].residual.flatten(1)
+        left[:, :, columns] = (residual - table @ (mix.T @ residual)).reshape(left[:, :, columns].shape)
+    found = torch.stack([render(o).double().square().mean() for o in left])
+    expected = seen.mse(modes, dict.fromkeys(ATTRIBUTES, 1))
+    assert torch.allclose(expected, found, rtol=1e-2, atol=1e-9)
+
+
+def test_bytes_go_first_to_what_shows_most() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    render = linear_pictures(60, 14)
+    judge = FieldJudge(strengths, offsets, render)
+    seen = rendered_courses(offsets, channel_weights(None, 60, 14), render)
+    best = separable_within(seen, strengths, 62, judge)
+    assert best.field.bytes_per_member <= 62
+    for ranks in ({"means": 2}, {"means": 1, "log_scales": 1}, {"quats": 1, "logit_opacities": 2}):
+        other = fit_separable(strengths, offsets, ranks)
+        assert best.worst > judge.candidate(other, "").worst
+
+
+def test_the_judge_finds_no_error_in_all_snapshots() -> None:
+    strengths, offsets = curved_trajectory(20)
+    judge = FieldJudge(strengths, offsets, linear_pictures(20, 14))
+    assert min(judge.curve(fit_keyframes(strengths, offsets, 9))) > 90
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    members=st.integers(0, 20),
+    snapshots=st.integers(2, 8),
+    rank=st.integers(0, 9),
+    scale=st.sampled_from([1e-20, 1e-6, 1.0, 1e6]),
+    seed=st.integers(0, 99),
+)
+def test_any_trajectory_gives_a_finite_field_with_exact_ends(
+    members: int, snapshots: int, rank: int, scale: float, seed: int
+) -> None:
+    rng = torch.Generator().manual_seed(seed)
+    strengths = torch.rand(snapshots, generator=rng).cumsum(0) + torch.arange(snapshots)
+    strengths = (strengths - strengths[0]) / (strengths[-1] - strengths[0])
+    strengths[-1] = 1.0
+    offsets = scale * torch.randn(snapshots, members, 14, generator=rng)
+    offsets[:, :, attribute_slices(14)["quats"]] = 0.0
+    offsets[0] = 0.0
+    field = fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank))
+    assert torch.equal(field.offsets(1.0), offsets[-1] if members else field.offsets(1.0))
+    assert bool(at_snapshots(field, strengths).isfinite().all())
+    assert isinstance(next(iter(field.attributes.values()), None), AttributeBases | None)

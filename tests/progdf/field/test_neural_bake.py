@@ -1,0 +1,93 @@
+"""A network baked to run: exact ends, an error that is told, what it misses spread over the way."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.field import baked_neural
+from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
+from progdf.field.evaluate import FieldJudge, sample_strengths
+from tests.helpers.edits import curved_trajectory
+from tests.helpers.networks import FORMS, MEMBERS, baked, network, rows
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_ends_of_a_baked_network_are_exact(form: str) -> None:
+    _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
+    assert not bool(baked(form).offsets(0.0).any())
+    assert torch.equal(baked(form).offsets(1.0), offsets[-1])
+
+
+@pytest.mark.parametrize("form", ["own", "own, hard bins"])
+def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
+    field, bound = baked(form), network(form).bound(rows())
+    strengths = sample_strengths()
+    wrong = sum(float((field.offsets(float(s)) - bound.offsets(float(s))).square().sum()) for s in strengths)
+    whole = sum(float(bound.offsets(float(s)).square().sum()) for s in strengths)
+    assert field.origin is not None
+    assert field.origin.error is not None
+    assert field.origin.error["rms"] == pytest.approx((wrong / whole) ** 0.5, rel=1e-3)
+    assert field.origin.error["rms"] < 0.02
+
+
+def test_what_a_network_misses_of_the_end_is_spread_over_the_way() -> None:
+    form = network("position")
+    _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
+    missing = float((form.bound(rows()).offsets(1.0) - offsets[-1]).norm())
+    field = baked("position")
+    last = float((field.offsets(1.0) - field.offsets(0.99)).norm())
+    assert last < 0.2 * missing
+
+
+def test_the_pull_follows_the_recorded_errors_where_they_are_known() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
+    judge = FieldJudge(strengths, offsets, lambda moved: moved[:, 11:14])
+    follows = FieldJudge.curve
+    known = baked_neural(network("position"), rows(), lambda s: _at(strengths, offsets, s))
+    assert sum(follows(judge, known)) >= sum(follows(judge, baked("position"))) - 1e-6
+
+
+def _at(strengths: Tensor, offsets: Tensor, s: float) -> Tensor:
+    place = s * (len(strengths) - 1)
+    left = min(int(place), len(strengths) - 2)
+    return torch.lerp(offsets[left], offsets[left + 1], place - left)
+
+
+def test_hard_bins_are_baked_as_steps() -> None:
+    field = baked("position, hard bins")
+    nodes = bake_nodes(10, hard=True)
+    assert bool((nodes[1:] > nodes[:-1]).all())
+    assert torch.allclose(field.offsets(0.41), field.offsets(0.49), atol=1e-6)
+    jump = float((field.offsets(0.4001) - field.offsets(0.3999)).abs().max())
+    assert jump > 10 * float((field.offsets(0.3999) - field.offsets(0.31)).abs().max())
+
+
+def test_a_form_refuses_other_numbers_of_members() -> None:
+    form = baked().origin
+    assert isinstance(form, NeuralForm)
+    with pytest.raises(ValueError, match="expected 40"):
+        form.baked(rows()[:39])
+
+
+def test_a_looser_bake_has_fewer_bases() -> None:
+    tight, loose = (baked_neural(network(), rows(), tolerance=given).origin for given in (1e-3, 0.3))
+    assert tight is not None
+    assert loose is not None
+    assert sum(loose.plan.ranks.values()) < sum(tight.plan.ranks.values())
+
+
+def test_the_error_of_a_bake_is_not_that_of_the_network_at_the_end() -> None:
+    form = baked("position").origin  # which misses the end by much, as all members see is their place
+    assert form is not None
+    assert form.error is not None
+    assert form.error["rms"] < 0.02
+
+
+@pytest.mark.parametrize("count", [1, 258])
+def test_a_plan_of_too_few_or_too_many_nodes_is_refused(count: int) -> None:
+    with pytest.raises(ValueError, match="expected 2 to 257"):
+        BakePlan(torch.linspace(0, 1, count), {}, {})

@@ -1,0 +1,144 @@
+"""Training a neural field: the same every time, nearer with every step, and to be interrupted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.field import NeuralSettings, baked_neural, fit_neural
+from progdf.field.neural_fit import NeuralFit, rendered_importance, trained
+from tests.helpers.edits import curved_trajectory
+from tests.helpers.networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_the_same_seed_gives_the_same_network_and_another_seed_another() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS)
+    found = [fit_neural(strengths, offsets, rows(), replace(SHORT, seed=seed)) for seed in (0, 0, 1)]
+    same = [
+        torch.equal(found[0].tensors[name], other.tensors[name])
+        for other in found[1:]
+        for name in ("control",)
+    ]
+    assert same == [True, False]
+    assert all(torch.equal(tensor, found[1].tensors[name]) for name, tensor in found[0].tensors.items())
+    assert torch.equal(found[0].codes, found[1].codes)
+
+
+def test_training_brings_the_network_to_the_trajectory() -> None:
+    strengths, offsets = smooth_trajectory(scene().means[members()])
+    errors = []
+    for steps in (1, 300):
+        given = NeuralSettings(inputs="position", steps=steps, batch=128)
+        field = fit_neural(strengths, offsets, rows(), given).bound(rows())
+        middle = field.offsets(float(strengths[4])) - offsets[4]
+        errors.append(float(middle.square().mean() / offsets[4].square().mean()))
+    assert errors[1] < 0.02 < 0.5 < errors[0]  # .0005 when written
+
+
+def test_a_code_tells_what_no_place_can() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+    same_place = rows().clone()
+    same_place[:] = same_place[0]
+    errors = []
+    for code in (0, 4):
+        given = NeuralSettings(inputs="position", steps=400, batch=128, code=code)
+        field = fit_neural(strengths, offsets, same_place, given).bound(same_place)
+        errors.append(float((field.offsets(0.5) - offsets[4]).square().sum() / offsets[4].square().sum()))
+    assert errors[1] < 0.2 * errors[0]
+
+
+def test_visible_members_are_fitted_first() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+    same_place = rows()[:1].expand(MEMBERS, -1).clone()
+    visibility = torch.full((MEMBERS,), 1e-6)
+    visibility[7] = 1.0
+    given = NeuralSettings(inputs="position", steps=200, batch=128)
+    field = fit_neural(strengths, offsets, same_place, given, visibility).bound(same_place)
+    wrong = (field.offsets(0.5) - offsets[4]).square().sum(dim=1)
+    assert int(wrong.argmin()) == 7
+
+
+def test_importance_is_what_pictures_show() -> None:
+    _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
+    found = rendered_importance(offsets, lambda moved: moved[:, 11:14])
+    assert found["sh0"] > 0.999
+    assert sum(found.values()) == pytest.approx(1.0)
+
+
+def test_the_loss_of_pictures_is_paid_in_the_last_steps() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+    seen: list[tuple[int, ...]] = []
+
+    def pictures(found: Tensor, recorded: Tensor) -> Tensor:
+        seen.append((*found.shape, *recorded.shape))
+        return (found - recorded).abs().mean()
+
+    fit_neural(strengths, offsets, rows(), replace(SHORT, picture_share=0.1), pictures=pictures)
+    assert seen == [(MEMBERS, 14, MEMBERS, 14)] * 4
+
+
+def test_what_moves_nothing_cannot_be_learned() -> None:
+    with pytest.raises(ValueError, match="nothing moves"):
+        fit_neural(torch.linspace(0, 1, 3), torch.zeros(3, MEMBERS, 14), rows(), SHORT)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_hardly_any_members_are_enough(count: int) -> None:
+    strengths, offsets = curved_trajectory(max(count, 1))
+    field = fit_neural(strengths, offsets[:, :1], rows()[:1], SHORT)
+    assert torch.equal(baked_neural(field, rows()[:1]).offsets(1.0), offsets[-1])
+    empty = NeuralFit(rows()[:0], 14, ("sh0",), SHORT)
+    assert empty.step(strengths, offsets[:, :0]) == 0.0
+
+
+def test_a_fit_goes_on_to_the_same_bits_after_it_was_saved() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+
+    def new() -> NeuralFit:
+        return NeuralFit(rows(), 14, ("sh0",), SHORT)
+
+    whole, first, second = new(), new(), new()
+    for fit in (whole, first):
+        fit.scale_to(offsets)
+    for _ in range(6):
+        whole.step(strengths, offsets)
+    for _ in range(3):
+        first.step(strengths, offsets)
+    kept = {name: tensor.clone() for name, tensor in first.saved().items()}
+    first.step(strengths, offsets)  # what was saved does not change with it
+    second.restore(kept)
+    for _ in range(3):
+        second.step(strengths, offsets)
+    assert whole.saved().keys() == second.saved().keys()
+    assert all(torch.equal(tensor, second.saved()[name]) for name, tensor in whole.saved().items())
+
+
+def test_a_trajectory_that_grows_does_not_change_what_the_network_answers() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+    fit = NeuralFit(rows(), 14, ("sh0",), replace(SHORT, inputs="position"))
+    fit.scale_to(0.1 * offsets)
+    trained(fit, strengths, 0.1 * offsets, 20)
+    before = fit.field().bound(rows()).offsets(0.5)
+    fit.scale_to(offsets)
+    after = fit.field().bound(rows()).offsets(0.5)
+    assert torch.allclose(before, after, atol=2e-3 * float(before.abs().max()))  # half precision
+
+
+def test_a_fit_takes_over_the_outputs_that_still_move() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
+    given = replace(SHORT, inputs="position")
+    first = NeuralFit(rows(), 14 + 9, ("means", "sh0", "shN"), given)
+    wide = torch.cat([offsets, offsets[:, :, :9]], dim=2)
+    first.scale_to(wide)
+    trained(first, strengths, wide, 20)
+    second = NeuralFit(rows(), 14, ("sh0",), given)
+    second.adopt(first.shape, first.saved())
+    second.scale_to(offsets)
+    expected = first.field().bound(rows()).offsets(0.5)[:, 11:14]
+    found = second.field().bound(rows()).offsets(0.5)[:, 11:14]
+    assert torch.allclose(found, expected, atol=2e-3 * float(expected.abs().max()))

@@ -1,0 +1,258 @@
+"""Scenes in the formats that people have: each gives the scene that was written, within its quantisation."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.__main__ import main
+from progdf.cli.info import kind_of
+from progdf.errors import ProgdfError
+from progdf.formats import gaussforge_child
+from progdf.formats import scene_file as formats
+from progdf.formats.ply import load_ply
+from progdf.formats.scene_file import load_scene, load_scene_with_report, scene_format, turned_about_x
+from progdf.gaussians import Gaussians
+from progdf.rasterize import render
+from progdf.rasterize.reference import rotation_matrices
+from progdf.sh import rgb_to_sh0, shade
+from tests.helpers.refused import refusal
+from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
+from tests.helpers.scenes import orbit_camera, random_gaussians
+
+Write = Callable[[Path, Gaussians], Path]
+
+
+def scene_of(degree: int = 0, count: int = 300) -> Gaussians:
+    """Colours within 0..1 and opacities that a byte can hold; quaternions of unit length."""
+    scene = random_gaussians(count, seed=4, sh_degree=degree, scale=0.05)
+    rng = torch.Generator().manual_seed(5)
+    return replace(
+        scene,
+        quats=scene.unit_quats,
+        log_scales=scene.log_scales.clamp(-8.0, 0.0),
+        sh0=rgb_to_sh0(0.1 + 0.8 * torch.rand(count, 3, generator=rng)),
+        shN=scene.shN.clamp(-0.9, 0.9),
+    )
+
+
+WRITERS: dict[str, tuple[Write, str, int]] = {
+    "compressed": (write_compressed_ply, "scene.ply", 3),
+    "compressed, older": (
+        lambda path, scene: write_compressed_ply(path, scene, colors=False),
+        "scene.ply",
+        0,
+    ),
+    "ksplat 0": (lambda path, scene: write_ksplat(path, scene, 0), "scene.ksplat", 3),
+    "ksplat 1": (lambda path, scene: write_ksplat(path, scene, 1), "scene.ksplat", 1),
+    "ksplat 2": (lambda path, scene: write_ksplat(path, scene, 2), "scene.ksplat", 2),
+    "splat": (write_scene, "scene.splat", 0),
+    "spz 2": (lambda path, scene: write_scene(path, scene, 2), "scene.spz", 3),
+    "spz 3": (lambda path, scene: write_scene(path, scene, 3), "scene.spz", 2),
+    "spz 4": (lambda path, scene: write_scene(path, scene, 4), "scene.spz", 3),
+    "sog": (write_scene, "scene.sog", 3),
+}
+"""How each is written, its name, and the degree of its spherical harmonics."""
+
+MEANS = {"compressed": 4e-3, "compressed, older": 4e-3, "ksplat 1": 4e-4, "ksplat 2": 4e-4}
+MEANS |= {"spz 2": 2e-4, "spz 3": 2e-4, "spz 4": 2e-4, "sog": 1e-3}
+"""Largest error of a centre: half a step of each format over a cloud about 7 wide; the others keep floats."""
+SH = {"compressed": 0.017, "ksplat 1": 5e-4, "ksplat 2": 6e-3, "spz 2": 0.07, "spz 3": 0.07, "spz 4": 0.07}
+SH |= {"sog": 0.03}
+"""Of a coefficient: bytes of −4..4, halves, bytes of −1.5..1.5, 4 and 5 bits of −1..1, and a palette."""
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path) -> None:
+    writer, file, degree = WRITERS[name]
+    scene = scene_of(degree)
+    path = writer(tmp_path / file, scene)
+    assert kind_of(path) == "scene"
+    found, report = load_scene_with_report(path)
+    assert (report.file, report.count, report.sh_degree) == (file, len(scene), degree)
+    assert report.file_bytes == path.stat().st_size
+    if name == "sog":  # in an order of its own
+        nearest = torch.cdist(found.means, scene.means).argmin(dim=1)
+        assert len(nearest.unique()) == len(scene)
+        scene = scene[nearest]
+    assert float((found.means - scene.means).abs().max()) <= MEANS.get(name, 0.0)
+    assert float((found.log_scales - scene.log_scales).abs().max()) <= 0.033  # SPZ: half of 1/16
+    assert float((found.opacities - scene.opacities).abs().max()) <= 1.01 / 255
+    assert float((found.sh0 - scene.sh0).abs().max()) <= 0.0142  # a byte of 0..1 truncated, of band 0
+    angles = (found.quats * scene.quats).sum(dim=1).abs().clamp(max=1.0).acos() * 2
+    # SPZ 2 keeps x, y, z as bytes, which w near 0 is worked out from
+    assert float(angles.rad2deg().max()) <= (10.0 if name == "spz 2" else 1.0)
+    if degree:
+        assert float((found.shN - scene.shN).abs().max()) <= SH.get(name, 1e-6)
+
+
+@pytest.mark.parametrize("name", ["ksplat 1", "spz 4", "sog", "compressed"])
+def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> None:
+    """A turned axis, a swapped band or a wrong sign costs tens of dB."""
+    writer, file, degree = WRITERS[name]
+    scene = scene_of(degree)
+    found = load_scene(writer(tmp_path / file, scene))
+    camera = orbit_camera(60, 40)
+    error = (render(found, camera) - render(scene, camera)).square().mean()
+    assert -10 * float(error.log10()) > 32.0
+
+
+def test_half_a_turn_about_x_turns_what_is_seen() -> None:
+    """The signs of all bands, against the basis itself: what is seen along d is then seen along d turned."""
+    scene = scene_of(3, 50)
+    turned, turn = turned_about_x(scene), torch.tensor([1.0, -1.0, -1.0])
+    directions = torch.nn.functional.normalize(scene.sh0, dim=1)
+    torch.testing.assert_close(shade(3, directions * turn, turned.sh), shade(3, directions, scene.sh))
+    frames, expected = (rotation_matrices(s.quats) * s.scales[:, None] for s in (turned, scene))
+    shapes, shapes_before = frames @ frames.mT, expected @ expected.mT
+    torch.testing.assert_close(shapes, shapes_before * turn * turn[:, None])
+    assert torch.equal(turned.means, scene.means * turn)
+
+
+def test_an_unpacked_sog_opens_by_its_folder_and_by_its_table(tmp_path: Path) -> None:
+    bundle = write_scene(tmp_path / "scene.sog", scene_of(1))
+    folder = tmp_path / "robot"
+    with zipfile.ZipFile(bundle) as archive:
+        archive.extractall(folder)
+    expected = load_scene(bundle)
+    for path in (folder, folder / "meta.json"):
+        assert kind_of(path) == "scene"
+        scene, report = load_scene_with_report(path)
+        assert torch.equal(scene.means, expected.means)
+        assert report.file == "robot"
+    assert main(["check", str(folder)]) == 0
+
+
+def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(write_scene(tmp_path / "scene.sog", scene_of())) as archive:
+        archive.extractall(tmp_path / "robot")
+    meta = tmp_path / "robot" / "meta.json"
+    table = json.loads(meta.read_text())
+    table["quats"]["files"] = ["../../secret.webp"]
+    meta.write_text(json.dumps(table))
+    assert "names images outside its folder" in refusal(load_scene, meta)
+
+
+def test_saturated_opacities_are_clamped_and_counted(tmp_path: Path) -> None:
+    scene = replace(scene_of(), logit_opacities=torch.full((300,), 15.0))
+    compressed = write_compressed_ply(tmp_path / "a.ply", scene)
+    ksplat, spz = write_ksplat(tmp_path / "a.ksplat", scene, 1), write_scene(tmp_path / "a.spz", scene)
+    for path in (compressed, ksplat, spz):
+        found, report = load_scene_with_report(path)
+        assert bool(found.logit_opacities.isfinite().all()), path.name
+        assert report.opaque == 300, path.name
+
+
+def test_every_format_that_can_say_so_keeps_antialiased(tmp_path: Path) -> None:
+    spz = write_scene(tmp_path / "a.spz", scene_of())
+    content = bytearray(spz.read_bytes())
+    content[14] |= 1
+    spz.write_bytes(bytes(content))
+    with zipfile.ZipFile(write_scene(tmp_path / "a.sog", scene_of())) as archive:
+        archive.extractall(tmp_path / "sog")
+    meta = tmp_path / "sog" / "meta.json"
+    meta.write_text(json.dumps(json.loads(meta.read_text()) | {"model": "antialiased"}))
+    ply = write_compressed_ply(tmp_path / "a.ply", scene_of(), "SplatRenderMode: mip")
+    for path in (spz, meta, ply):
+        scene, report = load_scene_with_report(path)
+        assert scene.antialiased, path
+        assert report.antialiased, path
+
+
+def test_content_decides_before_the_name_does(tmp_path: Path) -> None:
+    scene = scene_of()
+    for file, written in (("spz", "a.spz"), ("sog", "b.sog")):
+        path = write_scene(tmp_path / written, scene).rename(tmp_path / f"{file}.dat")
+        assert scene_format(path) == file
+    (tmp_path / "c.splat").write_bytes(b'{"' + bytes(30))  # a first coordinate that reads as JSON
+    assert kind_of(tmp_path / "c.splat") == "scene"
+    (tmp_path / "cameras.spz").write_text('[{"id": 0}]')
+    assert kind_of(tmp_path / "cameras.spz") == "cameras"
+
+
+def test_info_and_export_say_what_the_scene_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_scene(tmp_path / "a.spz", scene_of(1))
+    assert main(["info", str(path)]) == 0
+    assert ".spz 4, turned from y up to y down" in capsys.readouterr().out
+    assert main(["export", str(path), "--out", str(tmp_path / "b.ply")]) == 0
+    assert "a.spz is a .spz, this is a plain .ply" in capsys.readouterr().out
+    assert torch.equal(load_ply(tmp_path / "b.ply").means, load_scene(path).means)
+
+
+def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_scene(tmp_path / "a.splat", scene_of())
+    script = tmp_path / "child.py"
+    monkeypatch.setattr(gaussforge_child, "__file__", str(script))
+    monkeypatch.setattr(formats, "_SECONDS", (1, 0.0))
+    for body, said in (
+        ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
+        ("import time; time.sleep(60)", "gave no answer in 2 s"),
+        ("raise SystemExit(3)", "said nothing"),
+        ("import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)", "said: worse"),
+        ("pass", "said nothing"),
+        ("import sys; open(sys.argv[3], 'w').write('ply')", "gave no scene"),
+    ):
+        script.write_text(body)
+        message = refusal(load_scene, path)
+        assert said in message, message
+        assert message.isprintable()
+    monkeypatch.setattr(formats.importlib.util, "find_spec", lambda name: None)
+    assert "pip install progdf-studio[formats]" in refusal(load_scene, path)
+
+
+def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> None:
+    """A gigabyte asked for beyond the limit is a line, and no gigabyte."""
+    script, here = tmp_path / "greedy.py", "    path = Path(source)\n"
+    own = Path(gaussforge_child.__file__).read_text()
+    script.write_text(own.replace(here, f"    bytes(1 << 30)\n{here}"))
+    words = [sys.executable, "-P", str(script), "splat", "missing", "out", str(1 << 30), "1000000", "10"]
+    ended = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ended.returncode == 3
+    assert ended.stderr.startswith("MemoryError")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_are_one_line_or_a_drawable_scene(name: str, tmp_path: Path) -> None:
+    """Cut short anywhere, or with bits flipped: a line with the file's name, or finite numbers."""
+    writer, file, degree = WRITERS[name]
+    whole = writer(tmp_path / file, scene_of(degree, 70)).read_bytes()
+    rng = np.random.default_rng(6)
+    own = name.startswith(("compressed", "ksplat"))  # our readers are tried in a millisecond
+    refused = 0
+    for trial in range(200 if own else 16):
+        broken = bytearray(whole)
+        if trial % 2:
+            broken = broken[: int(rng.integers(0, len(whole)))]
+        else:
+            top = len(whole) if trial % 4 else min(4400, len(whole))  # headers above all
+            for at in rng.integers(0, top, 1 + trial % 7):
+                broken[at] ^= 1 << int(rng.integers(0, 8))
+        (tmp_path / file).write_bytes(bytes(broken))
+        said, scene = _attempt(tmp_path / file)
+        if scene is None:
+            refused += 1
+            assert said.isprintable(), (trial, said)
+            assert file in said, (trial, said)
+        else:
+            for tensor in (scene.means, scene.log_scales, scene.logit_opacities, scene.sh0, scene.shN):
+                assert bool(tensor.isfinite().all()), trial
+    assert refused > 3
+
+
+def _attempt(path: Path) -> tuple[str, Gaussians | None]:
+    try:
+        return "", load_scene_with_report(path)[0]
+    except ProgdfError as error:
+        return str(error), None

@@ -1,0 +1,116 @@
+"""`progdf rebind`: an edit on the same scene in another file, in another order, with other numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.__main__ import main
+from progdf.cli.rebind import match_scenes, rebound
+from progdf.compose.reference import Layer, compose
+from progdf.formats.ply import save_ply
+from progdf.formats.scene_file import load_scene, turned_about_x
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import load_gdf
+from progdf.rasterize import render
+from tests.helpers.scene_files import write_compressed_ply, write_scene
+from tests.helpers.stacks import Stack, bear_stack
+from viewer.camera.view_camera import first_camera, to_camera
+
+
+@pytest.fixture(scope="module")
+def stack() -> Stack:
+    return bear_stack(2000)
+
+
+def shuffled(scene: Gaussians, seed: int = 3) -> tuple[Gaussians, torch.Tensor]:
+    """Its rows in another order, every other quaternion negated, which is the same rotation."""
+    order = torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))
+    other = scene[order]
+    signs = torch.where(torch.arange(len(scene)) % 2 == 0, 1.0, -1.0)
+    return replace(other, quats=other.quats * signs[:, None]), order
+
+
+def psnr(a: Gaussians, b: Gaussians, stack: Stack) -> float:
+    camera = to_camera(first_camera(stack.scene, stack.demo.cameras), 96, 72)
+    return -10 * float((render(a, camera) - render(b, camera)).square().mean().log10())
+
+
+def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:
+    other, order = shuffled(stack.scene)
+    match = match_scenes(stack.scene, other)
+    assert np.array_equal(match.rows, order.numpy())
+    assert (match.matched, match.once, match.p95) == (1.0, 1.0, 0.0)
+    for gdf in stack.gdfs:
+        found = compose(other, [Layer(rebound(gdf, stack.scene, other, match), 0.6)])
+        expected = compose(stack.scene, [Layer(gdf, 0.6)])[order]
+        for name in ("means", "log_scales", "logit_opacities", "sh0"):
+            assert torch.equal(getattr(found, name), getattr(expected, name)), name
+
+
+def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
+    gdf, scene = stack.gdfs[0], stack.scene
+    bases = gdf.field.attributes["sh0"]
+    width = torch.zeros(len(gdf.region), 4)
+    turning = replace(
+        bases,
+        full=width + torch.tensor([0.0, 0.5, -0.2, 0.1]),
+        rest=torch.zeros(bases.rest.shape[0], len(gdf.region), 4, dtype=bases.rest.dtype),
+        step=torch.zeros(bases.step.shape[0], 4),
+    )
+    gdf = replace(gdf, field=replace(gdf.field, attributes={"quats": turning}))
+    other, order = shuffled(scene)
+    found = compose(other, [Layer(rebound(gdf, scene, other, match_scenes(scene, other)), 1.0)])
+    expected = compose(scene, [Layer(gdf, 1.0)])[order]
+    same = (found.unit_quats * expected.unit_quats).sum(dim=1).abs()
+    torch.testing.assert_close(same, torch.ones(len(scene)))
+
+
+def test_no_gaussian_serves_two_while_another_is_free(stack: Stack) -> None:
+    """Two at one place, told apart by their colors alone."""
+    twice = stack.scene[torch.arange(400).repeat_interleave(2)]
+    sh0 = twice.sh0.clone()
+    sh0[1::2] = -sh0[1::2]
+    a = replace(twice, sh0=sh0)
+    other, _ = shuffled(a)
+    match = match_scenes(a, replace(other, means=other.means + 1e-4))
+    assert match.once == 1.0
+    assert float((a.sh0[torch.from_numpy(match.rows)] - other.sh0).abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("file", ["b.sog", "b.spz", "b.ply"])
+def test_an_edit_is_carried_to_another_format(
+    stack: Stack, tmp_path: Path, file: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, edit, *_ = stack.save(tmp_path)
+    b = tmp_path / file
+    (write_compressed_ply if file == "b.ply" else write_scene)(b, stack.scene)
+    assert main(["render", str(b), str(edit), "-o", str(tmp_path / "no.png")]) == 2
+    assert "progdf rebind scarf.gdf --from SCENE" in capsys.readouterr().err
+    new = tmp_path / "new.gdf"
+    assert main(["rebind", str(edit), "--from", str(a), "--to", str(b), "-o", str(new)]) == 0
+    assert "matched: " in capsys.readouterr().out
+    scene = load_scene(b)
+    gdf = load_gdf(new, scene)
+    assert gdf.report["rebound"]["matched"] > 0.99
+    # the edit loses no more than the format itself has lost
+    before = psnr(scene, stack.scene, stack)
+    after = psnr(compose(scene, [Layer(gdf, 1.0)]), compose(stack.scene, [Layer(stack.gdfs[0], 1.0)]), stack)
+    assert after > before - 1.0
+
+
+def test_another_scene_is_refused_and_a_turned_one_is_named(
+    stack: Stack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, edit, *_ = stack.save(tmp_path)
+    moved = replace(stack.scene, means=stack.scene.means + torch.tensor([0.3, 0.0, 0.0]))
+    for scene, said in ((moved, "is another scene"), (turned_about_x(stack.scene), "half a turn about x")):
+        save_ply(tmp_path / "other.ply", scene)
+        words = ["--from", str(a), "--to", str(tmp_path / "other.ply"), "-o", str(tmp_path / "new.gdf")]
+        assert main(["rebind", str(edit), *words]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "new.gdf").exists()

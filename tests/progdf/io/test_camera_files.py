@@ -1,0 +1,156 @@
+"""The camera files of other programs and our own are read alike."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+import progdf
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.lens import Lens
+from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
+from tests.helpers.full_disk import files_up_to
+from tests.helpers.refused import refusal
+
+
+def assert_same_views(found: list[Camera], expected: list[Camera]) -> None:
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(
+            a.viewmat, b.viewmat, atol=2e-6, rtol=0
+        )  # the matrices were inverted twice
+        torch.testing.assert_close(a.K, b.K)
+        assert (a.width, a.height) == (b.width, b.height)
+
+
+def test_saved_cameras_load_to_the_same_bits(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    save_cameras(tmp_path / "cameras.json", cameras)
+    for found, expected in zip(load_cameras(tmp_path / "cameras.json"), cameras, strict=True):
+        assert torch.equal(found.viewmat, expected.viewmat)
+        assert torch.equal(found.K, expected.K)
+        assert (found.width, found.height, found.name) == (expected.width, expected.height, expected.name)
+    assert progdf.load_cameras is load_cameras
+
+
+def test_one_camera_or_a_bare_list_of_ours_is_read(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    save_cameras(tmp_path / "cameras.json", cameras)
+    entries = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
+    assert_same_views(load_cameras(written(tmp_path / "list.json", entries)), cameras)
+    assert_same_views(load_cameras(written(tmp_path / "one.json", entries[1])), cameras[1:2])
+
+
+def test_inria_cameras_are_read(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    found = load_cameras(written(tmp_path / "cameras.json", inria(cameras)))
+    assert_same_views(found, cameras)
+    assert found[0].name == cameras[0].name
+
+
+def test_inria_focal_lengths_belong_to_their_axes(tmp_path: Path) -> None:
+    entries = inria(some_cameras())
+    entries[0] |= {"fx": 200.0, "fy": 300.0}
+    K = load_cameras(written(tmp_path / "cameras.json", entries))[0].K
+    assert K.tolist() == [[200, 0, 160], [0, 300, 100], [0, 0, 1]]
+
+
+def test_nerfstudio_transforms_are_read(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    assert_same_views(load_cameras(written(tmp_path / "t.json", nerfstudio(cameras))), cameras)
+
+
+def test_a_frames_own_intrinsics_go_before_those_of_the_file(tmp_path: Path) -> None:
+    content = nerfstudio(some_cameras())
+    content["frames"][2] |= {"fl_x": 111.0, "fl_y": 222.0, "cx": 30.0, "cy": 40.0, "w": 66, "h": 88}
+    cameras = load_cameras(written(tmp_path / "t.json", content))
+    assert cameras[2].K.tolist() == [[111, 0, 30], [0, 222, 40], [0, 0, 1]]
+    assert (cameras[2].width, cameras[2].height) == (66, 88)
+    assert_same_views(cameras[:2], some_cameras()[:2])
+
+
+def test_a_field_of_view_stands_in_for_a_focal_length(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    angle = 2 * math.atan(160 / float(cameras[0].K[0, 0]))
+    content = nerfstudio(cameras, fl_x=None, fl_y=None, cx=None, cy=None, camera_angle_x=angle)
+    assert_same_views(load_cameras(written(tmp_path / "t.json", content)), cameras)
+
+
+@pytest.mark.parametrize(
+    ("given", "focal"),
+    [
+        ({"fl_x": 250.0}, (250, 250)),
+        ({"fl_y": 240.0}, (240, 240)),
+        ({"camera_angle_y": 2 * math.atan(100 / 240)}, (240, 240)),
+        (
+            {"camera_angle_x": 2 * math.atan(160 / 250), "camera_angle_y": 2 * math.atan(100 / 240)},
+            (250, 240),
+        ),
+    ],
+    ids=["fl_x", "fl_y", "angle y", "both angles"],
+)
+def test_what_is_said_of_one_axis_alone_holds_for_both(
+    given: dict[str, float], focal: tuple[float, float], tmp_path: Path
+) -> None:
+    content = nerfstudio(some_cameras(), **{"fl_x": None, "fl_y": None, **given})
+    K = load_cameras(written(tmp_path / "t.json", content))[0].K
+    assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx(focal, rel=1e-6)
+
+
+@pytest.mark.parametrize("model", [None, "opencv", "Simple_Pinhole"])
+def test_a_camera_model_may_be_missing_or_written_in_small_letters(model: str | None, tmp_path: Path) -> None:
+    cameras = some_cameras()
+    found = load_cameras(written(tmp_path / "t.json", nerfstudio(cameras, camera_model=model)))
+    assert_same_views(found, cameras)
+    assert found[0].name == f"images/{cameras[0].name}.png"
+
+
+def test_the_image_size_is_taken_from_the_picture_where_the_file_has_none(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    content = nerfstudio(cameras, w=None, h=None)
+    assert "w and h" in refusal(load_cameras, written(tmp_path / "t.json", content))
+    (tmp_path / "images").mkdir()
+    for camera, frame in zip(cameras, content["frames"], strict=True):
+        Image.new("RGB", (320, 200)).save(tmp_path / "images" / f"{camera.name}.png")
+        frame["file_path"] = f"./images/{camera.name}"  # synthetic NeRF scenes leave the suffix off
+    assert_same_views(load_cameras(written(tmp_path / "t.json", content)), cameras)
+
+
+def test_distortion_is_kept_as_the_cameras_lens_and_not_ignored(tmp_path: Path) -> None:
+    content = nerfstudio(some_cameras(), k1=0.1, k2=-0.02, p1=0.003, p2=0.004, k3=0.0)
+    content["frames"][1] |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+    cameras = load_cameras(written(tmp_path / "t.json", content))
+    assert cameras[0].lens == Lens(0.1, -0.02, 0.003, 0.004)
+    assert cameras[1].lens is None
+    save_cameras(tmp_path / "kept.json", cameras)
+    assert [camera.lens for camera in load_cameras(tmp_path / "kept.json")] == [c.lens for c in cameras]
+    assert cameras[0].resized(32, 20).lens == cameras[0].lens
+
+
+def test_what_lenses_bend_is_told_in_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    content = nerfstudio(some_cameras(), k1=0.1)
+    content["frames"][1] |= {"k1": 0.0}
+    with caplog.at_level(logging.INFO, logger="progdf"):
+        load_cameras(written(tmp_path / "t.json", content))
+        assert "3 of 4 cameras have a lens" in caplog.text
+        caplog.clear()
+        load_cameras(written(tmp_path / "t.json", nerfstudio(some_cameras())))
+        assert caplog.text == ""
+
+
+def test_a_save_that_fails_leaves_the_old_cameras_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    save_cameras(path, some_cameras())
+    old = path.read_bytes()
+    with files_up_to(100), pytest.raises(ProgdfError, match=r"cameras\.json cannot be written \("):
+        save_cameras(path, some_cameras()[:2])
+    assert path.read_bytes() == old
+    assert [entry.name for entry in tmp_path.iterdir()] == ["cameras.json"]

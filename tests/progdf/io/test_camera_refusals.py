@@ -1,0 +1,161 @@
+"""Camera files that are broken or of another kind: each is refused in one line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from progdf.errors import ProgdfError
+from progdf.io.cameras import load_cameras
+from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
+from tests.helpers.refused import refusal
+
+
+def test_a_picture_without_a_size_that_can_be_read_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = nerfstudio(some_cameras()[:1], w=None, h=None)
+    (tmp_path / "images").mkdir()
+    picture = tmp_path / content["frames"][0]["file_path"]
+    picture.write_text("no picture")
+    path = written(tmp_path / "t.json", content)
+    assert f"{picture}, which frame 0" in refusal(load_cameras, path)
+    Image.new("RGB", (320, 200)).save(picture)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    assert f"{picture}, which frame 0" in refusal(load_cameras, path)
+
+
+def test_distortion_of_a_kind_that_programs_read_differently_is_refused(tmp_path: Path) -> None:
+    for key in ("k4", "k5", "k6"):
+        assert "undistort" in refusal(
+            load_cameras, written(tmp_path / "t.json", nerfstudio(some_cameras(), **{key: 0.01}))
+        )
+
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def angle_instead(content: dict[str, Any], angle: float) -> None:
+    """The field of view, in place of the focal lengths."""
+    del content["fl_x"], content["fl_y"]
+    content["camera_angle_x"] = angle
+
+
+BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what must be said about it
+    "fisheye": (lambda t: t.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
+    "no focal length": (lambda t: (t.pop("fl_x"), t.pop("fl_y")), "focal length"),
+    "words": (lambda t: t.update(fl_x="wide"), "fl_x"),
+    "endless integer": (lambda t: t.update(fl_x=10**400), "100000000000…"),
+    "no matrix": (lambda t: t["frames"][3].pop("transform_matrix"), "frame 3"),
+    "a row gone": (lambda t: t["frames"][3]["transform_matrix"].pop(0), "no rotation"),
+    "ragged matrix": (lambda t: t["frames"][3]["transform_matrix"][1].pop(), "transform_matrix"),
+    "stretched": (
+        lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(slice(0, 3), [9, 0, 0]),
+        "rotation",
+    ),
+    "mirrored": (
+        lambda t: t["frames"][1]["transform_matrix"].insert(0, t["frames"][1]["transform_matrix"].pop(1)),
+        "rotation",
+    ),
+    "NaN": (lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(0, math.nan), "NaN is no number"),
+    "frame is a number": (lambda t: t["frames"].append(7), "frame 4"),
+    "no frames": (lambda t: t["frames"].clear(), "0 cameras"),
+    "a row too many": (lambda t: t["frames"][3]["transform_matrix"].append([0, 0, 0, 1]), "3x4 or 4x4"),
+    "a little stretched": (
+        lambda t: t["frames"][1].update(
+            transform_matrix=[[1.02 * x for x in row] for row in t["frames"][1]["transform_matrix"][:3]]
+        ),
+        "no rotation",
+    ),
+    "no angle": (lambda t: angle_instead(t, 0.0), "camera_angle_x = 0;"),
+    "an angle in degrees": (lambda t: angle_instead(t, 50.0), "camera_angle_x = 50;"),
+    "truth for a number": (lambda t: t.update(w=True), "w = True"),
+    "a billion pixels": (lambda t: t.update(w=10**9), "w = 1e+09"),
+    "half a pixel": (lambda t: t.update(w=320.5), "w = 320.5"),
+    "no pixels": (lambda t: t.update(h=0), "h = 0"),
+    "negative focal length": (lambda t: t.update(fl_y=-5.0), "focal lengths"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_camera_is_named_in_one_line(case: str, tmp_path: Path) -> None:
+    change, said = BROKEN[case]
+    content = nerfstudio(some_cameras())
+    change(content)
+    assert said in refusal(load_cameras, written(tmp_path / "t.json", content))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("", "nonsense", "{", "{}", "[]", "[1, 2]", '{"frames": 3}', "[" * 5000, "7", "\x00\xff"),
+        '[{"rotation": 1, "position": 2}]',
+    ],
+)
+def test_any_other_json_is_one_line(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    path.write_bytes(content.encode("latin-1"))
+    refusal(load_cameras, path)
+
+
+@pytest.mark.parametrize("diagonal", [(0, 0, 0, 0), (2, 2, 2, 1), (-1, 1, 1, 1), (1, 1, 1, 2)])
+def test_a_saved_camera_that_does_more_than_turn_and_move_is_refused(
+    diagonal: tuple[int, ...], tmp_path: Path
+) -> None:
+    viewmat = torch.diag(torch.tensor(diagonal)).tolist()
+    entry = {"width": 4, "height": 4, "K": torch.eye(3).tolist(), "viewmat": viewmat}
+    assert "no rotation" in refusal(load_cameras, written(tmp_path / "one.json", entry))
+
+
+def test_a_missing_camera_file_is_one_line(tmp_path: Path) -> None:
+    assert "does not exist" in refusal(load_cameras, tmp_path / "nowhere.json")
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(["frames", "cameras", "viewmat", "K", "w", "fl_x", "rotation"]), inner
+        )
+    ),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(content=JSON, kind=st.sampled_from(["inria", "nerfstudio", "ours"]), data=st.data())
+def test_any_value_in_any_place_loads_or_is_refused(
+    content: object, kind: str, data: st.DataObject, tmp_path: Path
+) -> None:
+    entry: Any = inria(some_cameras())[0]
+    whole: Any = [entry]
+    if kind == "nerfstudio":
+        whole = nerfstudio(some_cameras()[:1])
+        entry = data.draw(st.sampled_from([whole, whole["frames"][0]]))
+    if kind == "ours":
+        entry = {
+            "name": "a",
+            "width": 4,
+            "height": 4,
+            "K": torch.eye(3).tolist(),
+            "viewmat": torch.eye(4).tolist(),
+        }
+        whole = {"cameras": [entry]}
+    entry[data.draw(st.sampled_from(sorted(entry)))] = content
+    path = written(tmp_path / "fuzz.json", whole)
+    try:
+        cameras = load_cameras(path)
+    except ProgdfError as refused:
+        cameras, message = [], str(refused)
+        assert len(message.splitlines()) == 1
+    for camera in cameras:
+        assert bool(camera.viewmat.isfinite().all())

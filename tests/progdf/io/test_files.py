@@ -1,0 +1,210 @@
+"""Outputs are whole or absent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from progdf.cli.info import kind_of
+from progdf.errors import ProgdfError
+from progdf.formats.scene_file import load_scene
+from progdf.gdf.file import load_gdf
+from progdf.io.atomic import is_temporary, written_whole
+from progdf.io.cameras import load_cameras
+from progdf.io.images import open_picture
+from progdf.io.npy import open_npy
+from progdf.io.session import read_session, sha256
+from tests.helpers.full_disk import files_up_to
+from tests.helpers.refused import refusal
+
+
+def test_a_file_appears_when_it_is_complete_and_not_before(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    with written_whole(path) as beside:
+        beside.write_text("half")
+        assert not path.exists()
+        beside.write_text("whole")
+    assert path.read_text() == "whole"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_beside_it(
+    error: type[BaseException], tmp_path: Path
+) -> None:
+    path = tmp_path / "out.txt"
+    path.write_text("old")
+
+    def write() -> None:
+        with written_whole(path) as beside:
+            beside.write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    path.write_text("old")
+    told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); give a place")
+    with told as caught, files_up_to(100), written_whole(path) as beside, written_whole(beside) as within:
+        within.write_text("x" * 1000)
+    assert isinstance(caught.value.__cause__, OSError), "training tells a full disk by it"
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_whoever_still_reads_the_old_file_keeps_it(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    path.write_text("old")
+    with path.open() as reader:
+        with written_whole(path) as beside:
+            beside.write_text("new")
+        assert reader.read() == "old"
+    assert path.read_text() == "new"
+
+
+def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: Path) -> None:
+    ordinary, old = tmp_path / "ordinary.txt", tmp_path / "old.txt"
+    ordinary.touch()
+    old.touch()
+    old.chmod(0o640)
+    for path, expected in ((tmp_path / "new.txt", ordinary), (old, old)):
+        mode = expected.stat().st_mode
+        with written_whole(path) as beside:
+            beside.write_text("x")
+        assert path.stat().st_mode == mode
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+def test_a_new_file_obeys_the_umask_and_nobody_elses_is_touched(
+    mask: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    earlier = os.umask(mask)
+    try:
+        with monkeypatch.context() as patched:
+            # the process's umask holds for all its threads: to look at it is to change it for a moment
+            patched.setattr(os, "umask", lambda mask: pytest.fail("the umask was changed"))
+            with written_whole(tmp_path / "new.txt") as beside:
+                beside.write_text("x")
+    finally:
+        os.umask(earlier)
+    assert (tmp_path / "new.txt").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+def test_the_suffix_is_kept_for_writers_that_go_by_it(tmp_path: Path) -> None:
+    with written_whole(tmp_path / "picture.png") as beside:
+        assert beside.suffix == ".png"
+
+
+def test_a_missing_folder_and_a_folder_in_place_of_a_file_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="does not exist"), written_whole(tmp_path / "no" / "a.txt"):
+        pass
+    with pytest.raises(ProgdfError, match="is a folder"), written_whole(tmp_path):
+        pass
+
+
+def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(beside: Path, _: int | None) -> None:
+        raise PermissionError(13, "Permission denied", str(beside))
+
+    monkeypatch.setattr("progdf.io.atomic._create", refused)
+    path = tmp_path / "out.txt"
+    with pytest.raises(ProgdfError) as told, written_whole(path):
+        pass
+    assert str(told.value).startswith(f"{path} cannot be written (Permission denied); ")
+
+
+def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for name in ("old", "new"):  # the second leads to nothing yet
+        real, link = tmp_path / "there" / f"{name}.txt", tmp_path / f"{name}.txt"
+        link.symlink_to(Path("there") / real.name)
+        if name == "old":
+            real.write_text("old")
+        with written_whole(link) as beside:
+            beside.write_text("whole")
+        assert link.is_symlink()
+        assert real.read_text() == "whole"
+    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["new.txt", "old.txt"]
+
+
+@pytest.mark.parametrize(
+    "read", [load_scene, load_gdf, kind_of, load_cameras, open_npy, open_picture, read_session, sha256]
+)
+def test_a_pipe_that_is_read_from_is_refused_and_not_waited_for(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    signal.alarm(20)  # ends the process, where a reader waits
+    try:
+        for path in (pipe, Path("/dev/zero")):
+            assert refusal(read, path) == f"{path} is a pipe or a device; give a file"
+    finally:
+        signal.alarm(0)
+
+
+def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.png"
+    os.mkfifo(pipe)
+    handle = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with written_whole(pipe) as beside:
+            beside.write_text("half")
+            beside.write_text("whole")
+        assert os.read(handle, 100) == b"whole"
+    finally:
+        os.close(handle)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+KILLED = """
+import os, signal, sys
+from progdf.files import is_temporary, written_whole
+with written_whole(sys.argv[1]) as beside:
+    beside.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
+    left = list(tmp_path.iterdir())
+    assert len(left) == 1
+    assert is_temporary(left[0].name)
+    own = [tmp_path / name for name in (".out.abcdefgh.txt", ".progdf", ".progdf-notes.txt", "x.progdf-1")]
+    for mine in own:
+        mine.write_text("mine")
+    elsewhere = tmp_path / ".progdf-00000000-1-abcdefgh.txt"  # another machine's, which may be at work
+    elsewhere.write_text("half")
+    with written_whole(tmp_path / "a.txt") as running:
+        with written_whole(path) as beside:
+            beside.write_text("whole")
+        assert running.exists(), "a process that runs keeps what it writes"
+        running.write_text("whole")
+    os.utime(elsewhere, (0, 0))
+    assert sorted(tmp_path.iterdir()) == sorted([*own, elsewhere, path, tmp_path / "a.txt"])
+    with written_whole(path) as beside:
+        beside.write_text("whole")
+    assert not elsewhere.exists(), "it has not been written to for a day"
+
+
+def test_a_name_as_long_as_names_can_be_is_written(tmp_path: Path) -> None:
+    path = tmp_path / ("n" * 251 + ".txt")
+    with written_whole(path) as beside:
+        beside.write_text("whole")
+    assert path.read_text() == "whole"

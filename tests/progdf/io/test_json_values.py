@@ -1,0 +1,62 @@
+"""JSON that somebody made to do harm: refused in one line by whatever reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from progdf.cli.info import main as info
+from progdf.errors import ProgdfError
+from progdf.io.cameras import load_cameras
+from progdf.io.json_values import DEEPEST, decode_json
+from progdf.io.session import read_session
+from tests.helpers.hostile import JSON_TEXTS
+from trainer.store.state import StateFolder
+from viewer.files import timeline_file
+
+
+@pytest.mark.parametrize("content", JSON_TEXTS.values(), ids=JSON_TEXTS.keys())
+def test_what_no_program_writes_is_no_json(content: str) -> None:
+    with pytest.raises(ValueError) as refused:  # noqa: PT011  of one line, whatever it says
+        decode_json(content)
+    assert "\n" not in str(refused.value)
+
+
+def test_ordinary_values_come_as_they_are() -> None:
+    text = '{"a": [1, -2.5, true, null, "ä\\ud83d\\ude00"], "b": {"c": 123456789012345678}}'
+    assert decode_json(text) == {
+        "a": [1, -2.5, True, None, "ä\N{GRINNING FACE}"],
+        "b": {"c": 123456789012345678},
+    }
+    assert decode_json("1" + "0" * 30) == 1e30
+    deep = "[" * DEEPEST + "]" * DEEPEST
+    assert decode_json(deep) is not None
+
+
+@pytest.mark.parametrize("content", JSON_TEXTS.values(), ids=JSON_TEXTS.keys())
+@pytest.mark.parametrize(
+    "frame",
+    [
+        '{"progdf_session": 1, "scene": {"file": "a", "sha256": ""}, "view": {"layers": %s}}',
+        '{"progdf_timeline": 1, "keys": [{"frame": %s}]}',
+        '{"cameras": [{"width": 4, "height": 4, "K": %s}]}',
+    ],
+    ids=["session", "timeline", "cameras"],
+)
+def test_every_reader_refuses_it_in_one_line(frame: str, content: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(frame % content)
+    readers = [lambda: info([str(path)]), lambda: load_cameras(path), lambda: read_session(path)]
+    for read in [*readers, lambda: timeline_file.load(path, ())]:
+        with pytest.raises(ProgdfError) as refused:
+            read()
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("content", JSON_TEXTS.values(), ids=JSON_TEXTS.keys())
+def test_a_run_that_was_stopped_with_it_is_damaged(content: str, tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path)
+    (tmp_path / "run.json").write_text(f'{{"options": {content}}}')
+    with pytest.raises(ProgdfError, match="is damaged"):
+        folder.identity()

@@ -1,0 +1,70 @@
+"""Tensor files: the library reads them, and what is in them decides every byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file
+from torch import Tensor
+
+from progdf.io.tensors import _TYPES, read_tensors, write_tensors
+
+
+def some(dtype: torch.dtype) -> dict[str, Tensor]:
+    """Tensors of a type in every shape that matters: empty, one number, not contiguous."""
+    full = torch.arange(24).reshape(2, 3, 4).to(dtype)
+    return {"b": full, "none": full[:0], "a": full[1, 2, 3], "turned": full.permute(2, 0, 1)}
+
+
+@pytest.mark.parametrize("dtype", list(_TYPES), ids=str)
+def test_the_library_reads_every_type_and_shape(tmp_path: Path, dtype: torch.dtype) -> None:
+    tensors = {**some(dtype), "wide": torch.tensor([0.1], dtype=torch.float64)}
+    write_tensors(tmp_path / "x", tensors, {"z": "ä", "a": '"{}"'})
+    found = load_file(tmp_path / "x")
+    assert found.keys() == tensors.keys()
+    for name, tensor in tensors.items():
+        assert found[name].dtype == tensor.dtype
+        assert torch.equal(found[name], tensor)
+    with safe_open(tmp_path / "x", framework="pt") as opened:
+        assert opened.metadata() == {"z": "ä", "a": '"{}"'}
+
+
+def test_the_order_in_which_things_are_given_changes_no_byte(tmp_path: Path) -> None:
+    tensors, metadata = some(torch.float32), {"format": "1", "about": "2", "sha": "3"}
+    write_tensors(tmp_path / "x", tensors, metadata)
+    write_tensors(tmp_path / "y", dict(reversed(tensors.items())), dict(reversed(metadata.items())))
+    assert (tmp_path / "x").read_bytes() == (tmp_path / "y").read_bytes()
+
+
+def test_every_tensor_lies_where_its_type_is_aligned(tmp_path: Path) -> None:
+    tensors = {"a": torch.zeros(3, dtype=torch.int8), "b": torch.zeros(5, dtype=torch.float16)}
+    write_tensors(tmp_path / "x", {**tensors, "c": torch.ones(1, dtype=torch.float64)}, {})
+    content = (tmp_path / "x").read_bytes()
+    size = int.from_bytes(content[:8], "little")
+    assert size % 8 == 0
+    assert content[8 + size : 16 + size] == b"\0\0\0\0\0\0\xf0\x3f"  # 1.0 comes first
+
+
+def test_every_flipped_bit_is_noticed_where_there_is_a_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    write_tensors(path, {"a": torch.arange(4.0), "b": torch.arange(3)}, {"about": "it"}, checksum=True)
+    tensors, metadata = read_tensors(path)
+    assert torch.equal(tensors["a"], torch.arange(4.0))
+    assert metadata == {"about": "it"}
+    content = path.read_bytes()
+    # a flip in the name of the checksum loses the checksum alone
+    for place in range(len(content)):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        try:
+            found, told = read_tensors(path)
+        except ValueError:
+            continue
+        assert told.get("about") == "it", place
+        assert all(torch.equal(found[name], tensors[name]) for name in tensors), place
+    for kept in range(len(content)):
+        path.write_bytes(content[:kept])
+        with pytest.raises(ValueError):  # noqa: PT011  the library's words
+            read_tensors(path)

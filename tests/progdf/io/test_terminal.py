@@ -1,0 +1,86 @@
+"""Names in files may hold what commands a terminal; it is shown, and does not happen."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
+from progdf.gdf.file import save_gdf
+from progdf.io.cameras import save_cameras
+from progdf.terminal import PrintableFormatter, printable
+from tests.helpers.edits import curved_field, edit_of, some_rows
+from tests.helpers.ply_files import scene_of, table_of, with_extra, write
+from tests.helpers.scenes import front_camera, random_gaussians
+from trainer.store.progress import RunLog
+
+EVIL = "a\x1b]0;owned\x07\x1b[2J\r\u202e\x9b"
+
+
+def harmless(text: str) -> bool:
+    return all(line.isprintable() for line in text.splitlines()) and "\r" not in text
+
+
+def test_what_is_nothing_to_look_at_becomes_its_escape() -> None:
+    assert printable(EVIL) == r"a\x1b]0;owned\x07\x1b[2J\r\u202e\x9b"
+    assert printable("two\nlines") == r"two\nlines"
+    assert printable("caf\udce9") == r"caf\udce9", "a file name that is no UTF-8"
+    assert printable("Größe 12 345 × “…” 界") == "Größe 12 345 × “…” 界"
+
+
+def test_an_error_is_one_line_whatever_names_it_tells() -> None:
+    told = str(ProgdfError(f"camera {EVIL}\nis broken; export it again"))
+    assert told.endswith("is broken; export it again")
+    assert told.isprintable()
+
+
+def test_info_and_check_show_names_of_a_ply_harmlessly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evil = EVIL.replace("\r", "").encode("ascii", "ignore").decode().replace(" ", "")
+    path = write(tmp_path / "scene.ply", with_extra("label", "u1", 5)(table_of(scene_of(0))))
+    path.write_bytes(path.read_bytes().replace(b"label", evil.encode()))
+    for command in ("info", "check"):
+        assert main([command, str(path)]) == 0
+        told = capsys.readouterr().out
+        assert r"\x1b]0;owned" in told
+        assert harmless(told)
+
+
+def test_info_shows_names_of_edits_sessions_and_cameras_harmlessly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = {
+        "progdf_session": 1,
+        "scene": {"file": EVIL, "sha256": ""},
+        "view": {"layers": [{"name": EVIL}]},
+    }
+    (tmp_path / "a.json").write_text(json.dumps(session))
+    save_cameras(tmp_path / f"{EVIL}.json", [replace(front_camera(), name=EVIL)])
+    scene = random_gaussians(60)
+    save_gdf(tmp_path / "a.gdf", edit_of(scene, some_rows(scene, 9), curved_field(9), name=EVIL))
+    for path in (tmp_path / "a.json", tmp_path / "a.gdf", tmp_path / f"{EVIL}.json"):
+        assert main(["info", str(path)]) == 0
+        assert harmless(capsys.readouterr().out)
+
+
+def test_an_error_line_and_a_warning_are_harmless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(tmp_path / f"{EVIL}\nb.ply")]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert harmless(told)
+    record = logging.LogRecord("progdf", logging.WARNING, "", 0, "%s is odd", (EVIL,), None)
+    assert harmless(PrintableFormatter().format(record))
+
+
+def test_the_log_of_a_run_is_harmless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = RunLog(tmp_path / "log.txt")
+    log.say(EVIL)
+    log.close()
+    assert harmless((tmp_path / "log.txt").read_text())
+    assert harmless(capsys.readouterr().err)

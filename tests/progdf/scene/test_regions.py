@@ -1,0 +1,226 @@
+"""Regions: the language they are written in, the files they come from, and their set operations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.region import Region, from_mask, intersection, union, without
+from progdf.scene.region_spec import parse_region, split_spec
+from tests.helpers.scenes import random_gaussians
+
+COUNT = 200
+KINDS = ("labels", "box", "sphere")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Gaussians:
+    return random_gaussians(COUNT, seed=2)
+
+
+def labels_file(path: Path, seed: int = 0) -> np.ndarray:
+    labels = np.random.default_rng(seed).integers(0, 5, COUNT).astype(np.uint8)
+    np.save(path, labels)
+    return labels
+
+
+def members(spec: str, scene: Gaussians) -> set[int]:
+    return set(parse_region(spec, scene).members.tolist())
+
+
+def rows(mask: torch.Tensor | np.ndarray) -> set[int]:
+    return set(np.flatnonzero(np.asarray(mask)).tolist())
+
+
+# -------------------------------------------------------------------------------------------- language
+
+
+def test_all_is_every_gaussian(scene: Gaussians) -> None:
+    region = parse_region("all", scene)
+    assert region.members.tolist() == list(range(COUNT))
+    assert region.score.tolist() == [1.0] * COUNT
+    assert region.name == "all"
+
+
+def test_a_box_holds_what_lies_between_its_corners_in_any_order(scene: Gaussians) -> None:
+    x, y, z = scene.means.unbind(1)
+    expected = (x >= -0.5) & (x <= 1) & (y >= -1.5) & (y <= 0.1) & (z >= 0) & (z <= 9)
+    assert members("box:-0.5,-1.5,0,1,1e-1,+9", scene) == rows(expected)
+    assert members("box:1,1e-1,+9,-0.5,-1.5,0", scene) == rows(expected)
+
+
+def test_a_sphere_holds_what_is_near_its_centre(scene: Gaussians) -> None:
+    distance = (scene.means - torch.tensor([0.1, -0.2, 0.3])).norm(dim=1)
+    assert members("sphere:0.1,-0.2,.3,1.2", scene) == rows(distance <= 1.2)
+
+
+def test_labels_choose_one_or_several_ids(scene: Gaussians, tmp_path: Path) -> None:
+    labels = labels_file(tmp_path / "labels.npy")
+    assert members(f"labels:{tmp_path}/labels.npy:3", scene) == rows(labels == 3)
+    assert members(f"labels:{tmp_path}/labels.npy:0,4", scene) == rows((labels == 0) | (labels == 4))
+
+
+def test_parts_join_from_left_to_right(scene: Gaussians, tmp_path: Path) -> None:
+    labels = labels_file(tmp_path / "l.npy")
+    near = scene.means.norm(dim=1).numpy() <= 1
+    spec = f"labels:{tmp_path}/l.npy:1 + labels:{tmp_path}/l.npy:2 - sphere:0,0,0,1"
+    assert members(spec, scene) == rows(((labels == 1) | (labels == 2)) & ~near)
+    spec = f"labels:{tmp_path}/l.npy:1-sphere:0,0,0,1+labels:{tmp_path}/l.npy:2"
+    assert members(spec, scene) == rows(((labels == 1) & ~near) | (labels == 2))
+    assert members("all-sphere:0,0,0,1", scene) == rows(~near)
+
+
+def test_signs_in_numbers_and_file_names_join_nothing(scene: Gaussians, tmp_path: Path) -> None:
+    path = tmp_path / "my-box+2" / "a-b+all.npy"
+    path.parent.mkdir()
+    labels = labels_file(path)
+    assert members(f"labels:{path}:1-box:-9,-9,-9,0,+9,1e-9", scene) == rows(
+        (labels == 1) & ~((scene.means[:, 0] <= 0) & (scene.means[:, 2] <= 1e-9)).numpy()
+    )
+
+
+SPECS = st.lists(
+    st.tuples(
+        st.sampled_from("+-"),
+        st.one_of(
+            st.just("all"),
+            st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4).map(
+                lambda xs: "sphere:" + ",".join(map(str, xs))
+            ),
+            st.from_regex(r"[a-z0-9+-]{1,12}", fullmatch=True)
+            .filter(lambda s: "all" not in s)
+            .map("labels:{}.npy:1".format),
+        ),
+    ),
+    min_size=1,
+    max_size=5,
+)
+
+
+@given(parts=SPECS, blank=st.sampled_from(["", " ", "  "]))
+def test_what_was_joined_comes_apart_again(parts: list[tuple[str, str]], blank: str) -> None:
+    spec = parts[0][1] + "".join(f"{blank}{sign}{blank}{part}" for sign, part in parts[1:])
+    assert split_spec(spec, KINDS) == [("+", parts[0][1]), *parts[1:]]
+
+
+def test_a_caller_may_add_kinds(scene: Gaussians) -> None:
+    def first(rest: str, scene: Gaussians) -> Region:
+        return from_mask(rest, torch.arange(len(scene)) < int(rest))
+
+    region = parse_region("all-first:150", scene, name="rest", kinds={"first": first})
+    assert region.members.tolist() == list(range(150, COUNT))
+    assert region.name == "rest"
+
+
+# ---------------------------------------------------------------------------------------------- errors
+
+
+def refusal(spec: str, scene: Gaussians) -> str:
+    with pytest.raises(ProgdfError) as caught:
+        parse_region(spec, scene)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert ";" in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("", "lacks a part"),
+        ("-all", "lacks a part"),
+        ("all+", "no known kind"),
+        ("everything", "no known kind"),
+        ("cube:1,2,3", "all, labels:…, box:…, sphere:…"),
+        ("box:1,2,3", "6 numbers"),
+        ("box:1,2,3,4,5,six", "6 numbers"),
+        ("sphere:0,0,0,nan", "4 numbers"),
+        ("sphere:0,0,0,-1", "positive"),
+        ("sphere:99,99,99,1", "the scene reaches x"),
+        ("all-all", "holds no Gaussian"),
+        ("labels:nowhere.npy:1", "nowhere.npy does not exist"),
+        ("labels:nowhere.npy", "names no label"),
+        ("labels:nowhere.npy:one", "list of integers"),
+        ("labels:nowhere.npy:1,", "list of integers"),
+    ],
+)
+def test_a_spec_that_cannot_be_meant_is_one_line(spec: str, said: str, scene: Gaussians) -> None:
+    assert said in refusal(spec, scene)
+
+
+def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp_path: Path) -> None:
+    path = tmp_path / "l.npy"
+    labels = labels_file(path)
+    assert "no Gaussian with label 7; it has 0, 1, 2, 3, 4" in refusal(f"labels:{path}:7", scene)
+    np.save(path, labels[:-1])
+    assert "199 labels, the scene 200 Gaussians" in refusal(f"labels:{path}:1", scene)
+    np.save(path, labels.reshape(20, 10))
+    assert "20x10 labels" in refusal(f"labels:{path}:1", scene)
+    np.save(path, labels.astype(np.float32))
+    assert "float32" in refusal(f"labels:{path}:1", scene)
+    np.save(path, np.array([{}, []], dtype=object), allow_pickle=True)
+    assert "not a readable .npy" in refusal(f"labels:{path}:1", scene)
+    with path.open("wb") as file:
+        np.savez(file, labels)
+    assert "not a readable .npy" in refusal(f"labels:{path}:1", scene)
+    np.save(path, labels)
+    whole = path.read_bytes()
+    bracket, leading_zero = whole.replace(b"{'descr': '", b"{'descr': ("), whole.replace(b"|u1", b"|01")
+    for content in (b"", b"hello", whole[:40], whole[:-1], bracket, leading_zero):
+        path.write_bytes(content)
+        refusal(f"labels:{path}:1", scene)
+    assert "folder" in refusal(f"labels:{tmp_path}:1", scene)
+
+
+def test_a_label_file_that_claims_too_much_allocates_nothing(scene: Gaussians, tmp_path: Path) -> None:
+    path = tmp_path / "l.npy"
+    labels_file(path)
+    path.write_bytes(path.read_bytes().replace(b"(200,)", b"(9999999999,)").replace(b"       }", b"}", 1))
+    assert "not a readable .npy" in refusal(f"labels:{path}:1", scene)
+
+
+# -------------------------------------------------------------------------------------------- algebra
+
+MASKS = st.lists(st.booleans(), min_size=12, max_size=12).map(torch.tensor)
+
+
+@given(a=MASKS, b=MASKS)
+def test_set_operations_are_those_of_sets(a: torch.Tensor, b: torch.Tensor) -> None:
+    one, two = from_mask("a", a), from_mask("b", b)
+    for operation, expected in ((union, a | b), (without, a & ~b), (intersection, a & b)):
+        region = operation(one, two)
+        assert region.members.tolist() == expected.nonzero()[:, 0].tolist()
+        assert torch.equal(region.score, expected.float())
+
+
+def test_soft_scores_keep_their_shades() -> None:
+    a = Region("a", torch.tensor([0, 1]), torch.tensor([0.9, 0.8, 0.4, 0.0]))
+    b = Region("b", torch.tensor([1, 3]), torch.tensor([0.2, 0.75, 0.5, 1.0]))
+    assert union(a, b).score.tolist() == pytest.approx([0.9, 0.8, 0.5, 1.0])
+    assert without(a, b).score.tolist() == pytest.approx([0.8, 0.25, 0.4, 0.0])
+    assert intersection(a, b).score.tolist() == pytest.approx([0.2, 0.75, 0.4, 0.0])
+    assert without(a, b).members.tolist() == [0]
+
+
+def test_regions_of_different_scenes_do_not_mix() -> None:
+    a, b = (from_mask(name, torch.ones(count, dtype=torch.bool)) for name, count in (("a", 3), ("b", 4)))
+    for operation in (union, without, intersection):
+        with pytest.raises(ValueError, match="3 Gaussians, b of 4"):
+            operation(a, b)
+
+
+def test_the_real_labels_fit_their_scene(shared_data: Path) -> None:
+    from progdf.formats.ply import load_ply
+
+    real = load_ply(shared_data / "playbot_8k.ply")
+    labels = f"labels:{shared_data / 'playbot_8k_labels.npy'}"
+    robot = parse_region(f"all-{labels}:0", real)
+    assert torch.equal(robot.members, parse_region(f"{labels}:1+{labels}:2+{labels}:3", real).members)
+    assert 0 < len(robot) < len(real)

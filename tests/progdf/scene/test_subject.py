@@ -1,0 +1,165 @@
+"""What a picture of a scene is about: what stands on the ground, whatever floats about."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.demo_scenes import DemoScene, bear, room
+from progdf.formats.ply import load_ply
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.scene.subject import fitted_eye, is_room, standpoint, subject_rows
+from progdf.scene.up_axis import guess_up
+from tests.helpers.paths import SHARED_DATA
+from tests.helpers.scenes import random_gaussians
+from viewer.camera.view_camera import FILL, first_camera, fit, to_camera
+
+DATA = SHARED_DATA
+UP = torch.tensor([0.0, 1.0, 0.0])
+FIGURE = ("body", "head", "ears", "arms", "legs", "scarf", "plinth")
+
+
+@pytest.fixture(scope="module")
+def demo() -> DemoScene:
+    return bear(6000)
+
+
+def joined(*scenes: Gaussians) -> Gaussians:
+    return Gaussians(**{name: torch.cat([getattr(scene, name) for scene in scenes]) for name in ATTRIBUTES})
+
+
+def shell(like: Gaussians, count: int, nearest: float, farthest: float, size: float) -> Gaussians:
+    """Gaussians all around, above the ground, between two distances."""
+    shape = like.shN.shape[1]
+    found = replace(random_gaussians(count, seed=3), shN=torch.zeros(count, shape, 3))
+    away = torch.nn.functional.normalize(found.means, dim=1) * torch.tensor([1.0, 0.0, 1.0]) + UP
+    far = torch.linspace(nearest, farthest, count)[:, None]
+    return replace(
+        found,
+        means=torch.nn.functional.normalize(away * torch.rand(count, 1).add(0.2), dim=1) * far,
+        log_scales=torch.full((count, 3), math.log(size)),
+        logit_opacities=torch.full((count,), 2.0),
+    )
+
+
+def agreement(rows: Tensor, wanted: Tensor) -> float:
+    """Intersection over union of two sets of rows."""
+    both = len(np.intersect1d(rows.numpy(), wanted.numpy()))
+    return both / (len(rows) + len(wanted) - both)
+
+
+def spans(scene: Gaussians, rows: Tensor, width: int = 600, height: int = 400) -> tuple[float, float]:
+    """The share of the width and of the height that these rows span in the first picture of the scene."""
+    camera = to_camera(first_camera(scene, aspect=width / height), width, height)
+    seen = scene.means[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    assert bool((seen[:, 2] > 0).all())
+    x, y = (seen[:, :2] / seen[:, 2:] * camera.K[0, 0] + camera.K[:2, 2]).unbind(1)
+    for along, side in ((x, width), (y, height)):
+        assert float((along - 0.5 * side).abs().max()) <= 0.5 * side
+    return float(x.max() - x.min()) / width, float(y.max() - y.min()) / height
+
+
+def test_the_subject_is_the_bear_and_what_it_sits_on_but_not_the_lawn(demo: DemoScene) -> None:
+    rows = subject_rows(demo.gaussians, UP)
+    assert agreement(rows, demo.members(*FIGURE)) > 0.9
+
+
+def test_a_tilted_ground_is_a_ground(demo: DemoScene) -> None:
+    angle = math.radians(15)
+    turn = torch.tensor(
+        [[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]]
+    )
+    rows = subject_rows(replace(demo.gaussians, means=demo.gaussians.means @ turn.T), UP)
+    assert agreement(rows, demo.members(*FIGURE)) > 0.9
+
+
+def test_sky_and_floaters_are_not_the_subject(demo: DemoScene) -> None:
+    scene = demo.gaussians
+    around = joined(scene, shell(scene, 2500, 20.0, 60.0, 1.5), shell(scene, 100, 3.0, 8.0, 0.02))
+    assert agreement(subject_rows(around, UP), demo.members(*FIGURE)) > 0.9
+    assert not is_room(around, UP), "a sky is no ceiling"
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e4])
+def test_the_subject_does_not_depend_on_the_unit_of_length(demo: DemoScene, factor: float) -> None:
+    scene = demo.gaussians
+    scaled = replace(scene, means=factor * scene.means, log_scales=scene.log_scales + math.log(factor))
+    assert agreement(subject_rows(scaled, UP), subject_rows(scene, UP)) > 0.999
+
+
+def test_without_a_ground_all_is_the_subject(demo: DemoScene) -> None:
+    alone = demo.gaussians[demo.members(*FIGURE[:-1])]
+    assert len(subject_rows(alone, UP)) > 0.99 * int((alone.opacities > 0.1).sum())
+
+
+def test_a_bare_ground_is_the_subject_itself(demo: DemoScene) -> None:
+    lawn = demo.gaussians[demo.members("grass")]
+    assert len(subject_rows(lawn, UP)) > 0.95 * int((lawn.opacities > 0.1).sum())
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 63, 64, 65])
+def test_a_few_gaussians_have_a_subject_too(count: int) -> None:
+    rows = subject_rows(random_gaussians(count), UP)
+    assert 1 <= len(rows) <= count
+
+
+def test_in_the_first_picture_the_subject_takes_two_thirds(demo: DemoScene) -> None:
+    width, height = spans(demo.gaussians, demo.members(*FIGURE))
+    assert 0.6 < max(width, height) < 0.8
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs the shared scenes")
+@pytest.mark.parametrize("name", ["playbot_8k", "playbot_31k", "playbot_125k"])
+def test_a_trained_robot_and_its_hands_fill_the_first_picture_and_the_ground_does_not(name: str) -> None:
+    scene = load_ply(DATA / f"{name}.ply")
+    robot = torch.from_numpy(np.load(DATA / f"{name}_labels.npy")).bool().nonzero()[:, 0]
+    rows = torch.zeros(len(scene), dtype=torch.bool)
+    rows[subject_rows(scene, guess_up(scene))] = True
+    taken = max(1, -(-len(scene) // 60_000))
+    assert int(rows[robot].sum()) > 0.9 * len(robot) / taken
+    rows[robot] = False
+    assert int(rows.sum()) < 0.1 * len(robot) / taken
+    assert 0.6 < max(spans(scene, robot)) < 0.8
+
+
+def test_the_eye_stands_as_near_as_it_can() -> None:
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3) * torch.tensor([3.0, 1.0, 2.0])
+    eye = fitted_eye(corners, 0.0, torch.eye(3), (0.5, 0.5))
+    torch.testing.assert_close(eye, torch.tensor([0.0, 0.0, 8.0], dtype=torch.float64))
+    shown = corners.double() - eye
+    assert float((shown[:, :2].abs().amax(dim=1) / -shown[:, 2]).max()) == pytest.approx(0.5)
+
+
+def test_one_gaussian_fills_the_picture_by_its_size() -> None:
+    scene = random_gaussians(1)
+    camera = first_camera(scene, aspect=1.0)
+    half = math.atan(2 * float(scene.scales.max()) / camera.distance)
+    assert half == pytest.approx(math.atan(FILL * math.tan(math.radians(22.5))), rel=0.1)
+
+
+def test_fitting_keeps_the_direction_and_the_lens(demo: DemoScene) -> None:
+    first = replace(first_camera(demo.gaussians), azimuth=80.0, elevation=-10.0, fov_y=30.0)
+    scarf = fit(first, demo.gaussians[demo.members("scarf")], 1.5)
+    assert (scarf.azimuth, scarf.elevation, scarf.fov_y, scarf.up) == (80.0, -10.0, 30.0, first.up)
+    assert scarf.distance < first.distance
+
+
+def test_a_room_is_met_inside_past_what_stands_in_it() -> None:
+    demo = room(4000)
+    assert is_room(demo.gaussians, UP)
+    eye, target = standpoint(demo.gaussians, UP)
+    assert float(eye[[0, 2]].abs().max()) < 1.9, "within its walls"
+    assert 0.8 < float(eye[1]) < 2.2, "between its floor and its ceiling"
+    assert float((target - eye).norm()) > 1.0
+    nearest = float((demo.gaussians.means - eye).norm(dim=1).min())
+    assert nearest > 0.3, "with nothing in one's face"
+    assert first_camera(demo.gaussians).fov_y == 60.0
+
+
+def test_a_bear_under_the_sky_is_no_room(demo: DemoScene) -> None:
+    assert not is_room(demo.gaussians, UP)

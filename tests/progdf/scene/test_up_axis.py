@@ -1,0 +1,160 @@
+"""Which way is up: said, told by cameras, shown by a ground, kept with an edit; else the convention."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.__main__ import main
+from progdf.cli.options import parsed
+from progdf.demo_scenes import bear, room
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import save_gdf
+from progdf.io.cameras import save_cameras
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.up_axis import AXES, axis_direction, find_up, guess_up, saved_up
+from tests.helpers.scenes import ball, random_gaussians
+from tests.helpers.stacks import bear_stack
+from viewer.camera.view_camera import first_camera
+from viewer.commands import opening
+from viewer.commands.options import RenderOptions
+from viewer.files import session
+
+MINUS_Y = [0.0, -1.0, 0.0]
+
+
+def statue() -> Gaussians:
+    """A tall thing without a ground, whose flat sides face x: nothing tells which way is up."""
+    scene = random_gaussians(4000, seed=3)
+    place = torch.rand(4000, 3, generator=torch.Generator().manual_seed(3)) - 0.5
+    place[:, 0] = 0.5 * place[:, 0].sign()
+    return replace(
+        scene,
+        means=place * torch.tensor([1.0, 3.0, 1.0]),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4000, 4).contiguous(),
+        log_scales=torch.tensor([0.002, 0.03, 0.03]).log().expand(4000, 3).contiguous(),
+        logit_opacities=torch.full((4000,), 2.0),
+    )
+
+
+def test_flat_sides_of_a_thing_without_a_ground_are_no_floor() -> None:
+    assert guess_up(statue()).tolist() == MINUS_Y
+
+
+def test_a_picture_that_lies_flat_is_no_ground() -> None:
+    flat = statue()
+    flat = replace(flat, means=flat.means * torch.tensor([0.001, 1.0, 1.0]))
+    assert guess_up(flat).tolist() == MINUS_Y
+
+
+@pytest.mark.parametrize("make", [bear, room])
+def test_the_grounds_of_the_demo_scenes_speak_against_the_convention(make: object) -> None:
+    demo = make(3000)  # type: ignore[operator]
+    found = find_up(demo.gaussians)
+    assert torch.equal(found.direction, demo.up)
+    assert "ground" in found.reason
+
+
+def test_what_is_said_goes_before_cameras_and_ground() -> None:
+    demo = bear(3000)
+    for axis in AXES:
+        found = find_up(demo.gaussians, demo.cameras, axis)
+        assert found.name == axis
+        assert torch.equal(found.direction, axis_direction(axis))
+
+
+def test_cameras_go_before_a_ground_and_are_level_within_two_degrees() -> None:
+    scene = bear(3000).gaussians
+    held = torch.nn.functional.normalize(torch.tensor([0.01, 0.0, -1.0]), dim=0)
+    assert find_up(scene, orbit_rig(ball(), 12, 64, 64, up=held, elevations=(0.0, 0.0))).name == "-z"
+
+
+def test_too_few_gaussians_are_upright_by_convention() -> None:
+    assert guess_up(random_gaussians(3)).tolist() == MINUS_Y
+
+
+def test_a_saved_up_axis_comes_back_and_nonsense_does_not() -> None:
+    up = find_up(bear(3000).gaussians)
+    kept = saved_up(up.saved())
+    assert kept is not None
+    assert torch.equal(kept, up.direction)
+    for nonsense in (
+        None,
+        3,
+        {},
+        {"direction": [0, 0, 0]},
+        {"direction": [0, "y", 0]},
+        {"direction": [1e99] * 3},
+    ):
+        assert saved_up(nonsense) is None
+
+
+def test_an_axis_may_begin_with_a_minus_on_the_command_line() -> None:
+    assert parsed(RenderOptions, ["a.ply", "--up", "-z", "-o", "b.png"], "progdf render").up == "-z"
+
+
+def test_check_prints_boxes_to_paste_and_the_up_axis(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = random_gaussians(1000, seed=5)
+    scene.means[0] = torch.tensor([70.0, 0.0, 0.0])
+    save_ply(tmp_path / "a.ply", scene)
+    level = orbit_rig(ball(), 6, 64, 64, up=torch.tensor([1.0, 0.0, 0.0]), elevations=(0.0, 0.0))
+    save_cameras(tmp_path / "c.json", level)
+
+    def said(*options: str) -> list[str]:
+        assert main(["check", str(tmp_path / "a.ply"), *options]) == 0
+        return capsys.readouterr().out.splitlines()
+
+    from progdf.scene.region_spec import parse_region
+
+    lines = said()
+    assert "up: -y, by convention, as no ground tells; --up says otherwise" in lines
+    read = load_ply(tmp_path / "a.ply")
+    boxes = [line.partition("--region ")[2] for line in lines if "--region box:" in line]
+    bulk, whole = (parse_region(box, read) for box in boxes)
+    assert len(whole) == 1000
+    assert 850 <= len(bulk) <= 999
+    assert 0 not in bulk.members.tolist()
+    assert "up: +z, as --up says" in said("--up", "+z")
+    assert "up: +x, as the cameras are held" in said("--cameras", str(tmp_path / "c.json"))
+
+
+def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:
+    options = parsed(RenderOptions, [*arguments, "-o", str(tmp_path / "p.png")], "progdf render")
+    found = opening.opened(options)
+    return found.up if found.session is None else found.view.camera.up
+
+
+def test_an_edit_shows_its_scene_upright_without_being_asked(tmp_path: Path) -> None:
+    stack = bear_stack(2000)
+    scene, scarf, _ = stack.save(tmp_path)
+    plus_y, plus_x = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
+    assert upright(tmp_path, str(scene)) == plus_y
+    save_gdf(scarf, replace(stack.gdfs[0], report={"up": {"direction": [1.0, 0.0, 0.0], "reason": "told"}}))
+    assert upright(tmp_path, str(scene), str(scarf)) == plus_x
+    assert upright(tmp_path, str(scene), str(scarf), "--up", "+y") == plus_y
+
+
+def test_a_session_keeps_the_up_axis_and_up_changes_it(tmp_path: Path) -> None:
+    stack = bear_stack(2000)
+    scene, _, _ = stack.save(tmp_path)
+    options = parsed(RenderOptions, [str(scene), "-o", "p.png"], "progdf render")
+    found = opening.opened(options)
+    view = replace(found.view, camera=first_camera(found.document.scene, up=(0.0, 0.0, 1.0)))
+    session.save(tmp_path / "a.session.json", session.Session(found.document, view))
+    assert upright(tmp_path, str(tmp_path / "a.session.json")) == (0.0, 0.0, 1.0)
+    assert upright(tmp_path, str(tmp_path / "a.session.json"), "--up", "-y") == (0.0, -1.0, 0.0)
+
+
+def tilted(up: Tensor) -> str:
+    return find_up(statue(), orbit_rig(ball(), 12, 64, 64, up=up, elevations=(0.0, 0.0))).name
+
+
+def test_a_tilted_up_direction_is_named_by_its_numbers() -> None:
+    assert tilted(torch.nn.functional.normalize(torch.tensor([0.0, -1.0, 0.3]), dim=0)).startswith("0")

@@ -1,0 +1,167 @@
+"""Scenes trained with Mip-Splatting's 2D filter: they say so, and are drawn so everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import moderngl
+import pytest
+import torch
+
+from progdf.__main__ import main
+from progdf.compose.reference import Layer, compose
+from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
+from progdf.formats.ply_header import read_header
+from progdf.gaussians import Gaussians, pack
+from progdf.rasterize import alpha_weights, render
+from progdf.region import Region
+from tests.helpers.ply_files import scene_of, table_of, write
+from tests.helpers.scenes import front_camera
+from tests.helpers.stacks import Stack, bear_stack
+from trainer.views.crops import crop_scene
+from trainer.views.view import make_view
+from viewer.camera.view_camera import first_camera, to_camera
+from viewer.render.engine import Engine
+from viewer.render.headless import headless_context
+from viewer.state.view_state import LayerState, ViewState
+
+WHITE = torch.ones(3)
+SIZE = (96, 72)
+
+
+@pytest.fixture(scope="module")
+def stack() -> Stack:
+    made = bear_stack(1500)
+    return replace(made, demo=replace(made.demo, gaussians=replace(made.scene, antialiased=True)))
+
+
+@pytest.fixture(scope="module")
+def ctx() -> Iterator[moderngl.Context]:
+    context = headless_context()
+    yield context
+    context.release()
+
+
+def with_comment(path: Path, comment: bytes) -> Path:
+    save_ply(path, scene_of(0))
+    path.write_bytes(path.read_bytes().replace(b"\nelement", b"\ncomment " + comment + b"\nelement", 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("comment", "expected"),
+    [
+        (b"SplatRenderMode: mip", True),
+        (b"  splatrendermode:  MIP ", True),
+        (b"antialiased 1", True),
+        (b"SplatRenderMode: default", False),
+        (b"antialiased 0", False),
+        (b"antialiased 1\ncomment antialiased 0", False),
+        (b"not antialiased 1", False),
+        (b"SplatRenderMode: \x1b[2Jmip\xff\xfe", False),
+    ],
+)
+def test_a_comment_says_that_a_scene_is_antialiased(tmp_path: Path, comment: bytes, expected: bool) -> None:
+    scene, report = load_ply_with_report(with_comment(tmp_path / "scene.ply", comment))
+    assert scene.antialiased is report.antialiased is expected
+
+
+def test_check_says_it_and_never_shows_a_comment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = with_comment(tmp_path / "scene.ply", b"antialiased 1\ncomment \x1b]0;pwned\x07")
+    assert main(["check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "trained anti-aliased (mip), and drawn so" in said
+    assert "\x1b" not in said
+    assert "pwned" not in said
+
+
+def test_a_saved_scene_still_says_it(tmp_path: Path) -> None:
+    save_ply(tmp_path / "mip.ply", replace(scene_of(1), antialiased=True))
+    assert read_header(tmp_path / "mip.ply").antialiased
+    again = load_ply(tmp_path / "mip.ply")
+    assert again.antialiased
+    save_ply(tmp_path / "plain.ply", replace(again, antialiased=False))
+    assert b"comment" not in (tmp_path / "plain.ply").read_bytes()[:400]
+
+
+def test_a_repaired_scene_still_says_it(tmp_path: Path) -> None:
+    columns = table_of(scene_of(0))
+    columns["opacity"][3] = torch.inf
+    path = write(tmp_path / "inf.ply", columns)
+    path.write_bytes(path.read_bytes().replace(b"\nelement", b"\ncomment antialiased 1\nelement", 1))
+    scene, report = load_ply_with_report(path)
+    assert report.opaque == 1
+    assert scene.antialiased
+
+
+def test_rows_types_and_edits_keep_it(stack: Stack) -> None:
+    scene = stack.scene
+    rows = torch.arange(5)
+    assert scene[rows].antialiased
+    assert scene.to(dtype=torch.float64).antialiased
+    assert scene.replace_rows(rows, pack(scene[rows])).antialiased
+    assert compose(scene, [Layer(stack.gdfs[0], 0.5)]).antialiased
+
+
+def test_an_exported_edit_still_says_it(stack: Stack, tmp_path: Path) -> None:
+    scene, edit, *_ = stack.save(tmp_path)
+    assert main(["export", str(scene), str(edit), "--out", str(tmp_path / "edited.ply")]) == 0
+    assert load_ply(tmp_path / "edited.ply").antialiased
+
+
+def test_weights_count_what_is_drawn(stack: Stack) -> None:
+    """Σ w over all Gaussians is the share of a pixel that they cover, with the filter as without."""
+    scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), 40, 30)
+    white = replace(scene, sh0=torch.full_like(scene.sh0, 1.7724539), shN=scene.shN[:, :0])
+    covered = render(white, camera, (0.0, 0.0, 0.0))[..., 0].sum()
+    for engine in ("cpu", "reference"):
+        weights = alpha_weights(scene, camera, torch.ones(30, 40), engine=engine)[:, 2].sum()
+        torch.testing.assert_close(weights, covered, rtol=1e-4, atol=0.0)  # sums of float32
+
+
+def test_training_views_show_what_is_drawn(stack: Stack) -> None:
+    scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), *SIZE)
+    region = Region("all", torch.arange(len(scene)), torch.ones(len(scene)))
+    expected = render(scene, camera, WHITE).clamp(0.0, 1.0)
+    view = make_view(scene, region, camera, WHITE)
+    torch.testing.assert_close(view.image, expected, rtol=0.0, atol=2e-6)
+    for still in (False, True):
+        crop = crop_scene(scene, region.members, camera, (0, 0, *SIZE), WHITE, still)
+        image, _ = crop.render(pack(scene))
+        torch.testing.assert_close(image, expected, rtol=0.0, atol=2e-6)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("draw", ["gl", "cpu"])
+def test_the_window_draws_it_as_the_rasteriser_does(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
+    view = ViewState(
+        camera=first_camera(stack.scene, stack.demo.cameras), layers=(LayerState(0, "scarf", 0.7),)
+    )
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw)  # type: ignore[arg-type]
+    try:
+        found = torch.from_numpy(engine.image(view, SIZE))
+    finally:
+        engine.release()
+    edited = compose(stack.scene, [Layer(stack.gdfs[0], 0.7)])
+    expected = render(edited, to_camera(view.camera, *SIZE), view.background)
+    fat = render(replace(edited, antialiased=False), to_camera(view.camera, *SIZE), view.background)
+    assert float((found - expected).abs().max()) < 1 / 255  # a rim at the 1/255 cut, as in test_gl_parity
+    assert float((found - fat).abs().max()) > 0.1
+
+
+def test_one_point_is_drawn_with_the_stated_share_of_its_opacity() -> None:
+    """det0 / det is 0 for a point, and the root of the floor 0.005 is left of its opacity."""
+    camera = front_camera(9, 9)
+    point = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 2.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        log_scales=torch.full((1, 3), -20.0),
+        logit_opacities=torch.zeros(1),
+        sh0=torch.full((1, 3), -1.7724539),
+        shN=torch.zeros(1, 0, 3),
+        antialiased=True,
+    )
+    ink = [float((1 - render(replace(point, antialiased=a), camera, WHITE)).max()) for a in (True, False)]
+    torch.testing.assert_close(ink[0] / ink[1], 0.005**0.5, rtol=1e-3, atol=0.0)

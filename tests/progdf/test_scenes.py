@@ -1,0 +1,213 @@
+"""The bear: exact size, seeded, labelled, opaque; and edits whose course is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from progdf import demo_scenes as scenes
+from progdf.color.edits import typical_color
+from progdf.demo_scenes import bear_paint, surface
+from progdf.demo_scenes.assemble import assemble
+from progdf.demo_scenes.bear_parts import bear_parts
+from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.rasterize import render
+from progdf.sh import sh0_to_rgb
+
+
+@pytest.fixture(scope="module")
+def bear() -> scenes.DemoScene:
+    return scenes.bear(6000)
+
+
+def _same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ATTRIBUTES)
+
+
+@pytest.mark.parametrize("size", [scenes.SMALLEST, 401, 1999, 5003])
+def test_the_bear_has_exactly_the_size_asked_for(size: int) -> None:
+    scene = scenes.bear(size)
+    assert len(scene.gaussians) == size
+    assert scene.labels.shape == (size,)
+    assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
+
+
+def test_the_same_seed_gives_the_same_bear_and_another_seed_another(bear: scenes.DemoScene) -> None:
+    assert _same(bear.gaussians, scenes.bear(6000).gaussians)
+    assert not torch.equal(bear.gaussians.means, scenes.bear(6000, seed=1).gaussians.means)
+
+
+def test_making_a_bear_leaves_torch_as_it_was() -> None:
+    torch.manual_seed(5)
+    before, threads = torch.get_rng_state(), torch.get_num_threads()
+    scenes.bear(scenes.SMALLEST)
+    assert torch.equal(before, torch.get_rng_state())
+    assert torch.get_num_threads() == threads
+
+
+def test_a_room_has_its_size_and_all_its_things_and_is_seeded() -> None:
+    scene = scenes.room(2503)
+    assert len(scene.gaussians) == 2503
+    assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
+    assert _same(scene.gaussians, scenes.room(2503).gaussians)
+    with pytest.raises(ProgdfError, match="too few for a room; at least"):
+        scenes.room(scenes.SMALLEST_ROOM - 1)
+
+
+def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
+    scene = scenes.room(6000)
+    for camera in scene.cameras:
+        x, y, z = camera.position.tolist()
+        assert max(abs(x), abs(z)) < 1.9
+        assert 0.9 < y < 2.0
+    camera = scene.cameras[5].resized(96, 72)
+    red, green = (render(scene.gaussians, camera, background=c) for c in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    # closed on all sides: next to nothing of the background is left
+    assert float((red - green).abs().mean()) < 0.02
+
+
+def test_a_part_that_lies_inside_another_is_reported_not_searched_for() -> None:
+    outer = surface.Part("outer", "x", surface.ball(), torch.zeros(3), torch.eye(3))
+    inner = surface.Part("inner", "x", surface.ball(), torch.zeros(3), 0.1 * torch.eye(3))
+    with pytest.raises(ValueError, match="lies inside other parts; move it"):
+        assemble([outer, inner], ("x",), bear_paint.paint, 500, 0)
+
+
+def test_too_few_gaussians_for_a_bear_are_refused() -> None:
+    with pytest.raises(ProgdfError, match="too few for a bear; at least"):
+        scenes.bear(scenes.SMALLEST - 1)
+
+
+def test_every_number_of_the_bear_is_usable(bear: scenes.DemoScene) -> None:
+    g = bear.gaussians
+    assert all(getattr(g, name).isfinite().all() for name in ATTRIBUTES)
+    assert g.sh_degree == 1
+    assert torch.allclose(g.quats.norm(dim=1), torch.ones(len(g)), atol=1e-5)
+    assert g.scales.min() > 1e-5
+    assert g.scales.max() < 0.5
+    assert g.opacities.min() > 0.4
+    assert g.opacities.std() > 0.02
+
+
+def test_some_colours_are_clamped_as_in_real_scenes(bear: scenes.DemoScene) -> None:
+    rgb = sh0_to_rgb(bear.gaussians.sh0)
+    assert (rgb < 0.03).any()
+    assert (rgb > 0.97).any()
+
+
+def test_labels_tell_where_the_parts_are(bear: scenes.DemoScene) -> None:
+    order = ["ears", "head", "scarf", "body", "plinth", "grass"]
+    heights = [float(bear.gaussians.means[bear.members(name), 1].mean()) for name in order]
+    assert heights == sorted(heights, reverse=True)
+    assert len(bear.members("arms", "legs")) == len(bear.members("arms")) + len(bear.members("legs"))
+    with pytest.raises(ProgdfError, match="no part 'wings'; it has body, head"):
+        bear.members("wings")
+
+
+def test_no_gaussian_is_buried_in_another_part() -> None:
+    scene = scenes.bear(3000)
+    body = next(part for part in bear_parts() if part.name == "body")
+    others = scene.gaussians.means[scene.labels != scene.label_names.index("body")]
+    assert float(body.depth(others).max()) < 0.05
+
+
+def test_the_bear_has_no_holes_seen_from_its_cameras(bear: scenes.DemoScene) -> None:
+    # what shines through from behind changes with the background, and nothing else does
+    red, green = (
+        render(bear.gaussians, bear.cameras[0].resized(160, 160), background=color)
+        for color in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    )
+    leak = (red - green).abs().amax(dim=2)
+    rows, columns = torch.meshgrid(torch.arange(160), torch.arange(160), indexing="ij")
+    inside = (columns > 66) & (columns < 94) & (rows > 35) & (rows < 100)
+    assert float(leak[inside].mean()) < 0.01
+    assert float(leak[inside].max()) < 0.15
+    assert float(leak[:10].min()) > 0.95
+
+
+def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
+    front, back = bear.cameras[0], bear.cameras[16]
+    assert float(front.position[2]) > 2
+    assert abs(float(front.position[0])) < 1e-4
+    assert float(back.position[2]) < -2
+    image = render(bear.gaussians, front.resized(128, 128), background=bear.background)
+    assert torch.allclose(image[2, 2], torch.tensor(bear.background), atol=0.02)
+    dark = (image.amax(dim=2) < 0.2).nonzero().float().mean(0)
+    assert 25 < float(dark[0]) < 60  # eyes and nose: the darkest of the picture, in its upper half
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [surface.ball(), surface.ball(5.0), surface.ring(0.3), surface.lathe((0.5, 1.0, 0.3), (1.0, 0.2, -1.0))],
+)
+def test_samples_lie_on_the_surface_and_their_normals_point_out(shape: surface.Shape) -> None:
+    matrix = torch.tensor([[0.5, 0.1, 0.0], [0.0, 0.8, 0.0], [0.1, 0.0, 0.3]])
+    part = surface.Part("x", "x", shape, torch.tensor([1.0, 2.0, 3.0]), matrix)
+    at = surface.sample(part, 700)
+    # the profile is a polyline of 512 pieces
+    assert torch.allclose(shape.level(part.to_local(at.points)), torch.ones(700), atol=2e-3)
+    assert (shape.level(part.to_local(at.points + 0.01 * at.normals)) > 1).all()
+
+
+def test_samples_are_even_by_area() -> None:
+    sphere = surface.Part("x", "x", surface.ball(), torch.zeros(3), 2.0 * torch.eye(3))
+    at = surface.sample(sphere, 1000)
+    assert torch.allclose((at.spacing**2).sum(), torch.tensor(16 * math.pi), rtol=1e-2)
+    distance = torch.cdist(at.points, at.points).fill_diagonal_(9.0).amin(dim=1)
+    assert float(distance.min()) > 0.6 * float(at.spacing.mean())
+
+
+@pytest.mark.parametrize("name", ["gold", "blue scarf", "stripes", "big ears", "tilted ears", "night"])
+def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
+    bear: scenes.DemoScene, name: str
+) -> None:
+    edit, members = scenes.bear_edits(bear)[name]
+    assert _same(edit.apply(bear.gaussians, members, 0.0), bear.gaussians)
+    edited = edit.apply(bear.gaussians, members, 0.7)
+    others = torch.ones(len(bear.gaussians), dtype=torch.bool)
+    others[members] = False
+    assert _same(edited[others], bear.gaussians[others])
+    assert not _same(edited[members], bear.gaussians[members])
+
+
+def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoScene) -> None:
+    ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
+    edited = scenes.grown(3.0, pivot).apply(bear.gaussians, ears, 0.5)
+    before = bear.gaussians[ears]
+    assert torch.allclose(edited.means[ears] - pivot, 2 * (before.means - pivot), atol=1e-5)
+    assert torch.allclose(edited.scales[ears], 2 * before.scales, rtol=1e-5)
+
+
+def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
+    ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
+    edit = scenes.swung(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
+    half = edit.apply(bear.gaussians, ears, 0.5)[ears]
+    arm = bear.gaussians.means[ears] - pivot
+    expected = torch.stack([-arm[:, 1], arm[:, 0], arm[:, 2]], dim=1)
+    assert torch.allclose(half.means - pivot, expected, atol=1e-5)
+    # the picture turns with it: a quarter turn about z of everything, seen by a camera turned alike
+    camera = bear.cameras[0].resized(96, 96)
+    whole = torch.arange(len(bear.gaussians))
+    plain = replace(bear.gaussians, shN=torch.zeros(len(bear.gaussians), 0, 3))
+    turned = scenes.swung(180.0, torch.tensor([0.0, 0.0, 1.0]), torch.zeros(1, 3)).apply(plain, whole, 0.5)
+    quarter = torch.eye(4)
+    quarter[:2, :2] = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
+    same = render(turned, replace(camera, viewmat=camera.viewmat @ quarter))
+    assert (same - render(plain, camera)).abs().max() < 1e-2
+
+
+def test_recolouring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
+    scarf = bear.members("scarf")
+    target = torch.tensor([0.1, 0.5, 0.3])
+    edited = scenes.recolored(target).apply(bear.gaussians, scarf, 1.0)
+    assert torch.allclose(typical_color(sh0_to_rgb(edited.sh0[scarf])), target, atol=0.12)
+
+
+@pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
+def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
+    with pytest.raises(ProgdfError, match="0 to 1 would be right"):
+        scenes.darkened().apply(bear.gaussians, torch.arange(3), strength)

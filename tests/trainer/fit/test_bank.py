@@ -1,0 +1,208 @@
+"""The memory bank, and networks that a run trains alongside its edit or after it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field import neural_fit
+from progdf.field.neural_fit import NeuralFit, NeuralSettings
+from progdf.field.trajectory import load_trajectory
+from progdf.formats.ply import load_ply
+from progdf.gdf.file import load_gdf
+from tests.helpers.edits import curved_trajectory
+from tests.helpers.trained import quick_options, write_bear
+from trainer.fit.memory_bank import Alongside, MemoryBank
+from trainer.options import FitOptions, check_network_options, settled
+from trainer.pipeline.run import RunResult, refit, train
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_fits() -> Iterator[None]:
+    """Networks of a few hundred steps, on one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(neural_fit, "EFFORT", {"tiny": (300, 256, 5e-3)})
+        patch.setattr("trainer.fit.network.EFFORT", neural_fit.EFFORT)
+        yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def alongside(folder: Path) -> RunResult:
+    """A finished run whose network was trained beside the edit."""
+    return train(
+        quick_options(folder, "alongside", steps=60, stages=2, field="neural", fit="alongside"), quiet=True
+    )
+
+
+# ---- the bank
+
+
+def test_a_bank_begins_with_the_original() -> None:
+    bank = MemoryBank(5, 14)
+    assert bank.strengths.tolist() == [0.0]
+    assert not bool(bank.offsets.any())
+
+
+def test_a_bank_keeps_half_precision_in_order() -> None:
+    bank = MemoryBank(5, 14)
+    offsets = torch.randn(5, 14)
+    bank.add(0.25, offsets)
+    assert bank.offsets.dtype == torch.float16
+    assert torch.equal(bank.offsets[1], offsets.half())
+    with pytest.raises(ValueError, match=r"after one at 0\.25"):
+        bank.add(0.25, offsets)
+
+
+def test_a_full_bank_drops_what_its_neighbours_tell() -> None:
+    bank = MemoryBank(1, 14, most=4)
+    for strength in (0.3, 0.35, 0.4, 1.0):
+        bank.add(strength, torch.full((1, 14), strength))
+    assert bank.strengths.tolist() == pytest.approx([0.0, 0.3, 0.4, 1.0])
+    assert bank.offsets[:, 0, 0].tolist() == pytest.approx([0.0, 0.3, 0.4, 1.0], abs=1e-3)
+
+
+def beside(seed: int = 0) -> Alongside:
+    rows = torch.randn(20, 14, generator=torch.Generator().manual_seed(1))
+    settings = NeuralSettings(inputs="position", batch=32, seed=seed)
+    fit = NeuralFit(rows, 14, ("sh0",), settings)
+    return Alongside(fit, 14, (0.5, 1.0), (10, 20), lambda moved: moved[:, 11:14])
+
+
+def test_until_the_way_is_known_a_step_stands_for_its_place_in_its_stage() -> None:
+    along = beside()
+    assert [along.strength(step) for step in (0, 5, 10, 20, 30)] == [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def test_the_field_waits_for_the_first_recording() -> None:
+    along = beside()
+    along.step()
+    assert along.fit.steps == 0
+    along.add(3, curved_trajectory(20, moving=("sh0",))[1][4])
+    along.step()
+    assert along.fit.steps == 1
+
+
+def test_what_trains_alongside_goes_on_to_the_same_bits() -> None:
+    _, offsets = curved_trajectory(20, moving=("sh0",))
+    recordings = [(4, offsets[3].half()), (11, offsets[5].half()), (25, offsets[8].half())]
+
+    def run(along: Alongside, begin: int, end: int) -> None:
+        for step in range(begin, end):
+            for at, found in recordings:
+                if at == step:
+                    along.add(at, found)
+            along.step()
+
+    whole, first, second = beside(), beside(), beside()
+    run(whole, 0, 30)
+    run(first, 0, 15)
+    kept = first.saved()
+    second.restore(replace(kept, tensors={name: tensor.clone() for name, tensor in kept.tensors.items()}))
+    second.refill([(at, found) for at, found in recordings if at < 15])
+    run(second, 15, 30)
+    for name, tensor in whole.saved().tensors.items():
+        assert torch.equal(tensor, second.saved().tensors[name]), name
+
+
+# ---- runs
+
+
+def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
+    folder: Path, alongside: RunResult
+) -> None:
+    field = alongside.report["field"]
+    assert field["kind"] == "neural"
+    assert field["endpoint_error"] == 0.0
+    assert field["outside_change"] == 0.0
+    assert field["psnr_worst"] > alongside.report["baselines"]["keyframes2"]["psnr_worst"] + 3.0
+    assert field["bake_error"]["psnr_worst"] > field["psnr_worst"]
+    assert 0.0 <= field["position_floor"]["unpredictable"]["sh0"] <= 1.0
+    gdf = load_gdf(alongside.gdf, load_ply(folder / "scene.ply"))
+    assert gdf.field.origin is not None
+    assert gdf.field.origin.network.shape.inputs == "position"
+
+
+def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
+    folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = replace(
+        quick_options(folder, "again", steps=60, stages=2, field="neural", fit="alongside", save_every=0.0),
+        name="alongside",
+    )
+    step, steps = Alongside.step, 0
+
+    def interrupted(self: Alongside) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 31:
+            raise KeyboardInterrupt
+        step(self)
+
+    monkeypatch.setattr(Alongside, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="--resume"):
+        train(options, quiet=True)
+    monkeypatch.setattr(Alongside, "step", step)
+    found = train(replace(options, resume=True), quiet=True)
+    scene = load_ply(folder / "scene.ply")
+    one, other = (load_gdf(result.gdf, scene).field.origin for result in (alongside, found))
+    assert one is not None
+    assert other is not None
+    for name, tensor in one.network.tensors.items():
+        assert torch.equal(tensor, other.network.tensors[name]), name
+
+
+def test_a_refit_trains_a_network_on_what_was_recorded(folder: Path, alongside: RunResult) -> None:
+    before = alongside.folder.trajectory.read_bytes()
+    kept = alongside.gdf.read_bytes()
+    found = refit(
+        FitOptions(alongside.folder.root, field="neural", code=2, picture_loss=0.5, threads=1), quiet=True
+    )
+    assert alongside.folder.trajectory.read_bytes() == before
+    origin = load_gdf(found.gdf, load_ply(folder / "scene.ply")).field.origin
+    assert origin is not None
+    assert (origin.network.shape.inputs, origin.network.shape.code) == ("own", 2)
+    trajectory, _, _ = load_trajectory(found.folder.trajectory)
+    assert _end(found, folder).equal(trajectory.end)
+    alongside.gdf.write_bytes(kept)
+
+
+def _end(result: RunResult, folder: Path) -> Tensor:
+    return load_gdf(result.gdf, load_ply(folder / "scene.ply")).field.offsets(1.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"size": "small"}, "--size means nothing to --field auto; add --field neural"),
+        ({"fit": "alongside", "field": "keyframes"}, "--fit means nothing to --field keyframes"),
+        ({"picture_loss": 1.0, "field": "separable"}, "--picture-loss means nothing to --field separable"),
+        ({"field": "neural", "code": 65}, "--code is 65; 0 to 64"),
+        ({"field": "neural", "picture_loss": -1.0}, "--picture-loss is"),
+    ],
+)
+def test_network_options_that_mean_nothing_are_told(
+    folder: Path, changed: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ProgdfError, match=message):
+        settled(quick_options(folder, **changed))
+
+
+def test_a_refit_knows_its_options_too(folder: Path) -> None:
+    with pytest.raises(ProgdfError, match="--bins means nothing"):
+        check_network_options(FitOptions(folder, bins="hard"))

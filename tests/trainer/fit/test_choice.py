@@ -1,0 +1,60 @@
+"""Which field is kept: by its worst picture, within its budget, whatever way led to it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from progdf.field import Candidate, FieldJudge, choose_field, fit_separable
+from progdf.field.choose import _chosen, separable_within
+from progdf.field.rendered import rendered_courses
+from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
+
+
+def test_the_best_field_is_the_one_whose_worst_picture_is_best() -> None:
+    steady = Candidate(curved_field(3), (30.0, 31.0), "steady")
+    uneven = Candidate(curved_field(3), (20.0, 60.0), "good on the mean")
+    assert _chosen((uneven, steady), 99.0, None).best is steady
+
+
+def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another() -> None:
+    strengths, offsets = curved_trajectory(20, snapshots=3)
+    shown = linear_pictures(20, 14)
+    judge = FieldJudge(strengths, offsets, shown, lambda s: s**4 * offsets[-1])
+    chosen = choose_field(strengths, offsets, shown, kind="lossless", target=80.0, judge=judge)
+    assert chosen.best.worst < 80.0
+    assert not chosen.met
+
+
+def test_curves_are_tried_where_keyframes_are_asked_for() -> None:
+    strengths, offsets = curved_trajectory(20, snapshots=17)
+    chosen = choose_field(strengths, offsets, linear_pictures(20, 14), kind="keyframes", target=50.0)
+    assert any("cubic" in c.label for c in chosen.tried)
+    assert any("cubic" not in c.label and c.label.endswith("keyframes") for c in chosen.tried)
+
+
+def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:
+    strengths, offsets = curved_trajectory(40)
+    shown = linear_pictures(40, 14)
+
+    def far(moved: Tensor) -> Tensor:
+        return (10 * shown(moved)).sin() / 2  # so far from linear that effects do not add up
+
+    judge = FieldJudge(strengths, offsets, far)
+    seen = rendered_courses(offsets, torch.ones(40, 14), far)
+    found = separable_within(seen, strengths, 65.0, judge)
+    ranks = {name: len(bases.rest) for name, bases in found.field.attributes.items()}
+    assert found.worst >= judge.candidate(fit_separable(strengths, offsets, ranks), "").worst
+
+
+def test_a_refined_field_may_meet_the_target_that_the_solved_one_misses() -> None:
+    strengths, offsets = curved_trajectory(60, snapshots=17)
+    look = linear_pictures(60, 14)
+    plain, better = (
+        choose_field(strengths, offsets, look, kind="separable", target=torch.inf, budget=65.0, refine=refine)
+        for refine in (False, True)
+    )
+    target = (plain.best.worst + better.best.worst) / 2
+    found = choose_field(strengths, offsets, look, kind="separable", target=target, budget=65.0, refine=True)
+    assert found.best.worst >= target
+    assert found.met

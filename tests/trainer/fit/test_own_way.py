@@ -1,0 +1,91 @@
+"""An edit of one target goes straight unless its own way is nearer to the editor's half."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from progdf.field.trajectory import Trajectory
+from progdf.gaussians import attribute_slices, pack
+from tests.helpers.trained import WHITE, small
+from trainer.editors.base import EditKind
+from trainer.fit.own_path import kept_way
+from trainer.setup.training_setup import Stand
+from trainer.views.view import View, pictured
+
+
+@cache
+def stand() -> Stand:
+    case = small("scarf")
+    return Stand(case.scene, case.region, case.views[:3], case.views[3:], WHITE)
+
+
+def way(bend: float, attribute: str = "sh0") -> Trajectory:
+    """To another colour (or place), half way `bend` off the straight line."""
+    rows = pack(stand().scene[stand().region.members], with_shN=False)
+    column = attribute_slices(rows.shape[1])[attribute].start
+    offsets = torch.zeros(3, *rows.shape)
+    offsets[1, :, column] = 0.4 + bend
+    offsets[2, :, column] = 0.8
+    strengths = torch.tensor([0.0, 0.5, 1.0])
+    return Trajectory(strengths, offsets.half(), offsets[2], torch.tensor([0, 5, 10]), (2,), (1.0,))
+
+
+def same(trajectory: Trajectory) -> Trajectory:
+    return trajectory
+
+
+@dataclass(frozen=True)
+class Halfway:
+    """An editor whose half is what the scene shows at these offsets."""
+
+    offsets: Tensor
+    stages: tuple[float, ...] = ()
+    kind: EditKind = "style"
+    confined: bool = True
+
+    def edit(self, view: View, strength: float) -> Tensor:
+        assert strength == 0.5, "no other picture is needed"
+        members = stand().region.members
+        rows = pack(stand().scene[members], with_shN=False) + self.offsets
+        return pictured(stand().scene.replace_rows(members, rows), view.camera, WHITE)
+
+
+def test_a_detour_that_the_editor_takes_too_is_kept() -> None:
+    bent = way(0.6)
+    kept, why = kept_way(bent, stand(), Halfway(bent.node(1)), False, same)
+    assert kept is bent
+    assert why.startswith("as recorded")
+
+
+def test_a_detour_that_the_editor_does_not_take_is_left() -> None:
+    bent = way(0.6)
+    kept, why = kept_way(bent, stand(), Halfway(0.5 * bent.end), False, same)
+    assert len(kept) == 2
+    assert torch.equal(kept.end, bent.end)
+    assert torch.equal(kept.at(0.25), 0.25 * bent.end)
+    assert kept.stage_ends == (1,)
+    assert kept.asked == ((1.0, 1.0),)
+    assert why.startswith("straight: the editor's half")
+
+
+def test_where_nobody_pictures_the_half_it_goes_straight() -> None:
+    bent = way(0.6)
+    assert len(kept_way(bent, stand(), None, False, same)[0]) == 2
+    assert len(kept_way(bent, stand(), Halfway(bent.end, stages=(1.0,)), False, same)[0]) == 2
+
+
+def test_parts_keep_their_way_unless_a_straight_one_looks_the_same() -> None:
+    turned = way(0.4, "means")
+    assert kept_way(turned, stand(), None, True, same)[0] is turned
+    assert len(kept_way(way(0.0, "means"), stand(), None, True, same)[0]) == 2
+
+
+def test_a_way_that_is_not_kept_is_not_retimed() -> None:
+    def never(trajectory: Trajectory) -> Trajectory:
+        raise AssertionError("re-timed in vain")
+
+    assert len(kept_way(way(0.6), stand(), None, False, never)[0]) == 2

@@ -1,0 +1,114 @@
+"""The edit optimisation: it arrives, records on the way, moves nothing else, and repeats bit for bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.gaussians import attribute_slices, pack
+from progdf.rasterize import render
+from tests.helpers.trained import WHITE, Small, course, masked_psnr, small
+from trainer.editors import make_editor
+from trainer.optimize.pgs import Snapshot, learning_rates, most_change, optimise
+from trainer.views.crops import crop_scene
+from trainer.views.view import crop
+
+
+def run(case: Small, steps: int = 40, **more: object) -> tuple[Tensor, list[Snapshot]]:
+    """Original rows and recordings of a course."""
+    wanted = course(case, steps, **more)
+    return wanted[0], list(optimise(*wanted))
+
+
+def test_the_members_arrive_at_the_edited_views() -> None:
+    case = small("body")
+    original, found = run(case, steps=60)
+    edited = case.scene.replace_rows(case.region.members, original + found[-1].offsets)
+    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    for view in case.views:
+        target, inside = editor.edit(view, 1.0), view.mask > 0.5
+        before = masked_psnr(view.image, target, inside)
+        after = masked_psnr(render(edited, view.camera).clamp(0, 1), target, inside)
+        assert after > 28.0
+        assert after > before + 12.0
+
+
+def test_the_distance_from_the_finished_edit_falls() -> None:
+    _, found = run(small("body"))
+    assert found[-1].means["left"] < 0.25 * found[0].means["left"]
+
+
+def test_each_stage_ends_with_a_recording_and_steps_ascend() -> None:
+    _, found = run(small("body"))
+    assert [snapshot.step for snapshot in found if snapshot.ends_stage] == [40, 80]
+    steps = [snapshot.step for snapshot in found]
+    assert steps == sorted(set(steps))
+    assert len(found) >= 8
+
+
+def test_the_first_steps_start_from_the_original_exactly() -> None:
+    _, found = run(small("body"), snapshots=10_000)
+    assert float(found[0].offsets.abs().max()) < 0.1 * float(found[-1].offsets.abs().max())
+
+
+def test_a_colour_edit_moves_colours_and_nothing_else() -> None:
+    _, found = run(small("body"))
+    for name, columns in attribute_slices(found[-1].offsets.shape[1]).items():
+        moved = bool(found[-1].offsets[:, columns].any())
+        assert moved == (name in ("sh0", "shN")), name
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
+    case = small("body")
+    first, again, other = (run(case, steps=12, seed=seed)[1][-1].offsets for seed in (3, 3, 4))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_the_warm_up_takes_shorter_steps_at_first() -> None:
+    case = small("body")
+    free, warm = (run(case, steps=6, warmup=on)[1][-1].offsets for on in (False, True))
+    assert float(warm.abs().mean()) < 0.5 * float(free.abs().mean())
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_instead_of_spoiling_it() -> None:
+    case = small("body")
+    broken = replace(case, views=tuple(replace(v, image=v.image * float("nan")) for v in case.views))
+    with pytest.raises(FloatingPointError, match="step"):
+        run(broken, steps=3)
+
+
+def test_a_crop_equals_the_composed_scene_rendered_whole() -> None:
+    case = small("body")
+    view = case.views[0]
+    rows = pack(case.scene[case.region.members], with_shN=True)
+    random = torch.Generator().manual_seed(0)
+    rows = rows + 0.05 * torch.randn(rows.shape, generator=random)
+    prepared = crop_scene(case.scene, case.region.members, view.camera, view.box, WHITE)
+    image, _ = prepared.render(rows)
+    whole = render(case.scene.replace_rows(case.region.members, rows), view.camera).clamp(0, 1)
+    assert torch.allclose(image, crop(whole, view.box), atol=1e-5)
+    assert torch.allclose(prepared.original().clamp(0, 1), crop(view.image, view.box), atol=1e-6)
+
+
+def test_geometry_edits_have_rates_for_everything_and_scale_with_the_size_of_the_region() -> None:
+    small_rates, large_rates = (learning_rates("geometry", 14, extent) for extent in (1.0, 10.0))
+    assert bool((small_rates > 0).all())
+    means = attribute_slices(14)["means"]
+    assert torch.allclose(large_rates[means], 10 * small_rates[means])
+    assert torch.equal(large_rates[3:], small_rates[3:])
+
+
+def test_steps_are_sized_by_the_farthest_changes_and_not_by_their_mean() -> None:
+    before = torch.zeros(10, 10, 3)
+    target = torch.full((10, 10, 3), 0.02)
+    target[:1, :, 1] = 0.5  # a tenth of the pixels goes far
+    target[5:] = 0.0  # half do not change at all
+    assert most_change([target], [before]) == pytest.approx(0.5)
+    assert most_change([before], [before]) == 0.0
+    strip = torch.full((20, 10, 3), 0.1)
+    strip[0, :2] = 1.0  # a hundredth is no measure
+    assert most_change([strip], [torch.zeros(20, 10, 3)]) == pytest.approx(0.1)

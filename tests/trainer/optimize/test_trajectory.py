@@ -1,0 +1,207 @@
+"""The recorded trajectory: exact ends, even visible change, no jitter, round trips."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import (
+    Trajectory,
+    load_trajectory,
+    peek_trajectory,
+    recorded_field,
+    save_trajectory,
+)
+from progdf.io.tensors import write_tensors
+from trainer.optimize.retime import record, retime, straight_recordings, with_recordings
+from trainer.options import Slider
+
+CHANNELS = 14
+
+
+def along(progress: list[float], stage_ends: list[int] | None = None, noise: float = 0.0) -> Trajectory:
+    """A straight way of three members, recorded at the given shares of it (the original is added)."""
+    random = torch.Generator().manual_seed(0)
+    end = torch.randn(3, CHANNELS, generator=random)
+    ends = stage_ends or [len(progress)]
+    snapshots = []
+    for i, share in enumerate(progress):
+        last = i + 1 in ends
+        jitter = 0.0 if last else noise * torch.randn(3, CHANNELS, generator=random)
+        snapshots.append((i + 1, 0, last, (share * end + jitter).half()))
+    return record(snapshots, end, [(k + 1) / len(ends) for k in range(len(ends))])
+
+
+def seen(offsets: Tensor) -> Tensor:
+    """What is visible of offsets here: the offsets themselves."""
+    return offsets.flatten()
+
+
+def shown(trajectory: Trajectory) -> list[Tensor]:
+    return [seen(trajectory.node(i)) for i in range(len(trajectory))]
+
+
+def retimed(
+    trajectory: Trajectory, slider: Slider = "stages", passes: int = 3, samples: int = 20
+) -> Trajectory:
+    return retime(trajectory, shown(trajectory), slider, passes, samples)
+
+
+def even_chords(trajectory: Trajectory, steps: int = 20) -> Tensor:
+    pictures = [seen(trajectory.at(i / steps)) for i in range(steps + 1)]
+    return torch.stack([(b - a).abs().mean() for a, b in pairwise(pictures)])
+
+
+def test_both_ends_are_exact_although_recordings_are_in_half_precision() -> None:
+    trajectory = along([0.2, 0.5, 1.0])
+    assert not bool(trajectory.at(0.0).any())
+    assert torch.equal(trajectory.at(1.0), trajectory.end)
+    assert not torch.equal(trajectory.offsets[-1].float(), trajectory.end), (
+        "half precision alone would not do"
+    )
+
+
+def test_between_two_recordings_the_way_is_straight() -> None:
+    trajectory = along([0.5, 1.0])
+    low, high = float(trajectory.s[1]), float(trajectory.s[2])
+    middle = trajectory.at(0.5 * (low + high))
+    assert torch.allclose(middle, 0.5 * (trajectory.node(1) + trajectory.node(2)), atol=1e-6)
+
+
+def test_re_timing_makes_equal_slider_steps_change_the_picture_equally() -> None:
+    progress = [1 - (1 - i / 15) ** 4 for i in range(1, 16)]  # fast at first, slow at the end
+    before = even_chords(along(progress))
+    after = even_chords(retimed(along(progress)))
+    assert float(before.min() / before.max()) < 0.05
+    assert float(after.min() / after.max()) > 0.95
+
+
+def test_jitter_does_not_count_as_change() -> None:
+    progress = [i / 24 for i in range(1, 25)]
+    noisy = along(progress, noise=0.02)
+    arc = torch.cat([torch.zeros(1), _lengths(noisy).cumsum(0)])
+    after = retimed(noisy)
+    straight = (after.at(0.5) - 0.5 * after.end).abs().mean()
+    assert float(straight) < 0.05
+    assert float(arc[-1]) > 1.2 * float(noisy.end.abs().mean()), "the jitter is there"
+
+
+def test_three_passes_are_more_even_than_one_where_recordings_jitter() -> None:
+    noisy = along([1 - (1 - i / 20) ** 2 for i in range(1, 21)], noise=0.05)
+    once, thrice = (even_chords(retimed(noisy, passes=passes), 6) for passes in (1, 3))
+    assert float(thrice.min() / thrice.max()) > float(once.min() / once.max()) + 0.05
+
+
+def test_chords_as_long_as_a_step_make_steps_even_where_shorter_ones_count_jitter() -> None:
+    noisy = along([i / 60 for i in range(1, 61)], noise=0.02)
+    ours, fine = (even_chords(retimed(noisy, "even", samples=samples)) for samples in (20, 60))
+    assert float(ours.min() / ours.max()) > 0.7
+    assert float(ours.min() / ours.max()) > float(fine.min() / fine.max()) + 0.05
+
+
+def test_stage_ends_keep_their_strengths_whatever_happens_between() -> None:
+    progress = [0.01, 0.02, 0.05, 0.1, 0.3, 0.95, 1.0]
+    trajectory = retimed(along(progress, [2, 4, 5, 7]), "stages")
+    assert [float(trajectory.s[end]) for end in trajectory.stage_ends] == [0.25, 0.5, 0.75, 1.0]
+    even = retimed(along(progress, [2, 4, 5, 7]), "even")
+    assert float(even.s[even.stage_ends[0]]) == pytest.approx(0.02, abs=0.01)
+    time = retimed(along(progress, [2, 4, 5, 7]), "time")
+    assert torch.allclose(time.s, torch.linspace(0, 1, 8), atol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.floats(-1.0, 2.0), min_size=1, max_size=12))
+def test_slider_values_ascend_from_zero_to_one_for_any_way(progress: list[float]) -> None:
+    trajectory = retimed(along([*progress, 1.0]))
+    assert float(trajectory.s[0]) == 0.0
+    assert float(trajectory.s[-1]) == 1.0
+    assert bool((trajectory.s.diff() > 0).all())
+
+
+def test_a_recording_that_is_a_detour_is_left_out_and_stage_ends_stay() -> None:
+    trajectory = along([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0], [5, 10], noise=0.5)
+    kept = with_recordings(trajectory, straight_recordings(trajectory, shown(trajectory)))
+    assert len(kept) == 3
+    assert kept.stage_ends == (1, 2)
+    assert torch.equal(kept.node(1), trajectory.node(5))
+    assert torch.equal(kept.end, trajectory.end)
+
+
+def test_a_gentle_curve_keeps_its_recordings() -> None:
+    angle = torch.linspace(0, 1.2, 12)
+    way = torch.stack([angle.sin(), 1 - angle.cos()], dim=1)[:, None, :].repeat(1, 3, 7)
+    snapshots = [(i, 0, i == 11, way[i].half()) for i in range(1, 12)]
+    curve = record(snapshots, way[-1], [1.0])
+    assert len(straight_recordings(curve, shown(curve), detour=0.1)) > 6
+
+
+def test_a_trajectory_round_trips_through_its_file(tmp_path: Path) -> None:
+    trajectory = retimed(along([0.3, 0.6, 1.0], [1, 3]))
+    extra = {"members": torch.tensor([3, 5, 8]), "score": torch.rand(10)}
+    save_trajectory(tmp_path / "trajectory.safetensors", trajectory, extra, {"scene": "bär.ply"})
+    found, tensors, about = load_trajectory(tmp_path / "trajectory.safetensors")
+    assert torch.equal(found.s, trajectory.s)
+    assert torch.equal(found.offsets, trajectory.offsets)
+    assert torch.equal(found.end, trajectory.end)
+    assert found.strengths == trajectory.strengths
+    assert found.stage_ends == trajectory.stage_ends
+    assert torch.equal(tensors["members"], extra["members"])
+    assert torch.equal(tensors["score"], extra["score"])
+    assert about == {"scene": "bär.ply"}
+
+
+def test_whose_recording_it_is_can_be_told_without_reading_the_recordings(tmp_path: Path) -> None:
+    trajectory = along([0.3, 1.0])
+    extra = {"members": torch.tensor([3, 5, 8])}
+    save_trajectory(tmp_path / "trajectory.safetensors", trajectory, extra, {})
+    s, members = peek_trajectory(tmp_path / "trajectory.safetensors")
+    assert torch.equal(s, trajectory.s)
+    assert torch.equal(members, extra["members"])
+
+
+@pytest.mark.parametrize(
+    "part", [("end", torch.zeros(2, CHANNELS)), ("s", torch.tensor([0.0, 0.9, 1.1])), ("s", torch.ones(3))]
+)
+def test_recordings_that_do_not_hold_together_are_one_line(tmp_path: Path, part: tuple[str, Tensor]) -> None:
+    trajectory = replace(along([0.5, 1.0]), **{part[0]: part[1]})
+    save_trajectory(tmp_path / "trajectory.safetensors", trajectory, {}, {})
+    with pytest.raises(ProgdfError, match=r"is damaged .*; train again"):
+        load_trajectory(tmp_path / "trajectory.safetensors")
+
+
+def test_a_file_that_lacks_a_part_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "trajectory.safetensors"
+    write_tensors(path, {"s": torch.zeros(2)}, {"format": "progdf-trajectory-1", "about": "{}"})
+    with pytest.raises(ProgdfError, match="it has no end"):
+        load_trajectory(path)
+
+
+def test_a_recording_is_a_field_that_tells_the_same_at_and_between_the_snapshots() -> None:
+    trajectory = retimed(along([0.2, 0.3, 0.75, 1.0], noise=0.1))
+    field = recorded_field(trajectory)
+    assert field.recorded == tuple(trajectory.s.tolist())
+    for s in trajectory.s.tolist():
+        assert torch.equal(field.offsets(s), trajectory.at(s))
+    for s in (0.01, 0.4, 0.61, 0.99):
+        assert torch.allclose(field.offsets(s), trajectory.at(s), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"no tensors", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      "])
+def test_a_file_that_is_no_trajectory_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "trajectory.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ProgdfError, match="; "):
+        load_trajectory(path)
+
+
+def _lengths(trajectory: Trajectory) -> Tensor:
+    nodes = [trajectory.node(i) for i in range(len(trajectory))]
+    return torch.stack([(b - a).abs().mean() for a, b in pairwise(nodes)])

@@ -1,0 +1,63 @@
+"""`progdf fit` and the ablation on the folder of a run that is damaged, or made to do harm."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.field.trajectory import load_trajectory, save_trajectory
+from tests.helpers.refused import refusal
+from tests.helpers.trained import quick_options, write_bear
+from trainer.pipeline.reopen import reopened
+from trainer.pipeline.run import train
+
+Change = Callable[[dict[str, Any], dict[str, Tensor]], object]
+
+CHANGES: dict[str, Change] = {
+    "no losses": lambda about, _: about.pop("losses"),
+    "losses of one number": lambda about, _: about.update(losses={"step": 1.0, "left": [1.0]}),
+    "losses that do not fit": lambda about, _: about["losses"]["left"].append(1.0),
+    "no objective": lambda about, _: about.pop("objective"),
+    "no name": lambda about, _: about["options"].pop("name"),
+    "a name that leads elsewhere": lambda about, _: about["options"].update(name="../../elsewhere"),
+    "no editor": lambda about, _: about["options"].pop("editor"),
+    "an option of another type": lambda about, _: about["options"].update(target_psnr=[1]),
+    "an unknown kind": lambda about, _: about.update(kind="else"),
+    "an earlier slider of one number": lambda _, extra: extra.update(s_before_fit=torch.zeros(())),
+    "an earlier slider that stands": lambda _, extra: extra.update(
+        s_before_fit=torch.zeros_like(extra["s_before_fit"])
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made, 400)
+    options = quick_options(made, views=4, image_size=48, steps=64, stages=2)
+    train(options, quiet=True)
+    return options.out
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_what_a_trajectory_tells_is_checked_before_it_is_used(
+    change: Change, run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    path = tmp_path / "run" / "trajectory.safetensors"
+    trajectory, extra, about = load_trajectory(path)
+    about = json.loads(json.dumps(about))
+    extra.setdefault("s_before_fit", trajectory.s)
+    save_trajectory(path, trajectory, extra, about)
+    reopened(tmp_path / "run")
+    change(about, extra)
+    save_trajectory(path, trajectory, extra, about)
+    assert "is damaged" in refusal(lambda path: reopened(path.parent), path)

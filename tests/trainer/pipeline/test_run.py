@@ -1,0 +1,317 @@
+"""The whole job: `progdf train` and `progdf fit` on a small bear."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import trainer.pipeline.training
+from progdf.cli.options import parsed
+from progdf.compose.reference import Layer, compose
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import load_trajectory
+from progdf.formats.ply import load_ply
+from progdf.gaussians import ATTRIBUTES, pack
+from progdf.gdf.file import load_gdf
+from tests.helpers.trained import quick_options, write_bear
+from trainer import cli
+from trainer.optimize.retime import before_fit
+from trainer.options import FitOptions, settled
+from trainer.pipeline.run import RunResult, refit, train
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small bear."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def done(folder: Path) -> RunResult:
+    """A finished run of a few seconds, shared by the tests that only look."""
+    return train(quick_options(folder), quiet=True)
+
+
+def test_training_lowers_the_loss_and_reaches_held_out_views(done: RunResult) -> None:
+    _, _, recorded = load_trajectory(done.folder.trajectory)
+    losses = recorded["losses"]["left"]
+    assert losses[-1] < 0.2 * sum(losses[:3]) / 3
+    assert done.report["edit"]["psnr_to_views"] > 32.0  # 35.8 when written; 16 before the edit
+
+
+def test_the_slider_is_nearer_to_the_editor_than_two_keyframes(done: RunResult) -> None:
+    assert len(done.report["between"]) == 3
+    for s, between in done.report["between"].items():
+        assert between["psnr"] > between["keyframes2"] + 4.0, s
+
+
+def test_equal_steps_of_the_slider_look_equally_large(done: RunResult) -> None:
+    assert done.report["slider"]["uniformity"] > 0.7  # .9 when written; .5 with the editor's strengths pinned
+
+
+def test_the_report_says_at_which_strength_the_editor_was_asked(done: RunResult) -> None:
+    report = done.report
+    asked = [between["strength"] for between in report["between"].values()]
+    assert asked == report["trajectory"]["stages"][:-1] == list(done.trajectory.strengths[:-1])
+    assert [float(s) for s in report["between"]] == report["trajectory"]["stages_at"][:-1]
+    for s, quarter in zip(report["trajectory"]["stages_at"], (0.25, 0.5, 0.75, 1.0), strict=True):
+        assert s == pytest.approx(quarter, abs=0.06)
+    assert asked != [0.25, 0.5, 0.75], "this editor's strengths are not evenly visible"
+
+
+def test_the_recording_lies_where_the_field_shows_it(folder: Path, done: RunResult) -> None:
+    gdf = load_gdf(done.gdf, load_ply(folder / "scene.ply"))
+    trajectory, extra, _ = load_trajectory(done.folder.trajectory)
+    assert torch.equal(trajectory.s, done.trajectory.s)
+    assert gdf.field.recorded == pytest.approx(trajectory.s.tolist(), abs=1e-6)
+    assert not torch.equal(before_fit(trajectory, extra).s, trajectory.s), "where the next field begins"
+
+
+def test_with_stages_the_slider_is_the_editors_own_strength(folder: Path) -> None:
+    result = train(quick_options(folder, "pinned", slider="stages", steps=24), quiet=True)
+    assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}
+    assert all(float(s) == found["strength"] for s, found in result.report["between"].items())
+    assert result.report["trajectory"]["stages_at"] == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_exactly_the_recorded_end(
+    folder: Path, done: RunResult
+) -> None:
+    scene = load_ply(folder / "scene.ply")
+    gdf = load_gdf(done.gdf, scene)
+    at_zero = compose(scene, [Layer(gdf, 0.0)])
+    assert all(torch.equal(getattr(at_zero, name), getattr(scene, name)) for name in ATTRIBUTES)
+    trajectory, extra, _ = load_trajectory(done.folder.trajectory)
+    members = extra["members"]
+    with_sh = trajectory.end.shape[1] > 14
+    recorded = pack(scene[members], with_shN=with_sh) + trajectory.end
+    at_one = compose(scene, [Layer(gdf, 1.0)])
+    assert torch.equal(pack(at_one[members], with_shN=with_sh), recorded)
+    assert done.report["field"]["endpoint_error"] == 0.0
+
+
+def test_rows_outside_the_region_are_byte_identical_at_any_strength(folder: Path, done: RunResult) -> None:
+    scene = load_ply(folder / "scene.ply")
+    gdf = load_gdf(done.gdf, scene)
+    outside = torch.ones(len(scene), dtype=torch.bool)
+    outside[gdf.region.members] = False
+    for strength in (0.1, 0.5, 1.0):
+        edited = compose(scene, [Layer(gdf, strength)])
+        for name in ATTRIBUTES:
+            assert torch.equal(getattr(edited, name)[outside], getattr(scene, name)[outside])
+    assert done.report["field"]["outside_change"] == 0.0
+
+
+def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
+    report = json.loads(done.folder.report.read_text(encoding="utf-8"))
+    expected = {
+        "field": {"kind", "bytes_per_gaussian", "parameters", "psnr_mean", "psnr_worst", "endpoint_error"},
+        "baselines": {"keyframes2", "keyframes4"},
+        "slider": {"monotone", "uniformity", "largest_jump", "t50", "t90"},
+        "between": {f"{s:g}" for s in done.report["trajectory"]["stages_at"][:-1]},
+        "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
+        "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
+        "time": {"views", "edit", "optimise", "fit", "total"},
+        "memory_by_stage_mb": {"views", "edit", "optimise", "fit", "report"},
+        "options": {"scene", "editor", "seed"},
+    }
+    for part, keys in expected.items():
+        assert keys <= set(report[part]), part
+    assert report["memory_mb"] > 0
+    assert report["field"]["psnr_worst"] >= 40.0
+    assert set(report["baselines"]["keyframes2"]) >= {"psnr_mean", "psnr_worst", "bytes_per_gaussian"}
+
+
+def test_every_view_is_kept_before_and_after(done: RunResult) -> None:
+    views = done.folder.root / "views"
+    names = {path.name for path in (views / "original").glob("*.png")}
+    assert len(names) == 10
+    edited = [f"edited/{s:g}" for s in done.trajectory.strengths[:-1]]
+    for kind in ("edited", *edited, "mask", "final"):
+        assert {path.name for path in (views / kind).glob("*.png")} == names, kind
+    with Image.open(done.folder.picture) as picture:
+        assert picture.width > 600
+
+
+def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
+    folder: Path, done: RunResult
+) -> None:
+    options = quick_options(
+        folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="colour"
+    )
+    result = train(options, quiet=True)
+    assert result.report["edit"]["psnr_to_views"] > 32.0
+    given = {f"{s:g}" for s in done.trajectory.strengths[:-1]}
+    assert set(result.report["between"]) == given, "pinned where they were given"
+
+
+def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
+    options = quick_options(folder, "twice", steps=24, stages=2)
+    digests = []
+    for _ in range(2):
+        result = train(options, quiet=True)
+        trajectory, _, _ = load_trajectory(result.folder.trajectory)
+        digests.append(hashlib.sha256(trajectory.offsets.numpy().tobytes()).hexdigest())
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.parametrize(
+    ("field", "budget", "message"),
+    [
+        ("neural", 60, "--bytes-budget means nothing to --field neural"),
+        ("lossless", 60, "--bytes-budget means nothing to --field lossless"),
+        ("auto", 0.5, "--bytes-budget is 0.5; 1 or more"),
+        ("auto", math.nan, "--bytes-budget is nan; 1 or more"),
+    ],
+)
+def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: float, message: str) -> None:
+    with pytest.raises(ProgdfError, match=message):
+        settled(quick_options(folder, "budget", field=field, bytes_budget=budget))
+    with pytest.raises(ProgdfError, match="--refine means nothing to --field keyframes"):
+        settled(quick_options(folder, "budget", field="keyframes", refine=True))
+
+
+def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
+    result = train(quick_options(folder, "budget", steps=16, stages=2, bytes_budget=1.0), quiet=True)
+    assert not result.report["field"]["target_met"]
+    assert "fits into 1 bytes" in result.report["choice"]["why"]
+    least = result.report["field"]["bytes_per_gaussian"]
+    again = refit(FitOptions(result.folder.root, bytes_budget=least + 3, refine=True, threads=1), quiet=True)
+    assert "; refining it gains" in again.report["choice"]["why"]
+    assert again.report["options"]["bytes_budget"] == least + 3
+    assert again.report["field"]["target_met"]
+    assert least < again.report["field"]["bytes_per_gaussian"] <= least + 3
+    assert again.report["field"]["psnr_worst"] > result.report["field"]["psnr_worst"]
+
+
+def test_members_that_no_view_shows_are_left_out_only_when_asked(
+    folder: Path, done: RunResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "dropped" not in done.report["field"]
+    monkeypatch.setattr("trainer.fit.active.PIXEL", 0.05)  # a bear has hardly any that do not show at all
+    found = train(quick_options(folder, "fewer", steps=16, stages=2, drop_invisible=True), quiet=True)
+    dropped = found.report["field"]["dropped"]
+    gdf = load_gdf(found.gdf, load_ply(folder / "scene.ply"))
+    assert 0 < dropped["members"] < dropped["of"] == dropped["members"] + len(gdf.region)
+    assert dropped["largest_change"] <= 0.05
+    assert found.report["field"]["psnr_worst"] == dropped["psnr_worst"]["without"]
+    assert found.report["field"]["endpoint_error"] == 0.0  # of those that are left
+    assert "members that no view shows" in found.folder.log.read_text(encoding="utf-8")
+    with pytest.raises(ProgdfError, match="--drop-invisible means nothing to --field neural"):
+        settled(quick_options(folder, "fewer", field="neural", drop_invisible=True))
+
+
+def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
+    result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
+    before, extra, _ = load_trajectory(result.folder.trajectory)
+    again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
+    assert again.report["field"]["kind"] == "keyframes"
+    assert load_gdf(again.gdf).field.kind == "keyframes"
+    tried = again.report["choice"]["tried"]
+    assert again.report["choice"]["chosen"] in [field["field"] for field in tried]
+    assert "the smallest of" in again.report["choice"]["why"]
+    after, kept, _ = load_trajectory(result.folder.trajectory)
+    assert torch.equal(after.offsets, before.offsets)
+    assert torch.equal(after.end, before.end)
+    assert torch.equal(before_fit(after, kept).s, before_fit(before, extra).s), "each fit begins alike"
+    assert again.report["edit"] == result.report["edit"]
+    for stage in ("optimise", "total"):
+        assert again.report["time"][stage] == result.report["time"][stage]
+
+
+def test_an_interrupted_run_leaves_the_earlier_edit_whole(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = quick_options(folder, "interrupted", steps=24, stages=2)
+    first = train(options, quiet=True)
+    kept = first.gdf.read_bytes()
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer.pipeline.training, "solve", interrupt)
+    with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
+        train(options, quiet=True)
+    assert first.gdf.read_bytes() == kept
+    assert not [path for path in first.folder.root.rglob("*") if path.name.startswith(".")]
+
+
+def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
+    folder: Path, done: RunResult, tmp_path: Path
+) -> None:
+    (tmp_path / "thesis.txt").write_text("important")
+    with pytest.raises(ProgdfError, match="not empty"):
+        train(replace(quick_options(folder), out=tmp_path), quiet=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+    kept = done.gdf.read_bytes()
+    with pytest.raises(ProgdfError, match="another editor"):
+        train(quick_options(folder, editor="darken:0.5"), quiet=True)
+    assert done.gdf.read_bytes() == kept
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "nowhere.ply --out r --region all --editor night",
+        "{scene} --out r --region labels:{labels}:99 --editor night",
+        "{scene} --out r --region all --editor paint:#fff",
+        "{scene} --out r --region all --editor recolor:blue",
+        "{scene} --out r --region all --editor night --views 2",
+        "{scene} --out r --region all --editor night --steps 3",
+        "{scene} --out r --region all --editor night --steps many",
+        "{scene} --out r --region all --editor night --image-size 8",
+        "{scene} --out r --region all --editor night --name a/b",
+        "{scene} --out r --region all --editor night --cameras nowhere.json",
+        "{scene} --out {scene} --region all --editor night",
+        "{scene} --out r --region all --editor night --colour blue",
+        "{scene} --out r --region all",
+        "--out r",
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_no_edit(folder: Path, tmp_path: Path, arguments: str) -> None:
+    words = arguments.format(scene=folder / "scene.ply", labels=folder / "labels.npy").split()
+    words = [str(tmp_path / "r") if word == "r" else word for word in words]
+    with pytest.raises(ProgdfError, match="; ") as told:
+        cli.train(words)
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.rglob("*.gdf"))
+
+
+def test_an_edit_that_changes_nothing_is_told_before_training(folder: Path, done: RunResult) -> None:
+    originals = done.folder.root / "views" / "original"
+    with pytest.raises(ProgdfError, match="changes none of the views; "):
+        train(quick_options(folder, "nothing", editor=f"folder:{originals}"), quiet=True)
+
+
+def test_fitting_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="progdf train"):
+        cli.fit([str(tmp_path)])
+
+
+def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
+    words = (
+        f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
+    )
+    options = settled(parsed(trainer.options.TrainOptions, words, "progdf train"))
+    assert (options.seed, options.slider, options.name) == (7, "even", "r")
+    assert (options.steps, options.views) == (240, 12)
+
+
+def test_one_member_in_one_view_is_enough(folder: Path) -> None:
+    labels = np.zeros(1500, dtype=np.uint8)
+    scene = load_ply(folder / "scene.ply")
+    labels[int(scene.means[:, 1].argmax())] = 1
+    np.save(folder / "one.npy", labels)
+    options = quick_options(folder, "one", steps=8, stages=1, views=5)
+    result = train(replace(options, region=f"labels:{folder / 'one.npy'}:1"), quiet=True)
+    assert load_gdf(result.gdf).field.members == 1

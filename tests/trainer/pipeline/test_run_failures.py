@@ -1,0 +1,116 @@
+"""What goes wrong around a run (disk, folder, files, numbers) is one line, and what was saved goes on."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import trainer.optimize.pgs
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
+from tests.helpers.full_disk import files_up_to
+from tests.helpers.stopped import OUT, small_run
+from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
+from trainer.pipeline.run import train
+from trainer.store.run_folder import RunFolder, locked
+
+pytest_plugins = ["tests.helpers.stopped_runs"]
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_lost(
+    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lose_all() -> None:
+        for path in (OUT / "views" / "edited").glob("*.png"):
+            path.unlink()
+
+    with monkeypatch.context() as patch:
+        at_step(patch, 5, lose_all)
+        with pytest.raises(ProgdfError, match=r"\.png is gone; train again, with --resume"):
+            train(small_run(bear_folder), quiet=True)
+    assert saved_step() == 24
+    gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
+    bear_folder: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with files_up_to(40_000):  # the pictures fit in, the optimiser's state does not
+        assert main(words(bear_folder, "--resume", "--save-every=0")) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "progdf: the disk of run is full; free some space, then go on with --resume"
+    assert saved_step() == 10
+    assert not list(OUT.rglob(".*"))
+    gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.parametrize("size", [0, 2_000])
+def test_a_disk_that_is_full_from_the_start_is_one_line(
+    bear_folder: Path, size: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with files_up_to(size):
+        assert main(words(bear_folder)) == 2
+    assert "the disk of run is full; " in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
+    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, true_sum = 0, trainer.optimize.pgs.summed
+
+    def poisoned(terms: dict[str, torch.Tensor]) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        return true_sum(terms) * (float("nan") if calls == 13 else 1.0)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer.optimize.pgs, "summed", poisoned)
+        with pytest.raises(ProgdfError, match="the loss is nan at step 12; the state before it is kept"):
+            train(small_run(bear_folder, save_every=NEVER), quiet=True)
+    assert saved_step() == 12
+    gone_on(bear_folder, uninterrupted)
+
+
+def test_a_run_folder_that_is_removed_while_training_is_one_line(
+    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_step(monkeypatch, 5, lambda: shutil.rmtree(OUT))
+    with pytest.raises(ProgdfError, match="run/state was removed during the run; train again"):
+        train(small_run(bear_folder, save_every=0.0), quiet=True)
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(
+    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    OUT.mkdir()
+
+    def create(beside: Path, _: int | None) -> None:
+        raise OSError(30, os.strerror(30), str(beside))
+
+    monkeypatch.setattr("progdf.io.atomic._create", create)
+    with pytest.raises(ProgdfError, match=r"run.log\.txt cannot be written \(Read-only file system\); "):
+        train(small_run(bear_folder), quiet=True)
+    with pytest.raises(ProgdfError, match="cannot be made"):
+        train(replace(small_run(bear_folder), out=Path("/proc/run")), quiet=True)
+
+
+def test_two_runs_in_one_folder_are_refused(bear_folder: Path) -> None:
+    OUT.mkdir()
+    with locked(RunFolder(OUT)), pytest.raises(ProgdfError, match="being trained by another process; "):
+        train(small_run(bear_folder), quiet=True)
+
+
+@pytest.mark.parametrize("part", ["run.json", "training.safetensors", "recordings/000001.safetensors"])
+@pytest.mark.usefixtures("stopped")
+def test_a_damaged_state_is_one_line(bear_folder: Path, part: str) -> None:
+    path = OUT / "state" / part
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ProgdfError, match=r"is damaged .*; delete .*state and train again"):
+        train(replace(small_run(bear_folder), resume=True), quiet=True)

@@ -1,0 +1,91 @@
+"""The unit of length means nothing: a scene a millimetre wide trains to the edit of one of kilometres."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.camera import NEAR
+from progdf.compose.reference import Layer, compose
+from progdf.demo_scenes import bear
+from progdf.formats.ply import save_ply
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import load_gdf
+from progdf.region import Region
+from progdf.scene.bounds import near_plane
+from trainer.options import TrainOptions
+from trainer.pipeline.run import train
+from trainer.views.view import near_enough, pictured, region_rig
+
+FACTORS = (1e-3, 1e4)
+
+
+def scaled(scene: Gaussians, factor: float) -> Gaussians:
+    return replace(scene, means=factor * scene.means, log_scales=scene.log_scales + math.log(factor))
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_scene_of_any_size_is_trained_on_the_same_pictures(factor: float) -> None:
+    demo = bear(1500)
+    members = demo.members("scarf")
+    region = Region("scarf", members, torch.zeros(1500).index_fill(0, members, 1.0))
+    pictures = []
+    for scene in (demo.gaussians, scaled(demo.gaussians, factor)):
+        cameras = near_enough(region_rig(scene, region, 4, 64), scene)
+        pictures.append([pictured(scene, camera, torch.ones(3)) for camera in cameras])
+    for first, second in zip(*pictures, strict=True):
+        assert float((first < 0.9).float().mean()) > 0.2, "there is something to see"
+        assert float((first - second).abs().max()) < 0.01
+
+
+def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: str) -> Gaussians:
+    """The scene under a whole edit, trained in a hurry."""
+    folder.mkdir()
+    save_ply(folder / "scene.ply", scene)
+    labels = torch.zeros(len(scene), dtype=torch.uint8).index_fill(0, members, 1)
+    np.save(folder / "labels.npy", labels.numpy())
+    options = TrainOptions(
+        scene=folder / "scene.ply",
+        out=folder / "edit",
+        region=f"labels:{folder / 'labels.npy'}:1",
+        editor=editor,
+        views=6,
+        image_size=64,
+        steps=40,
+        stages=2,
+        field="separable",
+        kind=kind,
+        threads=1,
+    )
+    train(options, quiet=True)
+    return compose(scene, [Layer(load_gdf(folder / "edit/edit.gdf", scene), 1.0)])
+
+
+@pytest.mark.parametrize(("editor", "kind"), [("recolor:#3060d0", "colour"), ("darken:0.6", "style")])
+def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: str) -> None:
+    demo = bear(1500)
+    members = demo.members("scarf")
+    region = Region("scarf", members, torch.zeros(1500).index_fill(0, members, 1.0))
+    finished = {}
+    for factor in (1.0, *FACTORS):
+        scene = scaled(demo.gaussians, factor)
+        edited = trained(tmp_path / f"{factor:g}", scene, members, editor, kind)
+        (camera,) = near_enough(region_rig(scene, region, 1, 64), scene)
+        finished[factor] = pictured(edited, camera, torch.ones(3))
+        if factor == 1.0:
+            change = finished[1.0] - pictured(scene, camera, torch.ones(3))
+            assert float(change.abs().max()) > 0.2, "the edit shows"
+    for factor in FACTORS:
+        # each step of Adam divides by the size of the gradient, so that rounding grows
+        assert float((finished[factor] - finished[1.0]).abs().mean()) < 2e-3
+
+
+def test_the_near_plane_comes_nearer_with_smaller_scenes_only() -> None:
+    assert near_plane(1e-3) == pytest.approx(1e-5)
+    assert near_plane(1.0) == near_plane(1e4) == NEAR

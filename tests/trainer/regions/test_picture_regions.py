@@ -1,0 +1,327 @@
+"""Regions that pictures tell of: folders of masks, and sentences through GroundingDINO and SAM."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.demo_scenes import bear
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.images import write_image
+from progdf.lens import Lens
+from progdf.region import Region
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.region_spec import parse_region
+from tests.helpers.tiny_segmenters import tiny_detector, tiny_outliner
+from tests.helpers.trained import label_mask, quick_options, write_bear
+from trainer import segmenters
+from trainer.pipeline.run import train
+from trainer.regions.from_pictures import RegionSettings, region_kinds
+from trainer.segmenters import SEGMENTERS, SegmenterSettings
+from trainer.segmenters.folder import read_masks
+from trainer.segmenters.grounded_sam import as_asked
+
+SIZE, VIEWS = 96, 6
+DEMO = bear(1500)
+SCENE = DEMO.gaussians
+SCARF = DEMO.labels == DEMO.label_names.index("scarf")
+
+
+def six_cameras() -> list[Camera]:
+    return orbit_rig(SCENE, VIEWS, SIZE, SIZE)
+
+
+@pytest.fixture
+def masks(tmp_path: Path) -> Path:
+    """A folder with masks of the scarf, and their cameras."""
+    folder = tmp_path / "masks"
+    for camera in six_cameras():
+        mask = label_mask(SCENE, SCARF, camera).float()
+        write_image(folder / f"{camera.name}.png", mask[..., None].expand(-1, -1, 3))
+    save_cameras(folder / "cameras.json", six_cameras())
+    return folder
+
+
+def settings(tmp_path: Path, cameras: Path | None = None, **more: object) -> RegionSettings:
+    return RegionSettings(cameras, VIEWS, lambda: tmp_path / "segmented", quiet=True, **more)  # type: ignore[arg-type]
+
+
+def region_of(spec: str, told: RegionSettings, scene: Gaussians = SCENE) -> Region:
+    return parse_region(spec, scene, kinds=region_kinds(told))
+
+
+def refusal(spec: str, told: RegionSettings) -> str:
+    with pytest.raises(ProgdfError, match="; ") as caught:
+        region_of(spec, told)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def overlap(region: Region, expected: Tensor) -> float:
+    found = torch.zeros_like(expected).index_fill(0, region.members, True)
+    return float((found & expected).sum() / (found | expected).sum())
+
+
+# -------------------------------------------------------------------------------------- folders of masks
+
+
+def test_a_folder_of_masks_with_its_cameras_is_a_region(masks: Path, tmp_path: Path) -> None:
+    region = region_of(f"masks:{masks}", settings(tmp_path))
+    assert overlap(region, SCARF) > 0.6  # 1500 Gaussians at 96 pixels; see test_lift for real sizes
+
+
+def test_masks_without_cameras_of_their_own_take_those_given(masks: Path, tmp_path: Path) -> None:
+    own = region_of(f"masks:{masks}", settings(tmp_path))
+    given = (masks / "cameras.json").rename(tmp_path / "given.json")
+    assert "give --cameras" in refusal(f"masks:{masks}", settings(tmp_path))
+    found = region_of(f"masks:{masks}", settings(tmp_path, given))
+    assert torch.equal(found.members, own.members)
+
+
+def test_masks_join_with_other_kinds_of_region(masks: Path, tmp_path: Path) -> None:
+    alone = set(region_of(f"masks:{masks}", settings(tmp_path)).members.tolist())
+    np.save(tmp_path / "l.npy", DEMO.labels.numpy())
+    head = DEMO.label_names.index("head")
+    labelled = set((DEMO.labels == head).nonzero()[:, 0].tolist())
+    both = region_of(f"masks:{masks} + labels:{tmp_path}/l.npy:{head}", settings(tmp_path))
+    assert set(both.members.tolist()) == alone | labelled
+    rest = region_of(f"all - masks:{masks}", settings(tmp_path))
+    assert set(rest.members.tolist()) == set(range(len(SCENE))) - alone
+
+
+def test_masks_of_another_size_are_scaled_and_see_through_pixels_are_outside(
+    masks: Path, tmp_path: Path
+) -> None:
+    original = read_masks(masks, six_cameras())
+    for path in masks.glob("*.png"):
+        with Image.open(path) as picture:
+            alpha = picture.convert("L").resize((4 * SIZE, 4 * SIZE), Image.Resampling.NEAREST)
+        cutout = Image.new("RGBA", alpha.size, "white")
+        cutout.putalpha(alpha)
+        cutout.save(path)
+    assert all(torch.equal(a, b) for a, b in zip(original, read_masks(masks, six_cameras()), strict=True))
+
+
+def test_masks_of_photographs_are_straightened(tmp_path: Path) -> None:
+    camera = replace(six_cameras()[0], lens=Lens(k1=-0.2))
+    ramp = torch.linspace(0, 1, SIZE).expand(SIZE, SIZE)
+    write_image(tmp_path / f"{camera.name}.png", ramp[..., None].expand(-1, -1, 3))
+    straight = read_masks(tmp_path, [camera])[0]
+    unbent = read_masks(tmp_path, [camera], bent=True)[0]
+    assert torch.allclose(straight, ramp, atol=1 / 255)
+    # barrel distortion drew the picture together: straightened, its edges show less of the ramp
+    assert float(unbent[SIZE // 2, -1]) < float(straight[SIZE // 2, -1]) - 0.02
+    assert float(unbent[SIZE // 2, SIZE // 2]) == pytest.approx(0.5, abs=0.02)
+
+
+def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None:
+    told, given = settings(tmp_path), settings(tmp_path, masks / "cameras.json")
+    name = six_cameras()[2].name
+    assert "names no folder" in refusal("masks:", told)
+    assert "is not a folder" in refusal(f"masks:{tmp_path}/nowhere", given)
+    (masks / f"{name}.png").rename(masks / "other.png")
+    Image.new("L", (SIZE, SIZE // 2)).save(masks / f"{name}.png")
+    assert "96x48 pixels, its view 96x96" in refusal(f"masks:{masks}", told)
+    (masks / f"{name}.png").write_bytes(b"no picture")
+    assert "cannot be read as a picture" in refusal(f"masks:{masks}", told)
+
+
+def test_a_camera_without_a_mask_tells_nothing_and_none_at_all_is_one_line(
+    masks: Path, tmp_path: Path
+) -> None:
+    whole = set(region_of(f"masks:{masks}", settings(tmp_path)).members.tolist())
+    names = [camera.name for camera in load_cameras(masks / "cameras.json")]
+    (masks / f"{names[0]}.png").unlink()
+    said: list[str] = []
+    fewer = set(region_of(f"masks:{masks}", settings(tmp_path, say=said.append)).members.tolist())
+    assert len(whole & fewer) > 0.8 * len(whole | fewer)
+    assert "5 of 6 cameras have a mask; the others tell nothing" in said
+    for name in names[1:]:
+        (masks / f"{name}.png").unlink()
+    assert f"no mask for any of the 6 cameras; name each as its view, as {names[0]}.png" in refusal(
+        f"masks:{masks}", settings(tmp_path)
+    )
+
+
+def test_masks_that_select_nothing_tell_the_highest_score(masks: Path, tmp_path: Path) -> None:
+    assert "lower --lift-threshold" in refusal(f"masks:{masks}", settings(tmp_path, rule="paper"))
+    for path in masks.glob("*.png"):
+        Image.new("L", (SIZE, SIZE)).save(path)
+    assert "highest score is 0" in refusal(f"masks:{masks}", settings(tmp_path))
+
+
+# ------------------------------------------------------------------------------------------- sentences
+
+
+Asked = list[str]
+
+
+@pytest.fixture
+def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
+    """A segmenter that finds what is red, in place of the networks; what it was asked."""
+    asked: Asked = []
+
+    def segment(image: Tensor, prompt: str) -> Tensor:
+        asked.append(prompt)
+        if "unicorn" in prompt:
+            return torch.zeros(image.shape[:2], dtype=torch.bool)
+        red, green, blue = image.unbind(2)
+        return (red > green + 0.15) & (red > blue + 0.15)
+
+    kinds: dict[str, Callable[[SegmenterSettings], object]] = {"text": lambda _: segment}
+    monkeypatch.setattr(segmenters, "SEGMENTERS", kinds)
+    monkeypatch.setattr("trainer.regions.from_pictures.SEGMENTERS", kinds)
+    monkeypatch.setattr("trainer.regions.from_pictures.SEGMENTER_CHECKS", {"text": lambda settings: None})
+    return asked
+
+
+def test_a_sentence_is_segmented_once_and_kept(reddish: Asked, tmp_path: Path) -> None:
+    told = settings(tmp_path)
+    first = region_of('text:"the Red scarf"', told)
+    assert reddish == ["the Red scarf"] * (2 * VIEWS)  # around the scene, and near what was found
+    again = region_of('text:"the Red scarf"', told)
+    assert len(reddish) == 2 * VIEWS
+    assert torch.equal(first.members, again.members)
+    assert torch.equal(first.score, again.score)
+    region_of('text:"the Red scarf"', replace(told, segmenter=SegmenterSettings(least=0.5)))
+    assert len(reddish) == 4 * VIEWS
+
+
+def test_what_a_sentence_found_is_a_folder_of_masks(reddish: Asked, tmp_path: Path) -> None:
+    found = region_of('text:"scarf"', settings(tmp_path))
+    kept = region_of(f"masks:{tmp_path}/segmented/scarf", settings(tmp_path))
+    assert torch.equal(found.members, kept.members)
+
+
+def test_sentences_join_with_other_kinds_of_region(reddish: Asked, tmp_path: Path) -> None:
+    scarf = set(region_of("text:scarf", settings(tmp_path)).members.tolist())
+    rest = region_of('all - text:"scarf"', settings(tmp_path))
+    assert set(rest.members.tolist()) == set(range(len(SCENE))) - scarf
+
+
+def test_given_cameras_are_thinned_out_evenly(reddish: Asked, tmp_path: Path) -> None:
+    save_cameras(tmp_path / "many.json", orbit_rig(SCENE, 20, SIZE, SIZE))
+    region_of("text:scarf", replace(settings(tmp_path, tmp_path / "many.json"), views=4))
+    kept = sorted(path.stem for path in (tmp_path / "segmented" / "scarf").glob("*.png"))
+    assert kept == ["orbit_002", "orbit_007", "orbit_012", "orbit_017"]
+
+
+def test_what_is_found_nowhere_is_one_line(reddish: Asked, tmp_path: Path) -> None:
+    assert "found in none of 6 views" in refusal('text:"a unicorn"', settings(tmp_path))
+    assert "names nothing" in refusal('text:""', settings(tmp_path))
+
+
+def test_a_sentence_leaves_a_folder_that_is_no_run_alone(reddish: Asked, tmp_path: Path) -> None:
+    write_bear(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.txt").write_text("important")
+    with pytest.raises(ProgdfError, match="no run of progdf train"):
+        train(replace(quick_options(tmp_path), region="text:scarf"), quiet=True)
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.txt"]
+    assert reddish == []
+
+
+def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked, tmp_path: Path) -> None:
+    write_bear(tmp_path)
+    options = quick_options(tmp_path, steps=8, stages=1, views=5)
+    with pytest.raises(ProgdfError, match="found in none"):
+        train(replace(options, region="text:unicorn"), quiet=True)
+    done = train(replace(options, region="text:scarf"), quiet=True)
+    assert done.gdf.is_file()
+    assert len(list((done.folder.segmented / "scarf").glob("*.png"))) == 10
+
+
+def test_prompts_are_asked_as_the_detector_was_trained() -> None:
+    assert as_asked("  The man's  Shirt ") == "the man's shirt."
+    assert as_asked("a cat. a dog.") == "a cat. a dog."
+
+
+# --------------------------------------------------------------------------------------- the real networks
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> SegmenterSettings:
+    """A detector and an outliner of the real classes, saved and found as real ones are."""
+    pytest.importorskip("transformers")
+    folder = tmp_path_factory.mktemp("models")
+    return SegmenterSettings(
+        str(tiny_detector(folder / "dino")), str(tiny_outliner(folder / "sam")), least=0.01
+    )
+
+
+def test_the_networks_make_a_mask_of_the_pictures_size(tiny: SegmenterSettings) -> None:
+    segment = SEGMENTERS["text"](tiny)
+    image = torch.rand(60, 90, 3, generator=torch.Generator().manual_seed(0))
+    mask = segment(image, "The scarf")
+    assert (mask.shape, mask.dtype) == ((60, 90), torch.bool)
+    assert 0 < int(mask.sum()) < mask.numel()
+    assert torch.equal(mask, segment(image, "the scarf."))
+    nothing = SEGMENTERS["text"](replace(tiny, least=0.999))(image, "the scarf")
+    assert not bool(nothing.any())
+
+
+def test_boxes_are_in_pixels_of_the_picture(tiny: SegmenterSettings) -> None:
+    from trainer.segmenters.grounded_sam import grounded_sam
+
+    picture = Image.new("RGB", (300, 100), "white")
+    boxes = grounded_sam(tiny).boxes(picture, "scarf")
+    assert boxes.shape[1] == 4
+    assert bool((boxes[:, 0::2] <= 300).all())
+    assert bool((boxes[:, 1::2] <= 100).all())
+    assert float(boxes[:, 2].max()) > 100  # scaled by the width, not by the height
+
+
+def test_a_run_trains_a_region_that_a_sentence_names(tiny: SegmenterSettings, tmp_path: Path) -> None:
+    write_bear(tmp_path, 800)
+    options = replace(
+        quick_options(tmp_path, steps=8, stages=1, views=3),
+        region='text:"the scarf" - sphere:9,9,9,0.1',
+        detector=tiny.detector,
+        outliner=tiny.outliner,
+        detect_least=tiny.least,
+        lift_threshold=0.05,
+    )
+    done = train(options, quiet=True)
+    assert done.gdf.is_file()
+    assert len(list((done.folder.segmented / "the-scarf").glob("*.png"))) == 6
+
+
+def test_missing_weights_are_one_line_that_tells_how_to_get_them(
+    tiny: SegmenterSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
+    absent = settings(tmp_path, segmenter=replace(tiny, detector="someone/no-such-detector"))
+    assert "hf download someone/no-such-detector" in refusal("text:scarf", absent)
+    absent = settings(tmp_path, segmenter=replace(tiny, outliner=str(tmp_path / "nowhere")))
+    assert "give --outliner" in refusal("text:scarf", absent)
+    (tmp_path / "broken").mkdir()
+    for file in Path(tiny.outliner).iterdir():
+        (tmp_path / "broken" / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "broken" / "model.safetensors").write_bytes(b"half")
+    broken = settings(tmp_path, segmenter=replace(tiny, outliner=str(tmp_path / "broken")))
+    assert "no whole model with safetensors weights" in refusal("text:scarf", broken)
+
+
+def test_a_model_of_another_kind_is_one_line(tiny: SegmenterSettings, tmp_path: Path) -> None:
+    swapped = SegmenterSettings(tiny.outliner, tiny.detector)
+    assert "is a sam model, no grounding-dino; give --detector" in refusal(
+        "text:scarf", settings(tmp_path, segmenter=swapped)
+    )
+
+
+def test_a_missing_package_is_one_line_that_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    assert "pip install progdf-studio[segment]" in refusal("text:scarf", settings(tmp_path))

@@ -1,0 +1,152 @@
+"""`progdf region`: what a region selects, shown and kept; `progdf views`: pictures to draw masks on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from progdf.__main__ import main
+from progdf.demo_scenes import DemoScene, bear
+from progdf.errors import ProgdfError
+from progdf.formats.load_report import counted
+from progdf.formats.ply import save_ply
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.region import from_mask
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.region_spec import parse_region
+from trainer.regions.command import picture
+from trainer.regions.from_pictures import RegionSettings, region_kinds
+
+
+@pytest.fixture(scope="module")
+def demo() -> DemoScene:
+    return bear(3000)
+
+
+@pytest.fixture
+def scene(demo: DemoScene, tmp_path: Path) -> Path:
+    save_ply(tmp_path / "bear.ply", demo.gaussians)
+    np.save(tmp_path / "labels.npy", demo.labels.numpy())
+    return tmp_path / "bear.ply"
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert main([str(argument) for argument in arguments]) == 0
+    return capsys.readouterr().out
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert main([str(argument) for argument in arguments]) == 2
+    return capsys.readouterr().err
+
+
+def test_what_region_keeps_is_the_same_region_again(
+    demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = f"labels:{tmp_path}/labels.npy:0+sphere:0,1,0,0.2"
+    out = tmp_path / "members.npy"
+    line = said(capsys, "region", scene, spec, "-o", out)
+    kept = np.load(out)
+    wanted = parse_region(spec, demo.gaussians)
+    assert kept.dtype == np.int64
+    assert torch.equal(parse_region(f"file:{out}", demo.gaussians).members, wanted.members)
+    assert f"{counted(len(kept))} of 3 000" in line
+    mask = np.zeros(3000, np.bool_)
+    mask[kept] = True
+    np.save(tmp_path / "mask.npy", mask)
+    both = parse_region(f"all - file:{tmp_path}/mask.npy", demo.gaussians)
+    assert len(both) == 3000 - len(kept)
+
+
+@pytest.mark.parametrize(
+    ("stored", "told"),
+    [
+        (np.array([0, 3000]), "names row 3000, the scene has rows 0 to 2999"),
+        (np.array([-1, 2]), "names row -1"),
+        (np.ones(2999, np.bool_), "is a mask of 2999, the scene has 3000 Gaussians"),
+        (np.zeros(4), "float64 numbers"),
+        (np.zeros((2, 2), np.int64), "2 dimensions"),
+    ],
+)
+def test_rows_of_another_scene_are_one_line(
+    stored: np.ndarray, told: str, demo: DemoScene, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "m.npy", stored)
+    with pytest.raises(ProgdfError, match=told):
+        parse_region(f"file:{tmp_path}/m.npy", demo.gaussians)
+
+
+def test_the_picture_tints_the_region_and_takes_the_colour_from_the_rest(demo: DemoScene) -> None:
+    camera = demo.cameras[0].resized(64, 64)
+    nothing = picture(demo.gaussians, from_mask("", torch.zeros(3000, dtype=torch.bool)), camera)
+    assert float((nothing.amax(dim=2) - nothing.amin(dim=2)).max()) < 1e-3, "grey"
+    assert float(nothing.min()) > 0.6, "pale"
+    region = from_mask("", demo.labels == demo.labels[0])
+    shown = picture(demo.gaussians, region, camera)
+    changed = (shown - nothing).abs().amax(dim=2) > 0.1
+    assert 20 < int(changed.sum()) < 64 * 64 / 2
+    red, _, blue = shown[changed].mean(dim=0).tolist()
+    assert red > blue + 0.2
+
+
+def test_the_region_is_shown_from_four_sides_or_as_one_asks(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_cameras(tmp_path / "c.json", orbit_rig(bear(1000).gaussians, 2, 40, 30))
+    out = tmp_path / "r.png"
+    for asked, size in (
+        ((), (128, 96)),
+        (("--orbit", "-30,15"), (64, 48)),
+        (("--orbit", "0,0,3"), (64, 48)),
+        (("--camera", f"{tmp_path}/c.json:1"), (40, 30)),
+    ):
+        said(capsys, "region", scene, "all", "--size", "64x48", "-o", out, *asked)
+        assert Image.open(out).size == size
+
+
+def test_what_region_cannot_do_is_one_line_and_leaves_nothing(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.png"
+    assert "no .png or .npy" in refused(capsys, "region", scene, "all", "-o", tmp_path / "r.jpg")
+    assert "holds no Gaussian" in refused(capsys, "region", scene, "sphere:99,0,0,1", "-o", out)
+    assert "--orbit" in refused(capsys, "region", scene, "all", "-o", out, "--orbit", "1,99")
+    assert "--size" in refused(capsys, "region", scene, "all", "-o", out, "--size", "0x9")
+    assert not out.exists()
+
+
+def test_masks_drawn_over_the_views_are_the_region_that_train_takes(
+    demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "v"
+    line = said(capsys, "views", scene, "--out", out, "--views", "5", "--image-size", "96", "--up", "+y")
+    cameras = load_cameras(out / "cameras.json")
+    assert len(cameras) == 5
+    assert f"--cameras {out}/cameras.json --region masks:{out}" in line
+    from trainer.views.view import drawn, near_enough
+
+    bear_itself = demo.members(*(name for name in demo.label_names if name not in ("plinth", "grass")))
+    member = torch.zeros(3000, 3)
+    member[bear_itself] = 1.0
+    for camera in near_enough(cameras, demo.gaussians)[:4]:
+        with Image.open(out / "original" / f"{camera.name}.png") as original:
+            assert original.size == (96, 96)
+        seen = drawn(demo.gaussians, member, camera, torch.zeros(3))[..., 0] > 0.5
+        Image.fromarray((255 * seen.numpy()).astype(np.uint8)).save(out / f"{camera.name}.png")
+    settings = RegionSettings(out / "cameras.json", 5, lambda: tmp_path)
+    found = parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(settings))
+    both = torch.isin(found.members, bear_itself).sum()
+    assert int(both) > 0.85 * max(len(found), len(bear_itself))
+
+
+def test_views_overwrite_no_folder_of_views(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cameras.json").write_text("[]")
+    assert "is there already" in refused(capsys, "views", scene, "--out", tmp_path)
+    assert (tmp_path / "cameras.json").read_text() == "[]"
+    assert not (tmp_path / "original").exists()

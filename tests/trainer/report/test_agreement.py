@@ -1,0 +1,179 @@
+"""Whether edited views agree is told before training, and told right."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.rasterize import render
+from tests.helpers.trained import WHITE, Small, small
+from trainer.editors import make_editor
+from trainer.report.agreement import Agreement, _best_colors, _sight, measured
+from trainer.setup.training_setup import Stand
+from trainer.views.view import crop, drawn
+
+
+@cache
+def stand() -> Stand:
+    case = body()
+    return Stand(case.scene, case.region, case.views[:-3], case.views[-3:], WHITE)
+
+
+def body() -> Small:
+    return small("body", count=12, image_size=96)
+
+
+def judged(pictures: list[Tensor]) -> Agreement:
+    count = len(stand().train)
+    return measured(stand(), pictures[:count], pictures[count:])
+
+
+def edited(spec: str) -> list[Tensor]:
+    case = body()
+    editor = make_editor(spec, case.scene, case.region, case.views)
+    return [editor.edit(view, 1.0) for view in case.views]
+
+
+def stripes_of_its_own(period: float, seed: int) -> list[Tensor]:
+    """Every view with stripes in another direction."""
+    rng = torch.Generator().manual_seed(seed)
+    pictures = []
+    for view in body().views:
+        angle, phase = math.pi * float(torch.rand((), generator=rng)), float(torch.rand((), generator=rng))
+        y, x = torch.meshgrid(
+            torch.arange(view.mask.shape[0]), torch.arange(view.mask.shape[1]), indexing="ij"
+        )
+        striped = ((x * math.cos(angle) + y * math.sin(angle)) / period + phase) % 1 < 0.5
+        pictures.append(
+            view.blended(torch.where(striped[..., None], torch.tensor([0.1, 0.6, 0.2]), view.inside))
+        )
+    return pictures
+
+
+@pytest.mark.parametrize("spec", ["recolor:#3060d0", "stripes:#20a040", "night"])
+def test_edits_that_are_the_same_from_everywhere_agree(spec: str) -> None:
+    found = judged(edited(spec))
+    assert found.agree
+    assert found.unexplained < 0.15
+    assert found.psnr > 22
+
+
+@pytest.mark.parametrize("period", [9, 18, 36])
+def test_stripes_painted_differently_in_every_view_disagree(period: float) -> None:
+    found = judged(stripes_of_its_own(period, seed=1))
+    assert not found.agree
+    assert found.unexplained > 0.45
+
+
+def test_another_hue_in_every_view_disagrees() -> None:
+    rng = torch.Generator().manual_seed(2)
+    pictures = []
+    for view in body().views:
+        hue = torch.rand(3, generator=rng)
+        pictures.append(view.blended(torch.lerp(view.inside, hue.expand_as(view.inside), 0.6)))
+    assert not judged(pictures).agree
+
+
+def test_differences_too_faint_to_see_are_no_disagreement() -> None:
+    rng = torch.Generator().manual_seed(3)
+    pictures = [
+        view.blended((view.inside + 0.02 * torch.randn(3, generator=rng)).clamp(0, 1))
+        for view in body().views
+    ]
+    found = judged(pictures)
+    assert found.psnr > 28
+    assert found.agree
+
+
+def test_colours_that_the_members_can_have_are_found() -> None:
+    case = body()
+    rng = torch.Generator().manual_seed(4)
+    changed = case.scene.sh0.clone()
+    changed[case.region.members] += 0.3 * torch.randn(len(case.region.members), 3, generator=rng)
+    scene = case.scene.__class__(**{**case.scene.__dict__, "sh0": changed})
+    pictures = [render(scene, view.camera, WHITE).clamp(0, 1) for view in case.views]
+    found = judged(pictures)
+    assert found.unexplained < 0.35, "noise in every Gaussian is the hardest that one scene can show"
+    assert found.agree
+
+
+def test_the_line_tells_decibels_share_and_remedy() -> None:
+    line = Agreement(psnr=12.34, unexplained=0.61).told("style")
+    assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
+    assert "61 % of the change; use a calmer style" in line
+    assert "\n" not in line
+    assert Agreement(psnr=25.0, unexplained=0.1).told("style").startswith("the edited views agree")
+
+
+def test_measuring_twice_gives_the_same_figures() -> None:
+    pictures = edited("recolor:#3060d0")
+    assert judged(pictures) == judged(pictures)
+
+
+def test_a_smooth_change_that_colours_can_make_is_explained() -> None:
+    case = body()
+    change = torch.zeros(len(case.scene), 3)
+    change[case.region.members] = 0.3 * case.scene.means[case.region.members, 1:2]
+    pictures = [v.image + drawn(case.scene, change, v.camera, torch.zeros(3)) for v in case.views]
+    assert judged(pictures).unexplained < 0.04, "without conjugate directions it is .055"
+
+
+@dataclass(frozen=True)
+class LinearSight:
+    """A view of which the picture is a known matrix [P,M] times the colours."""
+
+    matrix: Tensor
+    change: Tensor
+
+    def shown(self, colors: Tensor) -> Tensor:
+        return self.matrix @ colors
+
+    def gathered(self, picture: Tensor, members: int) -> Tensor:
+        return self.matrix.T @ picture
+
+
+def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trainer.report.agreement._DAMPING", 0.2)
+    rng = torch.Generator().manual_seed(5)
+    sights = [
+        LinearSight(torch.randn(9, 5, generator=rng), torch.randn(9, 3, generator=rng)) for _ in range(2)
+    ]
+    A, b = torch.cat([s.matrix for s in sights]), torch.cat([s.change for s in sights])
+    slope = A.T @ b
+    damping = 0.2 * (A @ slope).square().sum() / slope.square().sum()
+    expected = torch.linalg.solve(A.T @ A + damping * torch.eye(5), slope)
+    found = _best_colors(sights, 5)  # type: ignore[arg-type]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_decibels_are_of_what_the_fit_leaves_where_the_held_out_views_change() -> None:
+    count = len(stand().train)
+    pictures = [view.image for view in body().views]
+    for view, i in zip(stand().held_out, range(count, len(pictures)), strict=True):
+        pictures[i] = view.image + 0.1 * (view.mask < 0.01)[..., None]  # all around the region
+    found = judged(pictures)
+    assert found.unexplained == pytest.approx(1.0)
+    changed = sum(float(crop(v.mask < 0.01, v.box).sum()) for v in stand().held_out)
+    counted = sum(float(crop((v.mask < 0.01) | (v.mask > 0.05), v.box).sum()) for v in stand().held_out)
+    assert found.psnr == pytest.approx(20 + 10 * math.log10(counted / changed), abs=0.1)
+
+
+def test_views_that_nothing_changed_agree_with_nothing_to_explain() -> None:
+    found = judged([view.image for view in body().views])
+    assert found == Agreement(99.0, 0.0)
+    assert found.figures() == {"psnr_best": 99.0, "unexplained": 0.0, "agree": True}
+
+
+def test_a_box_at_half_size_holds_all_of_its_odd_pixels_in_their_place() -> None:
+    view = replace(body().views[0], box=(11, 20, 61, 75))
+    x, y = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="xy")
+    ramp = torch.stack([0.1 + x / 200, 0.1 + y / 200, torch.full_like(x, 0.2)], dim=2)
+    sight = _sight(stand(), view, view.image + ramp)
+    halved = torch.nn.functional.avg_pool2d(ramp.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)
+    torch.testing.assert_close(sight.change, halved[10:38, 5:31], atol=1e-5, rtol=0)
+    assert sight.scene.box == (5, 10, 31, 38)

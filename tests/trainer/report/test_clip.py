@@ -1,0 +1,169 @@
+"""CLIP directional similarity: the formula, a real model read from disk, and why it is not measured."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field import BakedField
+from progdf.io.images import to_picture
+from tests.helpers.tiny_clip import tiny_clip
+from tests.helpers.trained import WHITE, quick_options, small, write_bear
+from trainer.fit.evaluate import make_judge
+from trainer.options import FitOptions
+from trainer.pipeline.fit_and_report import texts
+from trainer.pipeline.run import refit, train
+from trainer.report.clip import Clip, _square, direction, load_clip
+from trainer.report.measures import Texts, clip_course
+
+pytest.importorskip("transformers")
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a tiny CLIP."""
+    return tiny_clip(tmp_path_factory.mktemp("clip"))
+
+
+def _unit(*values: float) -> Tensor:
+    return torch.nn.functional.normalize(torch.tensor(values), dim=0)
+
+
+def test_a_picture_that_changes_as_the_words_do_scores_one_and_one_that_does_the_opposite_minus_one() -> None:
+    bear, golden = _unit(1.0, 0.0, 0.2), _unit(0.8, 0.6, 0.2)
+    before = _unit(0.1, 0.2, 1.0)
+    steps = torch.stack([before + 0.1 * (golden - bear), before - 0.1 * (golden - bear)])
+    found = direction(before.expand(2, 3), steps, bear, golden)
+    assert found == pytest.approx([1.0, -1.0], abs=1e-5)
+
+
+def test_a_picture_or_a_text_that_does_not_change_has_no_direction() -> None:
+    a, b = _unit(1.0, 2.0, 3.0), _unit(3.0, 1.0, 0.0)
+    assert direction(a[None], a[None], a, b) == [None]
+    assert direction(a[None], b[None], a, a) == [None]
+
+
+def test_a_model_read_from_disk_gives_features_of_unit_length_that_tell_things_apart(saved: Path) -> None:
+    clip = load_clip(str(saved))
+    torch.manual_seed(1)
+    pictures = clip.pictures([torch.rand(40, 60, 3), torch.rand(40, 60, 3)])
+    sentences = clip.texts(["a bear", "a golden bear " * 40])
+    for features in (pictures, sentences):
+        assert features.shape == (2, 12)
+        assert torch.allclose(features.norm(dim=1), torch.ones(2))
+        assert float((features[0] - features[1]).norm()) > 1e-3
+
+
+def test_features_are_those_of_the_model_itself(saved: Path) -> None:
+    from transformers import CLIPModel
+
+    clip = load_clip(str(saved))
+    image = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(2))
+    mean = torch.tensor([0.48145466, 0.4578275, 0.40821073])
+    spread = torch.tensor([0.26862954, 0.26130258, 0.27577711])
+    model = CLIPModel.from_pretrained(saved).eval()
+    with torch.no_grad():
+        seen = model.vision_model(pixel_values=((image - mean) / spread).permute(2, 0, 1)[None])
+        expected = model.visual_projection(seen.pooler_output)
+    assert torch.allclose(clip.pictures([image])[0], expected[0] / expected.norm(), atol=1e-5)
+
+
+def test_what_older_transformers_return_is_taken_too() -> None:
+    features = torch.tensor([[3.0, 4.0]])
+
+    def network(answer: Any) -> Any:
+        return SimpleNamespace(get_image_features=lambda pixel_values: answer)
+
+    for answer in (features, SimpleNamespace(pooler_output=features)):
+        found = Clip(network(answer), None, 16, "tiny").pictures([torch.zeros(8, 8, 3)])
+        assert torch.allclose(found, torch.tensor([[0.6, 0.8]]))
+
+
+def test_a_wide_picture_is_seen_whole() -> None:
+    image = torch.zeros(20, 60, 3)
+    image[:, :4] = torch.tensor([1.0, 0.0, 0.0])
+    seen = _square(image, 30)
+    assert seen.shape == (3, 30, 30)
+    assert float(seen[0, 15, 0]) > 0.9
+    assert float(seen[1, 15, 0]) < 0.1
+    assert torch.allclose(seen[:, 0], torch.ones(3, 30))
+
+
+def test_pictures_are_scaled_as_pillow_does_it_for_clip() -> None:
+    # not as far as black and white, as Pillow cuts what overshoots between its two passes
+    image = 0.3 + 0.4 * torch.rand(50, 50, 3, generator=torch.Generator().manual_seed(0))
+    scaled = to_picture(image).resize((32, 32), Image.Resampling.BICUBIC)
+    expected = torch.from_numpy(np.asarray(scaled, dtype=np.float32) / 255)
+    assert (_square(image, 32).permute(1, 2, 0) - expected).abs().max() < 2.5 / 255
+
+
+def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ProgdfError, match="hf download nobody/no-such-clip"):
+        load_clip("nobody/no-such-clip")
+    with pytest.raises(ProgdfError, match="holds no whole CLIP model"):
+        load_clip(str(tmp_path))
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
+    with pytest.raises(ProgdfError, match="bert model, no CLIP"):
+        load_clip(str(tmp_path))
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[clip\]"):
+        load_clip("nobody/no-such-clip")
+
+
+def test_an_instruction_is_what_one_sees_after_unless_something_else_is_said() -> None:
+    told = {"editor": 'instruct:"a golden bear"', "text_before": "a bear"}
+    assert texts(told).after == "a golden bear"
+    assert texts({**told, "text_after": "gold"}).after == "gold"
+    assert texts({"editor": "recolor:#fff"}).after == ""
+
+
+def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_words(
+    tmp_path: Path, saved: Path
+) -> None:
+    write_bear(tmp_path)
+    options = quick_options(
+        tmp_path, steps=24, stages=2, views=5, text_before="a bear", text_after="blue", clip_model=str(saved)
+    )
+    result = train(options, quiet=True)
+    edit, course = result.report["edit"], result.report["curves"]["clip_direction"]
+    assert course["s"][0] == 0.0
+    assert course["similarity"][0] is None
+    assert len(course["similarity"]) == 11
+    assert edit["clip_direction"] == course["similarity"][-1]
+    assert -1.0 <= edit["clip_direction"] <= 1.0
+    assert edit["clip_model"] == saved.name
+
+    again = refit(FitOptions(result.folder.root, text_after="zebra", threads=1), quiet=True)
+    assert again.report["edit"]["clip_direction"] != edit["clip_direction"]
+
+
+def test_why_nothing_is_measured_is_told(saved: Path) -> None:
+    bear = small(count=3)
+    unedited = {1.0: [view.image for view in bear.views]}
+    judge = make_judge(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
+
+    def reason(before: str, after: str, model: str = str(saved)) -> str:
+        found = clip_course(
+            judge,
+            bear.views,
+            BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14),
+            Texts(before, after, model),
+        )
+        assert not found.s
+        return found.reason
+
+    assert "--text-after was not given" in reason("a bear", "")
+    assert "say the same" in reason("a bear", "a bear")
+    assert "hf download" in reason("a bear", "gold", "nobody/no-such-clip")

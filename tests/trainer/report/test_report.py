@@ -1,0 +1,221 @@
+"""What a report tells: errors over the slider, plots one can read, memory by stage."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from progdf.field import BakedField, fit_keyframes
+from progdf.field.trajectory import Trajectory
+from progdf.gaussians import pack
+from tests.helpers.trained import WHITE, Small, small
+from trainer.fit.evaluate import Judge, make_judge
+from trainer.fit.fit import without_idle_attributes
+from trainer.optimize.losses import GradientL1
+from trainer.report.measures import courses
+from trainer.report.plots import LINES, Plot, draw_plot, ticks
+from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
+from trainer.store.memory import PeakMemory
+from trainer.views.crops import moving_attributes
+
+
+def _judged(bear: Small) -> Judge:
+    """A judge whose editor has painted everything darker, at half strength and in full."""
+    edited = {s: [view.image * (1 - 0.5 * s) for view in bear.views] for s in (0.5, 1.0)}
+    return make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
+
+
+def _darker(bear: Small, amount: float = 0.6) -> BakedField:
+    """A field that goes straight to a darker region."""
+    end = torch.zeros(len(bear.region), 14)
+    end[:, 11:] = -amount
+    return fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
+
+
+def _color_count(picture: Image.Image, color: Sequence[int]) -> int:
+    return int((np.abs(np.asarray(picture, dtype=int) - np.array(color)).max(axis=2) <= 12).sum())
+
+
+def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None:
+    bear = small(count=3)
+    judge, field = _judged(bear), _darker(bear)
+    truth = {s: judge.pictures(field.offsets(s)) for s in (0.3, 0.8)}
+    found = courses(judge, {"slider": field}, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
+    assert found.s == (0.3, 0.8)
+    assert found.psnr == (99.0, 99.0)
+    assert found.ssim == pytest.approx((1.0, 1.0), abs=1e-5)  # single precision
+    assert found.lpips == (0.0, 0.0)
+
+
+def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
+    bear = small(count=3)
+    judge = _judged(bear)
+    fields = {"near": _darker(bear, 0.55), "far": _darker(bear, 0.2)}
+    truth = judge.pictures(_darker(bear).offsets(1.0))
+    found = courses(judge, fields, (1.0,), lambda _: truth, GradientL1())
+    assert found["near"].psnr[0] > found["far"].psnr[0] + 6
+    assert found["near"].ssim[0] > found["far"].ssim[0]
+    assert found["near"].lpips[0] < found["far"].lpips[0]
+
+
+def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> None:
+    bear = small(count=3)
+    unedited = {1.0: [view.image for view in bear.views]}
+    judge = make_judge(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
+    truth = judge.pictures(_darker(bear).offsets(0.0))
+    worse = [picture.clone() for picture in truth]
+    worse[0] += 0.2 * torch.rand(worse[0].shape, generator=torch.Generator().manual_seed(0))
+    # the window of a pixel at the region's border reaches 5 pixels beyond it
+    reach = [max_pool2d(pixels[None, None].float(), 11, 1, 5)[0, 0] > 0 for pixels in judge.pixels]
+    beyond = [torch.where(near[..., None], p, 1 - p) for p, near in zip(truth, reach, strict=True)]
+    assert any(not torch.equal(a, b) for a, b in zip(beyond, truth, strict=True))
+    assert judge.ssim(beyond, truth) == pytest.approx(1.0, abs=1e-5)
+    assert judge.ssim(worse, truth) < 0.95
+    assert judge.psnr(beyond, truth) == 99.0
+
+
+def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_was_not_asked() -> None:
+    bear = small(count=3)
+    judge = _judged(bear)
+    columns = columns_of([(1.0, 1.0)])
+    ours, own = strip(judge, _darker(bear), columns, 64), editor_strip(judge, columns, 64)
+    assert len(ours) == len(own) == 5
+    assert {picture.shape for picture in (*ours, *own)} == {ours[0].shape}
+    assert torch.equal(ours[0], own[0])
+    assert float(ours[4].mean()) < float(ours[2].mean()) < float(ours[0].mean())
+    grey = (own[1] - own[1].mean()).abs() < 0.02
+    assert float(grey.float().mean()) > 0.5
+    assert int(judge.pixels[best_view(judge)].sum()) == max(int(p.sum()) for p in judge.pixels)
+
+
+@pytest.mark.parametrize("size", [(40, 40), (20, 60), (90, 30)])
+def test_a_thumbnail_has_the_width_that_is_asked_for_and_is_never_tall(size: tuple[int, int]) -> None:
+    picture = thumbnail(torch.zeros(*size, 3), 80)
+    assert picture.shape[1] == 80
+    assert picture.shape[0] <= 100
+    assert float((picture < 0.1).float().sum()) > 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (23.96, 63.4), (0.9, 0.9), (-0.31, 0.27), (1e-4, 3e-4)]
+)
+def test_ticks_are_few_even_and_enclose_the_range(low: float, high: float) -> None:
+    marks = ticks(low, high)
+    assert 2 <= len(marks) <= 9
+    assert marks[0] <= low
+    assert marks[-1] >= high
+    assert np.allclose(np.diff(marks), marks[1] - marks[0])
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_every_line_of_a_plot_is_drawn_in_its_colour(scale: str) -> None:
+    x = [i / 10 for i in range(11)]
+    lines = {f"line {k}": (x, [0.1 + 0.2 * k + 0.05 * v for v in x]) for k in range(4)}
+    picture = draw_plot(Plot("title", lines, "slider", scale), 400, 270)  # type: ignore[arg-type]
+    assert picture.size == (400, 270)
+    assert all(_color_count(picture, color) > 150 for color in LINES[:4])
+    assert _color_count(picture, LINES[4]) == 0
+
+
+def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:
+    holes = ([0.0, 0.5, 1.0], [float("nan"), 0.0, 2.0])
+    for scale in ("linear", "log"):
+        draw_plot(Plot("t", {"holes": holes, "none": ([], [])}, scale=scale), 300, 200)  # type: ignore[arg-type]
+    empty = draw_plot(Plot("t", {"none": ([], [])}), 300, 200)
+    assert _color_count(empty, LINES[0]) == 0
+
+
+def test_bars_stand_on_zero_and_are_as_high_as_their_values() -> None:
+    values = [1.0, 2.0, 4.0]
+    picture = np.asarray(draw_plot(Plot("t", {"b": ([0, 1, 2], values)}, form="bars"), 300, 220), dtype=int)
+    blue = np.abs(picture - np.array(LINES[0])).max(axis=2) <= 12
+    columns = blue.sum(axis=0)
+    heights = [int(part.max()) for part in np.array_split(columns[30:], 3)]
+    assert heights[1] == pytest.approx(2 * heights[0], abs=3)
+    assert heights[2] == pytest.approx(4 * heights[0], abs=5)
+
+
+def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
+    lines = {f"a name of some length {k}": ([0.0, 1.0], [k, k + 1.0]) for k in range(4)}
+    picture = np.asarray(draw_plot(Plot("t", lines), 400, 270), dtype=int)
+    for color in LINES[:4]:
+        rows = np.nonzero((np.abs(picture - np.array(color)).max(axis=2) <= 12).sum(axis=1) >= 10)[0]
+        assert rows.min() < 90, color  # the legend's, above the plot
+
+
+PEAKS = """
+import resource
+from pathlib import Path
+from trainer.memory import PeakMemory
+memory = PeakMemory()
+block = bytearray(128 << 20)
+memory.end("large")
+del block
+memory.end("small")
+(line,) = [l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("VmHWM:")]
+assert memory.peak() == round(int(line.split()[1]) / 1024) >= 128, (memory.peak(), line)
+assert memory.by_stage == {"large": memory.peak(), "small": memory.peak()}, memory.by_stage
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
+def test_the_peak_of_memory_is_the_one_that_the_system_reports() -> None:
+    # a process of its own, in which nothing was ever larger
+    subprocess.run([sys.executable, "-c", PEAKS], check=True, timeout=600)
+
+
+def test_a_resumed_run_remembers_the_peaks_of_its_first_session() -> None:
+    memory = PeakMemory()
+    memory.end("views")
+    memory.restore({"views": 1 << 20, "edit": 7}, 1 << 21)
+    assert memory.by_stage == {"views": 1 << 20, "edit": 7}
+    assert memory.peak() == 1 << 21
+
+
+def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None:
+    bear = small(count=3)
+    edited = {1.0: [view.image for view in bear.views]}
+    wide = pack(bear.scene[bear.region.members], with_shN=True).shape[1]
+    assert wide > 14
+    judge = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, wide)
+    offsets = _darker(bear).offsets(1.0)
+    narrow = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
+    for a, b in zip(judge.pictures(offsets), narrow.pictures(offsets), strict=True):
+        assert torch.allclose(a, b, atol=1e-6)
+
+
+def test_attributes_that_show_little_each_are_not_all_left_out_where_together_they_show() -> None:
+    """Two attributes worth .07 dB each: one may go, both would cost more than what is allowed in all."""
+
+    class Judging(Judge):
+        """Each of the two that is missing takes .07 dB."""
+
+        def pictures(self, offsets: Tensor) -> list[Tensor]:
+            missing = 2 - sum(bool(offsets[:, c].any()) for c in (slice(0, 3), slice(6, 10)))
+            return [torch.full((1, 1, 3), 0.1 * 10 ** (0.07 * missing / 20))]
+
+    end = torch.zeros(2, 14)
+    end[:, [0, 6, 12]] = 1.0
+    trajectory = Trajectory(
+        torch.tensor([0.0, 1.0]),
+        torch.stack([torch.zeros(2, 14), end]).half(),
+        end,
+        torch.tensor([0, 1]),
+        (1,),
+        (1.0,),
+    )
+    pixels = [torch.ones(1, 1, dtype=torch.bool)]
+    judge = Judging(torch.zeros(2, 14), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])
+    kept, costs = without_idle_attributes(trajectory, judge)
+    assert costs == {"quats": 0.07, "means": 0.07}
+    moving = moving_attributes(kept.end)
+    assert ("means" in moving) != ("quats" in moving)
+    assert "sh0" in moving

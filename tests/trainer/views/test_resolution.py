@@ -1,0 +1,61 @@
+"""How many views an edit gets and of how many pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.camera import Camera
+from progdf.demo_scenes import bear
+from progdf.region import Region
+from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
+from trainer.setup.resolution import SIZES, sized
+from trainer.views.view import region_rig
+
+OPTIONS = TrainOptions(scene=Path("s.ply"), out=Path("o"), region="all", editor="recolor:#3060d0")
+
+
+def choice(count: int, cameras: int | None = None, **said: object) -> tuple[int, int]:
+    """Pixels and views for so many of the bear's Gaussians, with that many cameras given."""
+    scene = bear(max(400, count)).gaussians[:count]
+    region = Region("all", torch.arange(count), torch.ones(count))
+    options = replace(OPTIONS, cameras=None if cameras is None else Path("c.json"), **said)  # type: ignore[arg-type]
+
+    def cameras_of(image_size: int, views: int) -> Sequence[Camera]:
+        return region_rig(scene, region, cameras or views, image_size)
+
+    found, views, _ = sized(options, scene, region, cameras_of)
+    return found[0].width, views
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the pixels, so that a small bear is dense."""
+    monkeypatch.setattr("trainer.setup.resolution.SIZES", tuple(size // 10 for size in SIZES))
+
+
+def test_a_sparse_region_gets_few_small_views() -> None:
+    assert choice(60) == (25, VIEWS)
+
+
+def test_a_dense_region_gets_more_views_and_larger_ones() -> None:
+    assert choice(6000) == (32, MOST_VIEWS)
+
+
+def test_where_given_cameras_are_few_the_views_grow_further() -> None:
+    assert choice(6000, cameras=12)[0] == 38
+
+
+def test_what_was_typed_is_kept() -> None:
+    assert choice(6000, views=7) == (38, 7)
+    assert choice(6000, image_size=20) == (20, MOST_VIEWS)
+    assert choice(6000, image_size=20, views=7) == (20, 7)
+
+
+def test_what_is_painted_view_by_view_and_a_draft_stay_small() -> None:
+    assert choice(6000, quick=True) == (25, VIEWS)
+    assert choice(6000, editor="style:14") == (25, VIEWS)

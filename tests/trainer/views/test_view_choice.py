@@ -1,0 +1,265 @@
+"""Which cameras an edit is trained from, and which are held out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.demo_scenes import room
+from progdf.errors import ProgdfError
+from progdf.formats.ply import save_ply
+from progdf.gaussians import Gaussians
+from progdf.io.cameras import save_cameras
+from progdf.lens import Lens
+from progdf.region import from_mask
+from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
+from tests.helpers.trained import WHITE, Small, small
+from trainer.options import TrainOptions
+from trainer.setup.training_setup import make_stand
+from trainer.views.choose import Choice, _framed, _sampled, choose_views, split_views
+
+
+def test_a_camera_that_looks_away_is_left_out() -> None:
+    case = small()
+    camera = case.views[0].camera
+    turned = replace(
+        camera, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.viewmat, name="x"
+    )
+    cameras = [turned, *(view.camera for view in case.views)]
+    chosen = choose_views(case.scene, case.region, cameras, 96, WHITE)
+    assert "x" not in {view.camera.name for view in chosen.views}
+    assert chosen.line() == "6 of 7 cameras; 1 do not see the region"
+    with pytest.raises(ProgdfError, match="sees the region"):
+        choose_views(case.scene, case.region, [turned], 96, WHITE)
+
+
+def test_fewer_views_than_there_are_cameras_are_spread_around_the_region() -> None:
+    case = small(count=6)
+    chosen = choose_views(case.scene, case.region, [view.camera for view in case.views], 3, WHITE).views
+    centre = case.scene.means[case.region.members].mean(dim=0)
+    directions = torch.nn.functional.normalize(
+        torch.stack([view.camera.position - centre for view in chosen]), dim=1
+    )
+    assert len(chosen) == 3
+    assert float((directions @ directions.T - torch.eye(3)).max()) < 0.8
+
+
+def test_held_out_views_are_not_trained_on() -> None:
+    case = small(count=6)
+    train, held_out = split_views(choice_of(case), 2)
+    assert len(train) == 4
+    assert len(held_out) == 2
+    assert not {v.camera.name for v in train} & {v.camera.name for v in held_out}
+
+
+def around(case: Small, azimuths: list[float], name: str = "a", size: int = 64) -> list[Camera]:
+    """Cameras at these azimuths (degrees) around the region, at three heights in turn."""
+    centre = case.scene.means[case.region.members].mean(dim=0)
+    up = torch.tensor([0.0, 1.0, 0.0])
+    cameras = []
+    for i, azimuth in enumerate(math.radians(a) for a in azimuths):
+        eye = centre + 2.5 * torch.tensor([math.sin(azimuth), 0.3 + 0.2 * (i % 3), math.cos(azimuth)])
+        viewmat = look_at(eye, centre, up)
+        cameras.append(Camera(viewmat, intrinsics(0.6, size, size), size, size, f"{name}{i:03d}"))
+    return cameras
+
+
+def azimuths_of(case: Small, cameras: list[Camera]) -> list[float]:
+    centre = case.scene.means[case.region.members].mean(dim=0)
+    places = [camera.position - centre for camera in cameras]
+    return sorted(math.degrees(math.atan2(float(p[0]), float(p[2]))) for p in places)
+
+
+def widest_gap(azimuths: list[float]) -> float:
+    return max(b - a for a, b in zip(azimuths, [*azimuths[1:], azimuths[0] + 360], strict=True))
+
+
+def crowded(case: Small) -> list[Camera]:
+    """Someone stood still for forty pictures, then walked around once."""
+    return around(case, [0.1 * i for i in range(40)], "still") + around(case, [12.0 * i for i in range(30)])
+
+
+def choice_of(case: Small) -> Choice:
+    cameras = [view.camera for view in case.views]
+    return choose_views(case.scene, case.region, cameras, len(cameras), WHITE)
+
+
+@pytest.mark.parametrize("count", [8, 24])
+def test_views_are_taken_from_all_around_and_not_from_the_beginning_of_the_list(count: int) -> None:
+    case = small("head")
+    chosen = choose_views(case.scene, case.region, crowded(case), count, WHITE)
+    assert len(chosen.views) == count
+    assert widest_gap(azimuths_of(case, [view.camera for view in chosen.views])) < 1.8 * 360 / count
+    assert f"{70 - count} show what others show" in chosen.line()
+
+
+def test_the_order_of_the_list_does_not_choose_the_views() -> None:
+    case = small("head")
+    cameras = around(case, [9.0 * i for i in range(40)])
+    shuffled = [cameras[i] for i in torch.randperm(40, generator=torch.Generator().manual_seed(1)).tolist()]
+    chosen, again, other = (
+        choose_views(case.scene, case.region, some, 8, WHITE) for some in (cameras, cameras, shuffled)
+    )
+    names = [view.camera.name for view in chosen.views]
+    assert names == [view.camera.name for view in again.views]
+    assert len(set(names) & {view.camera.name for view in other.views}) >= 6, "ties go by the order"
+    assert widest_gap(azimuths_of(case, [view.camera for view in other.views])) < 81
+    order = [camera.name for camera in shuffled]
+    assert sorted((v.camera.name for v in other.views), key=order.index) == [
+        v.camera.name for v in other.views
+    ]
+
+
+def test_held_out_views_stand_on_all_sides_whatever_the_order() -> None:
+    case = small("head")
+    azimuths = [15.0 * i for i in range(24)]
+    order = torch.randperm(24, generator=torch.Generator().manual_seed(2)).tolist()
+    cameras = around(case, [azimuths[i] for i in order])
+    train, held_out = split_views(choose_views(case.scene, case.region, cameras, 24, WHITE), 4)
+    assert len(train) == 20
+    assert widest_gap(azimuths_of(case, [view.camera for view in held_out])) < 150
+    assert widest_gap(azimuths_of(case, [view.camera for view in train])) < 50
+
+
+def test_views_from_within_show_every_wall() -> None:
+    """Cameras stand in a box and mostly look at one wall; few views are to show all four."""
+    side = torch.linspace(-1, 1, 12)
+    first, second = (axis.flatten() for axis in torch.meshgrid(side, side, indexing="ij"))
+    walls = [torch.stack([first, second, torch.full_like(first, d)], dim=1)[:, order]
+             for d in (-1.0, 1.0) for order in ([0, 1, 2], [2, 1, 0])]  # fmt: skip
+    unseen = torch.tensor([[0.0, 50.0, 0.0]]).expand(600, 3)
+    means = torch.cat([unseen, *walls])
+    n = len(means)
+    scene = Gaussians(
+        means, torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4).clone(), torch.full((n, 3), -2.5),
+        torch.full((n,), 2.0), torch.zeros(n, 3), torch.zeros(n, 0, 3),
+    )  # fmt: skip
+    up, K = torch.tensor([0.0, 1.0, 0.0]), intrinsics(1.2, 64, 64)
+    targets = [(0.02 * i, 0.0, 1.0) for i in range(30)] + [(1.0, 0, 0.1), (-1.0, 0, 0.1), (0.1, 0, -1.0)]
+    cameras = [
+        Camera(look_at(torch.tensor([0.0, 0.0, 0.01 * i]), torch.tensor(t), up), K, 64, 64, f"v{i}")
+        for i, t in enumerate(targets)
+    ]
+    region = from_mask("walls", torch.arange(n) >= len(unseen))
+    chosen = choose_views(scene, region, cameras, 6, WHITE)
+    assert {"v30", "v31", "v32"} <= {view.camera.name for view in chosen.views}
+
+
+def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
+    demo = room(1500)
+    save_ply(tmp_path / "room.ply", demo.gaussians)
+    options = TrainOptions(tmp_path / "room.ply", tmp_path / "run", "all", "night", views=6, image_size=48)
+    region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
+    with pytest.raises(ProgdfError, match="--cameras") as told:
+        make_stand(options, demo.gaussians, region)
+    assert "\n" not in str(told.value)
+    save_cameras(tmp_path / "c.json", [replace(c, lens=Lens(k1=0.1)) for c in demo.cameras])
+    stand = make_stand(replace(options, cameras=tmp_path / "c.json"), demo.gaussians, region)
+    assert len(stand.train) + len(stand.held_out) == 6
+    assert "6 of 32 cameras" in stand.notes[1]
+    assert "photographs:EDITED,ORIGINALS" in stand.notes[2]
+
+
+def picked(likeness: Tensor, held_out: int) -> list[int]:
+    """Which of the views are held out that are so much alike."""
+    views = tuple(replace(small().views[0], box=(i, 0, 64, 64)) for i in range(len(likeness)))
+    train, held = split_views(Choice(views, likeness, len(views), 0, 0), held_out)
+    assert [view.box[0] for view in train] == [
+        i for i in range(len(views)) if i not in {v.box[0] for v in held}
+    ]
+    return [view.box[0] for view in held]
+
+
+def test_views_that_show_what_the_others_show_are_held_out_one_from_each_side() -> None:
+    likeness = torch.eye(6)
+    likeness[:3, 1] = 0.95  # view 1 shows what 0 and 2 show, but they do not show all that it shows
+    likeness[3:, 5] = 1.0
+    likeness[3:, 0] = 0.65  # which is nothing new once 5 is held out
+    assert picked(likeness, 1) == [5]
+    assert picked(likeness, 2) == [1, 5], "in the order of the list"
+    assert picked(likeness.T.contiguous(), 2) != [1, 5]
+
+
+def test_no_more_than_a_third_is_held_out_and_no_view_twice() -> None:
+    assert picked(torch.ones(6, 6), 5) == [0, 1]
+    few = tuple(small().views[:2])
+    train, held = split_views(Choice(few, torch.eye(2), 2, 0, 0), 1)
+    assert train == held == list(few)
+
+
+def test_a_camera_that_shows_the_region_small_is_left_out_and_said_so() -> None:
+    case = small("head")
+    near = around(case, [0.0, 90.0, 180.0, 270.0])
+    far = replace(near[0], K=near[0].K * torch.tensor([[0.2, 1, 1], [1, 0.2, 1], [1, 1, 1]]), name="far")
+    little = replace(near[1].resized(24, 24), name="little")
+    chosen = choose_views(case.scene, case.region, [*near, far, little], 96, WHITE)
+    assert [view.camera.name for view in chosen.views] == [*(c.name for c in near), "little"]
+    assert chosen.line() == "5 of 6 cameras; 1 see too little of it"
+
+
+def test_a_region_behind_a_wall_is_seen_by_those_on_its_side() -> None:
+    member = one_gaussian(mean=(0.0, 0.0, 0.0), scales=(0.1, 0.1, 0.1))
+    layers = [
+        one_gaussian((0.0, 0.0, -0.5 - 0.1 * i), (9.0, 9.0, 0.01), (1, 0, 0, 0), opacity=0.999)
+        for i in range(6)
+    ]
+    scene = concatenate(member, *layers)
+    region = from_mask("hidden", torch.arange(len(scene)) == 0)
+    before = [orbit_camera(64, 64, azimuth=0.05 * i) for i in range(5)]
+    behind = [orbit_camera(64, 64, azimuth=math.pi + 0.4 * i, elevation=0.2 * i) for i in range(2)]
+    cameras = [replace(c, name=str(i)) for i, c in enumerate([*before, *behind])]
+    chosen = choose_views(scene, region, cameras, 96, WHITE)
+    assert [view.camera.name for view in chosen.views] == ["5", "6"]
+    assert chosen.line() == "2 of 7 cameras; 5 do not see the region"
+
+
+def test_what_reaches_into_the_picture_from_beside_it_is_seen() -> None:
+    scene = one_gaussian(mean=(0.9, 0.0, 1.0), scales=(0.3, 0.3, 0.3))
+    region = from_mask("all", torch.tensor([True]))
+    camera = front_camera(64, 64, focal=50.0)
+    assert len(choose_views(scene, region, [camera], 1, WHITE).views) == 1
+
+
+def test_places_are_framed_as_far_as_half_a_picture_beside_it() -> None:
+    camera = replace(orbit_camera(60, 40, azimuth=0.8, elevation=0.5), name="odd")
+    depth = torch.tensor(3.0)
+    pixels = torch.tensor([[30.0, 20.0], [-29, 20], [-31, 20], [89, 59], [30, 61], [30, 20]])
+    rays = torch.linalg.solve(camera.K, torch.cat([pixels, torch.ones(6, 1)], dim=1).T).T * depth
+    rays[5] *= -1  # behind
+    places = rays @ camera.c2w[:3, :3].T + camera.position
+    assert _framed(places, camera).tolist() == [True, True, False, True, False, False]
+
+
+def test_as_many_views_as_are_asked_for_even_where_all_show_the_same() -> None:
+    case = small("head")
+    same = [replace(case.views[0].camera, name=str(i)) for i in range(5)]
+    assert len(choose_views(case.scene, case.region, same, 3, WHITE).views) == 3
+
+
+def test_a_wide_view_shows_what_a_narrow_one_does_and_not_the_other_way_round() -> None:
+    left, right = (one_gaussian(mean=(x, 0.0, 4.0), scales=(0.3, 0.3, 0.3)) for x in (-0.7, 0.7))
+    scene = concatenate(left, right)
+    wide = front_camera(64, 64, focal=80.0)
+    narrow = replace(
+        wide, K=wide.K + torch.tensor([[0.0, 0, 40], [0, 0, 0], [0, 0, 0]])
+    )  # the left one alone
+    region = from_mask("both", torch.ones(2, dtype=torch.bool))
+    likeness = choose_views(scene, region, [wide, narrow], 2, WHITE).likeness
+    assert float(likeness[1, 0]) > 0.9
+    assert float(likeness[0, 1]) < 0.6
+
+
+def test_members_are_sampled_all_over_the_region() -> None:
+    scene = random_gaussians(2000, scale=0.01)
+    scene = replace(scene, log_scales=torch.full((2000, 3), -4.0), logit_opacities=torch.zeros(2000))
+    rows = _sampled(scene, from_mask("half", torch.arange(2000) >= 1000))
+    assert len(rows) == 256
+    assert int(rows[0]) - 1000 <= 4
+    assert 1999 - int(rows[-1]) <= 4
+    assert int(rows.diff().max()) <= 5

@@ -1,0 +1,216 @@
+"""Views: what of their pictures an edit can change, and where the cameras stand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.io.images import write_image
+from progdf.lens import Lens, straightened
+from progdf.rasterize import render
+from progdf.region import from_mask
+from progdf.scene.bounds import scene_sphere
+from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
+from tests.helpers.trained import small
+from trainer.editors import EditorSettings, check_new_editor, make_editor
+from trainer.editors.folder import FolderEditor
+from trainer.views.view import fit_size, make_view, named, region_box, region_rig, seen_colors
+
+
+def test_a_box_grows_to_what_an_edit_changes() -> None:
+    view = small().views[0]
+    moved = view.image.clone()
+    moved[0, 0] = 1.0 - moved[0, 0]
+    x0, y0, x1, y1 = view.widened([moved, view.image]).box
+    rows, columns = (view.mask > 0.05).nonzero().unbind(dim=1)
+    assert (x0, y0) == (0, 0)
+    assert x1 > int(columns.max())
+    assert y1 > int(rows.max())
+    assert view.widened([view.image]).box == view.box
+
+
+def test_the_rig_covers_a_small_region_with_pixels() -> None:
+    case = small("scarf", size=1500)
+    for view in case.views:
+        x0, y0, x1, y1 = view.box
+        width, height = view.camera.width, view.camera.height
+        assert max((x1 - x0) / width, (y1 - y0) / height) > 0.4
+
+
+def test_view_names_are_distinct_and_can_be_file_names() -> None:
+    camera = small().views[0].camera
+    names = ["images/a.png", "a.jpg", "", "x/../..", "b c"]
+    found = [c.name for c in named([replace(camera, name=name) for name in names])]
+    assert len(set(found)) == len(found)
+    assert found[0] == "a"
+    assert not any("/" in name or name.startswith(".") for name in found)
+
+
+def test_a_name_too_long_for_a_file_is_cut() -> None:
+    camera = small().views[0].camera
+    first, second = (c.name for c in named([replace(camera, name="\U00020000" * 300)] * 2))
+    assert len(f"{first}.png".encode()) < 250
+    assert second == "view_001"
+
+
+def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: Path) -> None:
+    case = small()
+    lens = Lens(k1=2.5)
+    view = replace(case.views[0], camera=replace(case.views[0].camera, lens=lens))
+    (tmp_path / "p").mkdir()
+    checks = (
+        ((torch.arange(72)[:, None] // 6 + torch.arange(72) // 6) % 2).float()[..., None].expand(-1, -1, 3)
+    )
+    write_image(tmp_path / "p" / f"{view.camera.name}.png", checks)
+    raw = make_editor(f"folder:{tmp_path / 'p'}", case.scene, case.region, [view]).edit(view, 1.0)
+    straight = make_editor(f"photographs:{tmp_path / 'p'}", case.scene, case.region, [view]).edit(view, 1.0)
+    assert torch.equal(raw, checks)
+    expected, shown = straightened(checks, view.camera.K, lens)
+    assert torch.equal(straight[shown], expected[shown])
+    assert torch.equal(straight[~shown], view.image[~shown]), "what no photograph shows stays as it is"
+    assert float((straight - raw).abs().mean()) > 0.01
+    plain = replace(view, camera=replace(view.camera, lens=None))
+    editor = make_editor(f"photographs:{tmp_path / 'p'}", case.scene, case.region, [plain])
+    assert torch.equal(editor.edit(plain, 1.0), raw)
+
+
+def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path: Path) -> None:
+    case = small()
+    view = case.views[0]
+    sharp = (
+        view.image + 0.2 * torch.rand(view.image.shape, generator=torch.Generator().manual_seed(0))
+    ) / 1.2
+    painted = sharp.clone()
+    painted[20:40, 30:50] = torch.tensor([0.1, 0.3, 0.9])
+    for folder, picture in (("before", sharp), ("after", painted)):
+        write_image(tmp_path / folder / f"{view.camera.name}.png", picture)
+    spec = f"photographs:{tmp_path / 'after'},{tmp_path / 'before'}"
+    editor = make_editor(spec, case.scene, case.region, [view])
+    made = editor.edit(view, 1.0)
+    untouched = torch.ones(made.shape[:2], dtype=torch.bool)
+    untouched[20:40, 30:50] = False
+    torch.testing.assert_close(made[untouched], view.image[untouched], atol=1e-6, rtol=0)
+    expected = (view.image + painted - sharp).clamp(0, 1)
+    torch.testing.assert_close(made, expected, atol=1.5 / 255, rtol=0)  # both files are rounded to 8 bits
+    alone = make_editor(f"photographs:{tmp_path / 'after'}", case.scene, case.region, [view])
+    torch.testing.assert_close(alone.edit(view, 1.0), painted, atol=0.6 / 255, rtol=0)
+    assert isinstance(editor, FolderEditor)
+    assert isinstance(alone, FolderEditor)
+    assert editor.warning is None
+    assert alone.warning is not None
+    assert "photographs:EDITED,ORIGINALS" in alone.warning
+
+
+@pytest.mark.parametrize(
+    "spec", ["photographs:", "photographs:{0},", "photographs:{0},{0}/no", "photographs:{0}/no"]
+)
+def test_photographs_that_are_not_there_are_refused_in_one_line(tmp_path: Path, spec: str) -> None:
+    with pytest.raises(ProgdfError, match="; ") as told:
+        check_new_editor(spec.format(tmp_path), EditorSettings())
+    assert "\n" not in str(told.value)
+
+
+def test_an_original_photograph_that_is_missing_is_refused_before_training(tmp_path: Path) -> None:
+    case = small(count=3)
+    (tmp_path / "before").mkdir()
+    for view in case.views:
+        write_image(tmp_path / f"{view.camera.name}.png", view.image)
+    with pytest.raises(ProgdfError, match=r"before has no picture .*; put the photographs there"):
+        make_editor(f"photographs:{tmp_path},{tmp_path / 'before'}", case.scene, case.region, case.views)
+
+
+def test_what_is_put_in_place_of_the_inside_is_mixed_as_the_original_was() -> None:
+    view = small().views[0]
+    assert float((view.blended(view.inside) - view.image).abs().max()) < 1e-6, "nothing changed"
+    green = torch.tensor([0.1, 0.8, 0.2]).expand_as(view.image)
+    expected = view.image + view.mask[..., None] * (green - view.inside)
+    soft = (view.mask > 0.02) & (view.mask < 0.98)
+    assert int(soft.sum()) > 20
+    torch.testing.assert_close(view.blended(green)[soft], expected.clamp(0, 1)[soft])
+    assert torch.equal(view.blended(green)[view.mask == 0], view.image[view.mask == 0])
+
+
+def test_outside_the_region_an_edit_is_put_back_and_from_a_fifth_on_it_is_taken() -> None:
+    view = replace(small().views[0], mask=torch.tensor([0.0, 0.1, 0.2, 1.0]).repeat_interleave(18)[:, None])
+    edited = 1 - view.image
+    found = view.confined(edited)
+    assert torch.equal(found[:18], view.image[:18])
+    torch.testing.assert_close(found[18:36], torch.full_like(found[18:36], 0.5))
+    torch.testing.assert_close(found[36:], edited[36:])
+
+
+def test_a_box_grows_with_a_change_in_one_channel_and_not_with_one_too_small_to_see() -> None:
+    view = small().views[0]
+    faint, blue = view.image.clone(), view.image.clone()
+    faint[0, 0] += 0.04
+    blue[0, 0, 2] -= 0.06
+    assert view.widened([faint]).box == view.box
+    assert view.widened([blue]).box[:2] == (0, 0)
+
+
+def test_a_view_shows_the_scene_and_of_the_region_its_own_colour() -> None:
+    behind = one_gaussian(mean=(0.1, 0.0, 3.0), scales=(0.3, 0.3, 0.3), rgb=(0.1, 0.2, 0.9))
+    scene = concatenate(
+        behind, one_gaussian(mean=(-0.1, 0.0, 2.0), scales=(0.2, 0.2, 0.2), rgb=(0.8, 0.3, 0.1))
+    )
+    scene = replace(scene, shN=0.1 * torch.randn(2, 15, 3, generator=torch.Generator().manual_seed(0)))
+    region = from_mask("front", torch.tensor([False, True]))
+    camera, background = front_camera(96, 80, focal=90.0), torch.tensor([0.2, 0.9, 0.4])
+    view = make_view(scene, region, camera, background)
+    torch.testing.assert_close(view.image, render(scene, camera, background).clamp(0, 1))
+    alone = view.mask > 0.05
+    assert int(alone.sum()) > 100
+    own = seen_colors(scene, camera)[1].clamp(0, 1)
+    torch.testing.assert_close(view.inside[alone], own.expand(int(alone.sum()), 3), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "box"),
+    [
+        ((60, 140), (100, 250), (94, 54, 256, 146)),  # six pixels all around
+        ((100, 101), (150, 151), (118, 68, 182, 132)),  # 64 pixels, the spot in the middle
+        ((0, 1), (0, 1), (0, 0, 64, 64)),
+        ((199, 200), (299, 300), (236, 136, 300, 200)),
+        ((0, 200), (0, 300), (0, 0, 300, 200)),
+        ((0, 0), (0, 0), (0, 0, 300, 200)),  # nothing shows it
+    ],
+)
+def test_a_box_has_a_margin_64_pixels_and_stays_in_the_picture(
+    rows: tuple[int, int], columns: tuple[int, int], box: tuple[int, int, int, int]
+) -> None:
+    mask = torch.full((200, 300), 0.02)
+    mask[slice(*rows), slice(*columns)] = 0.03
+    assert region_box(mask) == box
+
+
+def test_a_picture_smaller_than_64_pixels_is_all_box() -> None:
+    assert region_box(torch.ones(40, 50)) == (0, 0, 50, 40)
+
+
+def test_the_rig_fills_the_picture_with_the_region_to_four_fifths_and_a_half_in_turn() -> None:
+    scene = ball(400)
+    region = from_mask("piece", (scene.means - torch.tensor([0.3, 0.0, 0.0])).norm(dim=1) < 0.25)
+    centre, radius = scene_sphere(scene[region.members])
+    radius += float(scene.scales[region.members].amax(dim=1).median())
+    for i, camera in enumerate(region_rig(scene, region, 6, 100)):
+        distance = float((camera.position - centre).norm())
+        across = 2 * float(camera.K[0, 0]) * math.tan(math.asin(radius / distance))
+        assert across == pytest.approx(80 if i % 2 == 0 else 50, rel=0.05)
+        ahead = camera.viewmat[:3, :3] @ centre + camera.viewmat[:3, 3]
+        torch.testing.assert_close(ahead[:2], torch.zeros(2), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("size", "found"),
+    [((400, 100), (64, 16)), ((100, 400), (16, 64)), ((64, 20), (64, 20)), ((20, 9), (20, 9))],
+)
+def test_the_longer_side_is_fitted_and_nothing_is_enlarged(
+    size: tuple[int, int], found: tuple[int, int]
+) -> None:
+    camera = fit_size(front_camera(*size), 64)
+    assert (camera.width, camera.height) == found

@@ -1,0 +1,95 @@
+"""The list of bindings: whole, readable at the smallest window, and never under a message."""
+
+from __future__ import annotations
+
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.ui_rig import Rig, rig
+from viewer.app import bindings
+from viewer.camera import controls
+from viewer.ui.context import SMALL_PX
+
+SMALLEST = (1024, 640)
+
+
+def test_every_key_that_has_a_help_text_is_listed_once_under_a_topic() -> None:
+    listed = [does for topic in bindings.topics() for _, does in topic.rows]
+    assert sorted(listed) == sorted(
+        [does for _, does in bindings.MOUSE_HELP] + [key.help for key in controls.KEYS if key.help]
+    )
+    assert all(topic.rows for topic in bindings.topics())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 9])
+def test_columns_keep_all_topics_in_their_order_and_none_is_longer_than_need_be(count: int) -> None:
+    topics = bindings.topics()
+    found = bindings.columns(topics, count)
+    assert len(found) <= count
+    assert tuple(topic for column in found for topic in column) == topics
+    longest = max(sum(topic.height for topic in column) for column in found)
+    assert longest <= sum(topic.height for topic in topics) / count + max(t.height for t in topics)
+
+
+def shown(hand: Rig) -> imgui.internal.Window:
+    return imgui.internal.find_window_by_name("bindings")
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize(
+    ("points", "density", "scale"), [(SMALLEST, 1.0, 1.0), (SMALLEST, 2.0, 1.0), ((2048, 1280), 1.0, 2.0)]
+)
+def test_the_whole_list_is_readable_in_the_smallest_window(
+    points: tuple[int, int], density: float, scale: float
+) -> None:
+    with rig(None, points, density, scale) as hand:
+        hand.key("F1")
+        hand.frame(2)
+        window = shown(hand)
+        assert window.scroll_max.y == 0.0
+        assert window.scroll_max.x == 0.0
+        assert window.pos.y >= 0.0
+        assert window.pos.y + window.size.y <= points[1]
+        assert fits_its_columns(hand)
+
+
+def fits_its_columns(hand: Rig) -> bool:
+    """Whether no line is longer than its column."""
+    imgui.new_frame()
+    imgui.push_font(hand.stage.ui.fonts.regular, SMALL_PX)
+    room = (bindings.COLUMN_PX - 8.0) * hand.stage.ui.scale
+    fits = all(
+        max(imgui.calc_text_size(chord).x for topic in column for chord, _ in topic.rows)
+        + 14.0 * hand.stage.ui.scale
+        + max(imgui.calc_text_size(does).x for topic in column for _, does in topic.rows)
+        <= room
+        for column in bindings.columns(bindings.topics(), 3)
+    )
+    imgui.pop_font()
+    imgui.end_frame()
+    return fits
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("times", [1, 4, 16])
+def test_a_message_stands_below_the_list_also_where_it_takes_several_lines(times: int) -> None:
+    with rig(None, SMALLEST) as hand:
+        hand.key("F1")
+        hand.stage.tell("a line that is long enough to be wrapped " * times)
+        hand.frame(3)
+        window, message = shown(hand), imgui.internal.find_window_by_name("message")
+        assert window.pos.y + window.size.y <= message.pos.y
+        assert times > 4 or window.scroll_max.y == 0.0
+
+
+@pytest.mark.gl
+def test_in_a_window_that_is_too_small_the_list_scrolls_to_its_end() -> None:
+    with rig(None, (640, 400)) as hand:
+        hand.key("F1")
+        hand.frame(2)
+        before = hand.stage.work.view.camera
+        assert shown(hand).scroll_max.y > 0.0
+        for _ in range(40):
+            hand.wheel(320.0, 200.0, -2.0)
+        assert shown(hand).scroll.y == shown(hand).scroll_max.y
+        assert hand.stage.work.view.camera == before, "the wheel over it zooms nothing"

@@ -1,0 +1,118 @@
+"""Files dropped on the window, without a screen: glfw's null platform."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from progdf.formats.ply import save_ply
+from progdf.gdf.file import save_gdf
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app import app as application
+from viewer.files import timeline_file
+from viewer.state.view_state import Keyframe, Timeline
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[application.App]:
+    """The application on a window of glfw's null platform: everything but a screen."""
+    from viewer.ui.window import Window, glfw
+
+    glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
+    if not glfw.init():
+        pytest.skip("glfw has no null platform here")
+    glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
+    stack = bear()
+    try:
+        window = Window("test", (800, 600))
+    finally:
+        glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
+    document = application.Document("bear.ply", stack.scene, stack.gdfs[:1])
+    app = application.App(window, document, first_view(stack, 0.5), tmp_path)
+    app.draw()
+    yield app
+    app.close()
+    window.close()
+
+
+@pytest.mark.gl
+def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, tmp_path: Path) -> None:
+    gdf = bear().gdfs[1]
+    save_gdf(tmp_path / "ears.gdf", gdf)
+    opened.open(tmp_path / "ears.gdf")
+    opened.draw()
+    layers = opened.stage.work.view.layers
+    assert [(layer.name, layer.strength) for layer in layers] == [("scarf", 0.5), ("ears", 1.0)]
+    assert [row.count for row in opened.stage.facts.rows] == [len(g.region) for g in bear().gdfs]
+    assert len(opened.stage.work.past.past) == 1
+
+
+@pytest.mark.gl
+def test_a_dropped_timeline_is_ready_to_play_and_can_be_undone(
+    opened: application.App, tmp_path: Path
+) -> None:
+    layers = opened.stage.work.view.layers
+    keys = (Keyframe(0, ((0, 0.0),)), Keyframe(9, ((0, 1.0),)))
+    timeline_file.save(tmp_path / "film.json", Timeline(keys, 9), layers)
+    opened.open(tmp_path / "film.json")
+    opened.draw()
+    assert opened.stage.work.view.timeline.keys == keys
+    assert opened.stage.work.player.shown
+    assert len(opened.stage.work.past.past) == 1
+    save_ply(tmp_path / "half.ply", bear().scene[:700])
+    opened.stage.restart(opened.stage.work.view)
+    opened.open(tmp_path / "half.ply")
+    assert opened.stage.work.view.timeline == Timeline()
+
+
+@pytest.mark.gl
+def test_a_dropped_scene_takes_the_place_of_the_old_one(opened: application.App, tmp_path: Path) -> None:
+    save_ply(tmp_path / "half.ply", bear().scene[:700])
+    opened.open(tmp_path / "half.ply")
+    opened.draw()
+    assert opened.stage.facts.count == 700
+    assert opened.stage.work.view.layers == ()
+    assert opened.stage.facts.title == "half.ply"
+
+
+@pytest.mark.gl
+def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
+    opened: application.App, tmp_path: Path
+) -> None:
+    before = opened.stage.work.view
+    other = replace(bear().gdfs[1], scene=replace(bear().gdfs[1].scene, means_sha256="0" * 64))
+    save_gdf(tmp_path / "other.gdf", other)
+    (tmp_path / "torn.ply").write_bytes(b"ply\nformat")
+    (tmp_path / "notes.txt").write_text("hello")
+    for name in ("other.gdf", "torn.ply", "notes.txt", "absent.gdf"):
+        opened.open(tmp_path / name)
+        opened.draw()
+        message = opened.stage.work.message
+        assert message is not None
+        assert message.error
+        assert name in message.text
+        assert "\n" not in message.text
+        assert opened.stage.work.view == before
+
+
+@pytest.mark.gl
+def test_glfw_hands_dropped_files_to_the_next_turn_of_the_loop(
+    opened: application.App, tmp_path: Path
+) -> None:
+    from viewer.ui.window import glfw
+
+    (tmp_path / "torn.ply").write_bytes(b"ply\nformat")
+    drop = glfw.set_drop_callback(opened.window.handle, None)
+    names = (ctypes.c_char_p * 1)(str(tmp_path / "torn.ply").encode())
+    drop(opened.window.handle, len(names), names)
+    assert opened.stage.patience() == 0.0, "the loop wakes"
+    for path in opened._take_dropped():
+        opened.open(path)
+    opened.draw()
+    assert opened.stage.work.message is not None
+    assert "torn.ply" in opened.stage.work.message.text
+    assert opened._take_dropped() == []

@@ -1,0 +1,174 @@
+"""The desktop's own file dialogs, with a program of ours in the place of the desktop's."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.null_app import null_app, press
+from tests.helpers.ui_rig import bear, first_view, rig
+from viewer.app import native_dialogs as native
+from viewer.app.app import App
+from viewer.files import document, session
+from viewer.state.workspace import Dialog
+
+pytestmark = [
+    pytest.mark.gl,
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others have dialogs of their own"),
+]
+
+
+@dataclass(frozen=True)
+class Desktop:
+    """The application, and a program that answers for the person."""
+
+    app: App
+    folder: Path
+
+    def answers(self, script: str) -> None:
+        """What the program `zenity` does from now on; "$@" is what it was asked."""
+        program = self.folder / "bin" / "zenity"
+        program.write_text(f'#!/bin/sh\necho "$@" > "{self.folder}/asked"\n{script}\n')
+        program.chmod(0o755)
+
+    @property
+    def asked(self) -> str:
+        return (self.folder / "asked").read_text()
+
+    def until_answered(self) -> None:
+        """The window's loop, as long as the program is on screen; it never waits longer than a poll."""
+        end = time.monotonic() + 60.0
+        while self.app.desk.choosing() is not None:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+            self.app.draw()
+        for _ in range(4):
+            self.app.draw()
+
+
+@pytest.fixture
+def desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desktop]:
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "work").mkdir()
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("XDG_CURRENT_DESKTOP", "GNOME")
+    scene, *gdfs = bear().save(tmp_path / "work")
+    with null_app(document.load(scene, gdfs[:1]), first_view(bear(), 0.5), tmp_path / "work") as app:
+        made = Desktop(app, tmp_path)
+        made.answers("exit 1")
+        yield made
+
+
+def question(desktop: Desktop) -> Dialog:
+    asked = desktop.app.stage.work.dialog
+    assert asked is not None
+    return asked
+
+
+def test_a_file_chosen_in_the_desktops_dialog_is_opened(desktop: Desktop) -> None:
+    ears = desktop.folder / "work" / "ears.gdf"
+    desktop.answers(f'echo "{ears}"')
+    press(desktop.app, "Ctrl+O", "Ctrl+B")
+    desktop.until_answered()
+    assert desktop.app.stage.work.dialog is None
+    assert [gdf.name for gdf in desktop.app.document.gdfs] == ["scarf", "ears"]
+    assert "--file-selection" in desktop.asked
+    assert str(desktop.folder / "work") in desktop.asked, "it begins beside the scene"
+
+
+def test_a_place_chosen_in_the_desktops_dialog_is_saved_to(desktop: Desktop) -> None:
+    there = desktop.folder / "work" / "chosen.session.json"
+    desktop.answers(f'echo "{there}"')
+    press(desktop.app, "Shift+Left", "Ctrl+S", "Ctrl+B")
+    desktop.until_answered()
+    assert "--save" in desktop.asked
+    assert session.open_session(there).view.layers == desktop.app.stage.work.view.layers
+    assert not desktop.app.desk.unsaved
+
+
+def test_cancelling_it_leaves_the_question_with_what_was_typed(desktop: Desktop) -> None:
+    press(desktop.app, "Ctrl+S")
+    typed = question(desktop).text
+    press(desktop.app, "Ctrl+B")
+    desktop.until_answered()
+    assert question(desktop) == Dialog("save", typed)
+    press(desktop.app, "Enter")
+    assert Path(typed).is_file(), "the path field still does its work"
+
+
+def test_the_window_goes_on_while_it_is_open_and_takes_it_away_when_it_answers_itself(
+    desktop: Desktop,
+) -> None:
+    desktop.answers(f'echo $$ > "{desktop.folder}/pid"\nexec sleep 600')
+    press(desktop.app, "Ctrl+O", "Ctrl+B")
+    frames = desktop.app.stage.frames
+    pid = desktop.folder / "pid"
+    while not (pid.is_file() and pid.read_text().strip()):
+        assert desktop.app.desk.choosing() == native.POLL_S
+        time.sleep(0.01)
+    assert question(desktop).choosing
+    press(desktop.app, "Ctrl+B")
+    assert desktop.app.stage.frames > frames, "nothing waits for the person"
+    press(desktop.app, "Escape")
+    assert desktop.app.stage.work.dialog is None
+    assert desktop.app.desk.choosing() is None
+    assert not alive(int(pid.read_text()))
+
+
+def test_closing_the_window_takes_it_away(desktop: Desktop) -> None:
+    desktop.answers(f'echo $$ > "{desktop.folder}/pid"\nexec sleep 600')
+    press(desktop.app, "Ctrl+O", "Ctrl+B")
+    pid = desktop.folder / "pid"
+    while not (pid.is_file() and pid.read_text().strip()):
+        time.sleep(0.01)
+    desktop.app.desk.release()
+    assert not alive(int(pid.read_text()))
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that ended and was not yet asked about does not."""
+    end = time.monotonic() + 10.0
+    while time.monotonic() < end:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return False
+        if state == "Z":
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def test_without_such_a_program_one_line_says_so_and_the_path_field_stays(
+    desktop: Desktop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(desktop.folder / "nothing"))
+    press(desktop.app, "Ctrl+S", "Ctrl+B")
+    assert question(desktop).notice == native.obstacle()
+    assert "; type the path" in native.obstacle()
+    assert "\n" not in native.obstacle()
+    assert not question(desktop).choosing
+    assert desktop.app.desk.choosing() is None
+    path = Path(question(desktop).text)
+    press(desktop.app, "Enter")
+    assert path.is_file()
+
+
+@pytest.mark.parametrize("kind", ["open", "save"])
+def test_the_button_beside_the_path_field_asks_for_it(kind: str) -> None:
+    with rig(points=(900, 640)) as hand:
+        hand.stage.ask(Dialog(kind, "/tmp/x"))
+        hand.settle()
+        x = (900 - 300) / 2 + 260 - 16 - 18
+        for y in range(60, 320, 8):
+            hand.click(x, float(y))
+            if "browse" in hand.stage.work.requests:
+                break
+        assert "browse" in hand.stage.work.requests
+        assert hand.stage.work.dialog is not None, "the question stays"

@@ -1,0 +1,121 @@
+"""A mouse that rests and a hand that types fast: tooltips open, no letter is lost or comes too late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera import inputs
+from viewer.camera.inputs import Keys, Press
+from viewer.ui import frame_pacer as pace
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig(first_view(bear(), 0.5, 0.5), (700, 640)) as made:
+        yield made
+
+
+def tooltip_is_open() -> bool:
+    windows = imgui.get_current_context().windows
+    tips = [window for window in windows if window.name.startswith("##Tooltip")]
+    return any(window.active and not window.hidden for window in tips)
+
+
+@pytest.mark.parametrize("place", [(22.0, 617.0), (222.0, 617.0), (272.0, 617.0), (150.0, 109.0)])
+def test_a_tooltip_opens_under_a_mouse_that_rests_and_then_nothing_is_drawn(
+    hand: Rig, place: tuple[float, float]
+) -> None:
+    hand.move(400.0 + place[0], place[1])
+    hand.settle()
+    assert not tooltip_is_open()
+    hand.rest()
+    assert tooltip_is_open()
+    assert hand.stage.patience() is None
+
+
+def test_other_frames_meanwhile_do_not_take_the_tooltips_place(hand: Rig) -> None:
+    hand.move(422.0, 617.0)
+    hand.settle()
+    hand.frame(5)  # a picture that sharpens, a message that leaves
+    hand.rest()
+    assert tooltip_is_open()
+
+
+def test_rest_takes_a_bounded_number_of_frames() -> None:
+    made = pace.Pace()
+    frames = 0
+    while (wait := made.patience(())) is not None:
+        made.step(max(wait, 1 / 60))
+        frames += 1
+    assert frames == 2 * pace.SETTLE_FRAMES + 1
+
+
+def type_fast(hand: Rig, text: str, *keys: tuple[imgui.Key, str]) -> None:
+    """All of it between two frames, as the window hears it of a slow frame; then what its loop does."""
+    for letter in text:
+        hand.io.add_key_event(getattr(imgui.Key, f"_{letter}", imgui.Key.period), True)
+        hand.io.add_input_characters_utf8(letter)
+        hand.io.add_key_event(getattr(imgui.Key, f"_{letter}", imgui.Key.period), False)
+    pressed = []
+    for key, chord in keys:
+        pressed.append(Press(chord, event_id=inputs.next_event_id()))
+        hand.io.add_key_event(key, True)
+        hand.io.add_key_event(key, False)
+    hand.stage.wake()
+    hand.frame(keys=Keys(tuple(pressed)))
+    hand.settle()
+
+
+def test_a_value_typed_faster_than_frames_arrives_whole_and_before_enter(hand: Rig) -> None:
+    hand.modifier(imgui.Key.mod_ctrl)
+    hand.click(*hand.slider(0, 0.2))
+    hand.modifier(imgui.Key.mod_ctrl, False)
+    type_fast(hand, "0.1122", (imgui.Key.enter, "Enter"))
+    assert hand.strengths[0] == pytest.approx(0.1122)
+    assert hand.stage.work.renaming is None, "this Enter was the field's"
+
+
+def test_what_follows_the_click_at_once_is_typed_too(hand: Rig) -> None:
+    hand.move(*hand.slider(0, 0.2))
+    hand.io.add_key_event(imgui.Key.mod_ctrl, True)
+    for down in (True, False):
+        hand.io.add_mouse_button_event(0, down)
+    hand.io.add_key_event(imgui.Key.mod_ctrl, False)
+    type_fast(hand, "0.75", (imgui.Key.enter, "Enter"))
+    assert hand.strengths[0] == 0.75
+
+
+def test_keys_wait_while_a_text_field_opens(hand: Rig) -> None:
+    hand.stage.wake()
+    hand.frame(keys=Keys((Press("Enter"), Press("B"))))
+    assert hand.stage.opening
+    hand.settle()
+    assert hand.stage.work.renaming is not None
+    assert not hand.stage.work.view.brush.active, "the letter belongs to the name"
+
+
+def test_escape_closes_the_list_of_keys_first(hand: Rig) -> None:
+    hand.key("F1")
+    hand.key("Escape")
+    assert not hand.stage.work.help
+    assert hand.stage.work.focus is not None
+    hand.key("Escape")
+    assert hand.stage.work.focus is None
+
+
+def test_the_chosen_segment_keeps_its_colour_under_the_mouse(hand: Rig) -> None:
+    y = 334.0  # Orbit of Orbit | Fly
+    hand.move(200.0, 300.0)
+    hand.settle()
+    x = 700 - 300 + 12 + 82 + 20
+    before = hand.image()[int(y) - 8, int(x)]
+    hand.move(x, y)
+    hand.settle()
+    assert hand.io.want_capture_mouse
+    assert (hand.image()[int(y) - 8, int(x)] == before).all()

@@ -1,0 +1,93 @@
+"""What has to stay within reach in a small window: questions, timeline controls, the way home."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera import view_camera as turntable
+from viewer.camera.view_camera import ViewCamera
+from viewer.files import recent
+from viewer.files.document import Document
+from viewer.panel import panel, timeline_bar
+from viewer.state import workspace
+from viewer.state.workspace import Dialog
+
+pytestmark = pytest.mark.gl
+SMALLEST = (640, 400)
+"""The least size that the window can be given."""
+
+
+def windows(name: str) -> list[imgui.internal.Window]:
+    """imgui's windows on screen whose name holds a text."""
+    found = imgui.get_current_context().windows
+    return [window for window in found if name in window.name and window.active]
+
+
+@pytest.mark.parametrize("points", [SMALLEST, (800, 600), (1280, 800)])
+@pytest.mark.parametrize("kind", ["open", "save", "leave", "overwrite", "restore", "replace"])
+def test_every_question_lies_within_the_window_with_eight_recent_files(
+    points: tuple[int, int], kind: str
+) -> None:
+    with rig(first_view(bear(), 0.5, 0.5), points) as hand:
+        name = "a_scene_with_a_rather_long_name_indeed"
+        hand.stage.recent = tuple(Path(f"/scenes/{name}_{i}.gdf") for i in range(recent.MOST))
+        hand.stage.ask(
+            Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
+        )
+        hand.frame(4)
+        (dialog,) = [window for window in windows("##dialog") if "/" not in window.name]
+        assert dialog.pos.x >= 0.0
+        assert dialog.pos.y >= 0.0
+        assert dialog.pos.x + dialog.size.x <= points[0] - panel.WIDTH_PX
+        assert dialog.pos.y + dialog.size.y <= points[1]
+        assert dialog.content_size.y <= dialog.size.y, "the buttons are not cut off"
+
+
+@pytest.mark.parametrize("points", [SMALLEST, (800, 600)])
+def test_the_controls_of_the_timeline_stay_in_a_narrow_window(points: tuple[int, int]) -> None:
+    with rig(first_view(bear(), 0.5, 0.5), points) as hand:
+        hand.key("K")
+        assert hand.stage.work.player.shown
+        (bar,) = windows("timeline")
+        assert bar.pos.y + bar.size.y <= points[1]
+        assert bar.content_size.x <= bar.size.x
+        y = points[1] - timeline_bar.ROW_PX + 6.0
+        hand.click(30.0, y)
+        assert hand.stage.work.view.timeline.keys[0].easing == "linear"
+        hand.click(92.0, y)
+        assert hand.stage.work.view.timeline.ping_pong
+
+
+def test_home_is_upright_and_framed_under_another_up_axis() -> None:
+    with rig(first_view(bear(), 0.5, 0.5), (700, 640)) as hand:
+        first = hand.stage.work.view.camera
+        hand.key("Shift+F")
+        assert hand.stage.work.view.camera == first
+        turned_by_hand(hand, (0.0, 0.0, 1.0))
+        hand.key("Shift+F")
+        home = hand.stage.work.view.camera
+        assert home.up == (0.0, 0.0, 1.0)
+        fitted = turntable.fit_subject(home, bear().scene, 400 / 640)
+        assert home.distance == pytest.approx(fitted.distance, rel=1e-4), (
+            "as one would frame it under this axis"
+        )
+        assert home.pivot == pytest.approx(fitted.pivot, abs=1e-3)
+        turned_by_hand(hand, first.up)
+        hand.key("Shift+F")
+        assert hand.stage.work.view.camera == first
+
+
+def turned_by_hand(hand: Rig, up: tuple[float, float, float]) -> None:
+    camera = turntable.with_up(hand.stage.work.view.camera, up)
+    hand.stage.work = workspace.with_camera(hand.stage.work, replace(camera, azimuth=70.0))
+
+
+def test_the_first_look_under_an_axis_is_the_first_camera_that_has_it() -> None:
+    scene = bear().scene
+    first = turntable.first_camera(scene)
+    assert Document("bear.ply", scene).facts().home(ViewCamera(up=first.up), 1.5) == first

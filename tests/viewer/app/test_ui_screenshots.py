@@ -1,0 +1,174 @@
+"""What the interface looks like on a software GPU. After --regenerate-screenshots, look at them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+
+from progdf.errors import ProgdfError
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera.inputs import Keys
+from viewer.panel import panel
+from viewer.render.engine import FrameTimings
+from viewer.render.headless import headless_context, is_software
+from viewer.state.view_state import Brush, LayerState, ViewState
+from viewer.state.workspace import Dialog
+
+Compare = Callable[[str, np.ndarray], None]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def software_gpu() -> None:
+    """Goldens hold for one rasteriser of text and lines; elsewhere they would differ by a hair's breadth."""
+    try:
+        context = headless_context()
+    except ProgdfError as error:
+        pytest.skip(str(error))
+    software = is_software(context)
+    context.release()
+    if not software:
+        pytest.skip("the goldens were drawn by a software GPU")
+
+
+pytestmark = pytest.mark.gl
+SMALLEST = (1024, 640)
+"""The least window size that the layout is made for."""
+
+
+def crowded() -> ViewState:
+    """More layers than fit, names that are too long, one layer hidden."""
+    names = (
+        "scarf",
+        "ears → gold",
+        "an edit with a name that is far too long for its row",
+        "d",
+        "e",
+        "f",
+        "g",
+    )
+    layers = tuple(LayerState(i % 2, name, i / 6, enabled=i != 1) for i, name in enumerate(names))
+    return replace(first_view(bear()), layers=layers)
+
+
+def the_panel(hand: Rig) -> np.ndarray:
+    return hand.image()[:, -round(panel.WIDTH_PX) :]
+
+
+def test_the_window_at_its_smallest(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        screenshot("ui_main", hand.image())
+
+
+def test_the_window_on_a_dense_screen(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), (700, 560), density=2.0) as hand:
+        screenshot("ui_2x", hand.image())
+
+
+def test_a_scaled_desktop_shows_the_same_as_a_dense_screen() -> None:
+    view = first_view(bear(), 0.7, 0.5)
+    with rig(view, (700, 560), density=2.0) as hand:
+        dense = hand.image()
+    with rig(view, (1400, 1120), scale=2.0) as hand:
+        scaled = hand.image()
+    # edges of text may fall between pixels of the one and on pixels of the other
+    assert (np.abs(dense.astype(int) - scaled).max(axis=-1) > 40).mean() < 0.01
+
+
+def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
+    with rig(crowded(), SMALLEST) as hand:
+        screenshot("ui_crowded", the_panel(hand))
+        hand.wheel(900.0, 300.0, -100.0)
+        hand.frame(20)
+        screenshot("ui_crowded_scrolled", the_panel(hand))
+
+
+def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.key("F1")
+        hand.stage.tell(
+            "shirt.gdf was made for another scene: it has 41 203 Gaussians, bear.ply has 1 500", True
+        )
+        hand.settle()
+        screenshot("ui_help", hand.image())
+
+
+def test_a_scene_without_edits_and_the_original_held(screenshot: Compare) -> None:
+    with rig(first_view(bear()), SMALLEST) as hand:
+        hand.frame(3, Keys(held=frozenset("\\")))
+        screenshot("ui_original", hand.image())
+
+
+def test_a_value_being_typed(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.modifier(imgui.Key.mod_ctrl)
+        hand.move(900.0, 136.0)
+        hand.press()
+        hand.release()
+        hand.modifier(imgui.Key.mod_ctrl, False)
+        hand.frame(3)
+        screenshot("ui_typing", the_panel(hand))
+
+
+def test_the_timings_of_a_picture(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.key("F10")
+        hand.stage.canvas.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500, share=0.03)
+        hand.stage.latencies_ms.extend([20.0, 21.0, 34.0])
+        hand.frame()
+        screenshot("ui_timings", hand.image()[:210, :240])
+
+
+def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Compare) -> None:
+    view = replace(first_view(bear(), 1.1, 0.5), overshoot=True, unfolded=(0,))
+    first, second = view.layers
+    layers = (replace(first, solo=True), replace(second, locked=True))
+    with rig(replace(view, layers=layers), SMALLEST) as hand:
+        hand.key("Tab")
+        hand.frame(3)
+        screenshot("ui_gains", hand.image())
+
+
+def test_the_original_beside_the_edited(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
+        hand.key("Y")
+        hand.move(362.0, 250.0)
+        hand.frame(3)
+        screenshot("ui_split", hand.image())
+
+
+def test_the_field_beside_what_was_recorded(screenshot: Compare, tmp_path: Path) -> None:
+    runs = bear().save_runs(tmp_path)[1:]
+    with rig(first_view(bear(), 0.62, 0.0), SMALLEST, gdf_paths=runs) as hand:
+        hand.key("Alt+Y")
+        screenshot("ui_recorded", hand.image())
+
+
+def test_the_difference_from_the_original(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
+        hand.key("Shift+Y")
+        screenshot("ui_difference", hand.image())
+
+
+def test_snapshots_and_a_question(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
+        for chord in ("F3", *["Shift+Left"] * 5, "F3"):
+            hand.key(chord)
+        hand.frame(5)
+        hand.wheel(900.0, 400.0, -100.0)
+        hand.stage.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+        hand.stage.ask(Dialog("open"))
+        hand.frame(3)
+        screenshot("ui_snapshots", hand.image())
+
+
+def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:
+    view = replace(first_view(bear(), 1.0, 0.5), brush=Brush(active=True, radius=25.0))
+    with rig(view, SMALLEST) as hand:
+        hand.drag((360.0, 300.0), (420.0, 320.0))
+        hand.frame(3)
+        screenshot("ui_paint", hand.image())

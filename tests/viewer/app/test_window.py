@@ -1,0 +1,336 @@
+"""The real window: `progdf view` under Xvfb, driven by xdotool."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.helpers.paths import ROOT
+from tests.helpers.ui_rig import bear
+from viewer.app import app as application
+from viewer.camera import controls
+from viewer.camera.view_camera import first_camera, to_camera
+from viewer.files.session import open_session
+from viewer.panel import panel
+
+PATIENCE_S = 120.0  # a busy machine may take long; what has happened is not waited for
+WIDTH, HEIGHT = application.SIZE
+
+
+@dataclass
+class Desktop:
+    """`progdf view` on a display of its own."""
+
+    process: subprocess.Popen[str]
+    environment: dict[str, str]
+    folder: Path
+    window: str = ""
+
+    def xdotool(self, *arguments: object) -> str:
+        command = ["xdotool", *(str(argument) for argument in arguments)]
+        run = subprocess.run(
+            command, env=self.environment, capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        return run.stdout.strip()
+
+    def until(self, what: str, happened: Callable[[], object]) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not happened():
+            assert not self.process.poll(), f"the window closed: {self.process.communicate()}"
+            assert time.monotonic() < end, f"waited in vain for {what}"
+            time.sleep(0.05)
+
+    def open(self) -> None:
+        def found() -> str:
+            self.window = self.xdotool("search", "--onlyvisible", "--name", "ProGDF Studio").split("\n")[0]
+            return self.window
+
+        self.until("the window", found)
+        self.xdotool("windowfocus", self.window)
+
+    def point(self, x: float, y: float) -> None:
+        self.xdotool("mousemove", "--window", self.window, round(x), round(y))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: int = 1) -> None:
+        self.grip(start, end, button)
+        self.xdotool("mouseup", button)
+
+    def grip(self, start: tuple[float, float], end: tuple[float, float], button: int = 1) -> None:
+        """A drag that does not let go."""
+        self.point(*start)
+        self.xdotool("mousedown", button)
+        for share in (0.3, 0.6, 1.0):
+            self.point(*(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+
+    def shot(self, keys: str = "shift+F2") -> np.ndarray:
+        """The window as it saves itself, after everything that was sent before."""
+        path = self.folder / f"bear_{len(list(self.folder.glob('bear_*.png'))) + 1:03d}.png"
+        self.xdotool("key", keys)
+        self.until(path.name, path.exists)
+        return np.asarray(Image.open(path)).astype(int)
+
+    def rest(self) -> np.ndarray:
+        """The window once its picture is still: on a slow machine it is coarse while it is in the hand."""
+        shots = [self.shot()]
+
+        def same() -> bool:
+            shots.append(self.shot())
+            return changed(*shots[-2:]) == 0
+
+        self.until("a picture at rest", same)
+        return shots[-1]
+
+    def turns(self) -> int:
+        """How often the window's loop has gone round: events handled, frames drawn."""
+        return int.from_bytes((self.folder / "turns").read_bytes(), "little")
+
+    def until_idle(self, what: str) -> None:
+        """Until a whole second passes in which the window's loop never goes round."""
+
+        def idle() -> bool:
+            before = self.turns()
+            time.sleep(1.0)
+            return self.turns() == before
+
+        self.until(what, idle)
+
+
+@pytest.fixture
+def desktop(tmp_path: Path) -> Iterator[Desktop]:
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("Xvfb and xdotool are not installed")
+    paths = bear().save(tmp_path)
+    receive, send = os.pipe()
+    server = subprocess.Popen(
+        [
+            "Xvfb",
+            "-displayfd",
+            str(send),
+            "-screen",
+            "0",
+            f"{WIDTH + 100}x{HEIGHT + 100}x24",
+            "-nolisten",
+            "tcp",
+        ],
+        pass_fds=[send],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(send)
+    with os.fdopen(receive) as display:
+        environment = os.environ | {"DISPLAY": f":{display.readline().strip()}", "NUMBA_NUM_THREADS": "2"}
+    environment.pop("WAYLAND_DISPLAY", None)
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            str(ROOT / "tests" / "helpers" / "counted_view.py"),
+            str(tmp_path / "turns"),
+            *map(str, paths),
+            "--set",
+            "scarf=0.5",
+        ],
+        env=environment,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    made = Desktop(process, environment, tmp_path)
+    try:
+        made.open()
+        yield made
+    finally:
+        for started in (process, server):
+            started.terminate()
+            started.communicate(timeout=PATIENCE_S)
+
+
+def slider(layer: int, strength: float) -> tuple[float, float]:
+    """Of two layers the last one lies on top."""
+    inset = 12 + 10 + 7
+    x = WIDTH - panel.WIDTH_PX + inset + strength * (panel.WIDTH_PX - 2 * inset)
+    return x, 136.0 + 97.0 * (1 - layer)
+
+
+def changed(before: np.ndarray, after: np.ndarray, height: int = HEIGHT - 60) -> int:
+    """Pixels of the picture that differ visibly; without the line at its bottom, if nothing else is said."""
+    part = np.s_[:height, : WIDTH - round(panel.WIDTH_PX)]
+    return int((np.abs(before[part] - after[part]).max(axis=-1) > 12).sum())
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_nothing(
+    desktop: Desktop,
+) -> None:
+    first = desktop.shot()
+    assert first.shape == (HEIGHT, WIDTH, 3)
+    desktop.drag(slider(0, 0.5), slider(0, 1.0))
+    desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
+    desktop.xdotool("key", "ctrl+z")
+    desktop.point(400, 400)  # away from the tooltip
+    assert changed(first, desktop.rest()) == 0
+    desktop.until_idle("a window that draws nothing when nothing changes")
+    desktop.xdotool("key", "ctrl+q")
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+    assert desktop.process.communicate() == ("", "")
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> None:
+    first = desktop.shot()
+    desktop.drag((400, 400), (480, 380))
+    desktop.until("the turn", lambda: changed(first, desktop.shot()) > 1000)
+    orbited = desktop.rest()
+    desktop.xdotool("keydown", "w")
+    desktop.until("the flight", lambda: changed(orbited, desktop.shot("F2")) > 1000)
+    desktop.xdotool("keyup", "w")
+    desktop.xdotool("windowsize", "--sync", desktop.window, 900, 650)
+    # the window may be told of its size after the key that follows it
+    shapes = (desktop.shot("F2").shape for _ in range(5))
+    assert (650, 900 - panel.WIDTH_PX, 3) in shapes
+    desktop.xdotool("key", "ctrl+q")
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop: Desktop) -> None:
+    first = desktop.shot()
+    desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimising does to a window
+    desktop.until_idle("a window that draws nothing when nobody can see it")
+    desktop.xdotool("windowmap", "--sync", desktop.window)
+    desktop.xdotool("windowfocus", "--sync", desktop.window)
+    assert changed(first, desktop.rest()) == 0
+    desktop.drag(slider(0, 0.5), slider(0, 1.0))
+    desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_the_real_mouse_paints_and_undo_takes_the_stroke_away(desktop: Desktop) -> None:
+    desktop.point(*slider(0, 0.5))  # where the brush's ring is not over the picture
+    desktop.xdotool("key", "2")  # the lower card: the scarf
+    clean = desktop.shot()
+    desktop.xdotool("key", "b")
+    colours = desktop.rest()
+    assert changed(clean, colours) > 200, "the weights are shown"
+    x, y = scarf_on_screen()
+    desktop.drag((x - 30, y), (x + 30, y))
+    desktop.point(*slider(0, 0.5))
+    desktop.until("the stroke", lambda: changed(colours, desktop.shot()) > 100)
+    painted = desktop.rest()
+    desktop.xdotool("key", "ctrl+z")
+    assert changed(colours, desktop.rest()) == 0
+    desktop.xdotool("key", "ctrl+shift+z")
+    assert changed(painted, desktop.rest()) == 0
+    desktop.xdotool("key", "b")
+    assert changed(clean, desktop.shot()) > 50, "where it was erased the edit is gone"
+
+
+def scarf_on_screen() -> tuple[float, float]:
+    """Where the middle of the scarf is in the first picture."""
+    stack, size = bear(), (WIDTH - round(panel.WIDTH_PX), HEIGHT)
+    camera = to_camera(first_camera(stack.scene), *size)
+    middle = stack.scene.means[stack.gdfs[0].region.members].mean(0)
+    x, y, z = (camera.viewmat[:3, :3] @ middle + camera.viewmat[:3, 3]).tolist()
+    return float(camera.K[0, 0] * x / z + camera.K[0, 2]), float(camera.K[1, 1] * y / z + camera.K[1, 2])
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_escape_takes_a_drag_of_the_real_mouse_back(desktop: Desktop) -> None:
+    first = desktop.shot()
+    desktop.grip(slider(0, 0.5), slider(0, 1.0))
+    desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
+    desktop.xdotool("key", "Escape")
+    desktop.point(*slider(0, 0.2))
+    desktop.xdotool("mouseup", 1)
+    desktop.point(400, 400)  # away from the tooltip
+    assert changed(first, desktop.rest()) == 0
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_ctrl_c_in_the_terminal_closes_an_idle_window(desktop: Desktop) -> None:
+    desktop.shot()
+    desktop.until_idle("a window at rest")
+    desktop.process.send_signal(signal.SIGINT)
+    assert desktop.process.wait(timeout=PATIENCE_S) == 130
+    assert desktop.process.communicate() == ("", "progdf: interrupted\n")
+
+
+def test_without_a_display_view_says_so_in_one_line(tmp_path: Path) -> None:
+    paths = bear().save(tmp_path)
+    hidden = {"DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE"}
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    run = subprocess.run(
+        [sys.executable, "-m", "progdf", "view", str(paths[0])],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    if sys.platform != "linux":
+        pytest.skip("only Linux can be without a display")
+    assert run.returncode == 2
+    assert run.stderr.count("\n") == 1
+    assert run.stderr.startswith("progdf: no window")
+    assert "progdf render" in run.stderr
+
+
+def test_chords_are_named_as_in_the_table_of_bindings() -> None:
+    from viewer.ui.window import _NAMES, chord, glfw
+
+    assert chord("Z", glfw.MOD_CONTROL | glfw.MOD_SHIFT) == "Ctrl+Shift+Z"
+    assert chord("F2", 0) == "F2"
+    bound = {key.chord.rpartition("+")[2] for key in controls.KEYS} | {controls.HELD_ORIGINAL}
+    assert bound <= set(_NAMES.values()), "every bound key is known to the window"
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_closing_the_real_window_with_unsaved_changes_asks_and_saves(desktop: Desktop) -> None:
+    desktop.xdotool("key", "2")
+    first = desktop.shot()
+    desktop.xdotool("key", "shift+Left")
+    desktop.xdotool("key", "ctrl+q")
+    # the picture is dimmed behind a question
+    desktop.until("the question", lambda: changed(first, desktop.shot()) > 100_000)
+    desktop.xdotool("key", "Escape")
+    desktop.until("the picture", lambda: changed(first, desktop.shot()) < 100_000)
+    desktop.xdotool("key", "ctrl+q")
+    desktop.until("the question", lambda: changed(first, desktop.shot()) > 100_000)
+    desktop.xdotool("key", "s")
+    desktop.until("the field", lambda: not desktop.xdotool("key", "Return") and desktop.process.poll() == 0)
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+    assert desktop.process.communicate() == ("", "")
+    saved = open_session(desktop.folder / "bear.session.json")
+    assert saved.view.layers[0].strength == pytest.approx(0.4)
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_what_the_real_keyboard_types_fast_arrives_whole(desktop: Desktop) -> None:
+    desktop.shot()
+    desktop.xdotool("keydown", "ctrl")
+    desktop.point(*slider(0, 0.2))
+    desktop.xdotool("click", 1)
+    desktop.xdotool("keyup", "ctrl")
+    desktop.xdotool("type", "--delay", "10", "0.1122\n")  # its Enter is the line feed key
+    desktop.shot()
+    desktop.xdotool("key", "ctrl+s", "Return")
+    path = desktop.folder / "bear.session.json"
+    desktop.until("the session", path.exists)
+    assert open_session(path).view.layers[0].strength == pytest.approx(0.1122)

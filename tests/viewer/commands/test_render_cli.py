@@ -1,0 +1,320 @@
+"""`progdf render` and `progdf export`, as a person at the keyboard meets them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from progdf.__main__ import main
+from progdf.camera import Camera
+from progdf.compose.reference import Layer, compose
+from progdf.formats.ply import load_ply
+from progdf.gaussians import ATTRIBUTES
+from progdf.gdf.file import save_gdf
+from progdf.io.cameras import read_camera, save_cameras
+from progdf.rasterize import render
+from tests.helpers.stacks import Stack, bear_stack
+from viewer.camera.view_camera import ViewCamera
+from viewer.commands.arguments import fitted, layers_of, parse_orbit
+from viewer.files.document import load_edits
+from viewer.pictures import film
+
+SMALL = ("--size", "64x48", "--engine", "cpu")
+Run = Callable[..., int]
+
+
+@pytest.fixture(scope="module")
+def stack() -> Stack:
+    return bear_stack(800)
+
+
+@pytest.fixture(scope="module")
+def folder(stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("render")
+    stack.save(made)
+    save_cameras(made / "cameras.json", [camera.resized(64, 48) for camera in stack.demo.cameras[:3]])
+    return made
+
+
+@pytest.fixture
+def run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    monkeypatch.chdir(folder)
+    return lambda *argv: main([str(argument) for argument in argv])
+
+
+def pixels(path: Path | str) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def edited_by(stack: Stack, camera: Camera, scarf: float, ears: float) -> np.ndarray:
+    layers = [Layer(stack.gdfs[0], scarf), Layer(stack.gdfs[1], ears)]
+    return film.to_pixels(render(compose(stack.scene, layers), camera).numpy())
+
+
+def test_a_camera_file_and_strengths_give_the_composed_picture(run: Run, stack: Stack) -> None:
+    options = ("--set", "scarf=0.7", "--set", "ears=1", "--camera", "cameras.json:1", "--engine", "cpu")
+    assert run("render", "bear.ply", "scarf.gdf", "ears.gdf", *options, "-o", "a.png") == 0
+    expected = edited_by(stack, stack.demo.cameras[1].resized(64, 48), 0.7, 1.0)
+    assert np.abs(pixels("a.png").astype(int) - expected).max() <= 1
+
+
+@pytest.mark.gl
+def test_the_gpus_edit_pass_writes_the_picture_that_the_cpu_composes(
+    run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("bear.ply", "scarf.gdf", "ears.gdf", "--set", "scarf=0.7", "--set", "ears=1", "--draw", "gl")
+    assert run("render", *options, "--edit-pass", "cpu", "-o", "cpu.png") == 0
+    assert "edited" not in capsys.readouterr().out
+    assert run("render", *options, "--edit-pass", "gpu", "-o", "gpu.png") == 0
+    assert "drawn by gl, edited by GPU ±" in capsys.readouterr().out
+    assert np.abs(pixels("cpu.png").astype(int) - pixels("gpu.png")).max() <= 1
+
+
+@pytest.mark.gl
+def test_both_engines_write_the_same_picture(run: Run) -> None:
+    options = ("bear.ply", "scarf.gdf", "--set", "scarf=1", "--camera", "cameras.json", "--size", "64x48")
+    assert run("render", *options, "--engine", "cpu", "-o", "cpu.png") == 0
+    assert run("render", *options, "--engine", "gl", "-o", "gl.png") == 0
+    assert np.abs(pixels("cpu.png").astype(int) - pixels("gl.png")).max() <= 3, "the early stop: 0.01 of 255"
+
+
+def test_edits_without_a_strength_are_rendered_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    edits, both = ("bear.ply", "scarf.gdf", "ears.gdf"), ("--set", "scarf=1", "--set", "ears=1")
+    for name, settings in (("none", ()), ("full", both), ("one", both[:2])):
+        assert run("render", *edits, *settings, *SMALL, "-o", f"{name}.png") == 0
+    assert np.array_equal(pixels("none.png"), pixels("full.png"))
+    assert not np.array_equal(pixels("one.png"), pixels("full.png")), "one that is set leaves the others at 0"
+    capsys.readouterr()
+    assert run("render", "bear.ply", *SMALL, "-o", "plain.png") == 0
+    assert run("render", *edits, "--set", "ears=0", *SMALL, "-o", "zero.png") == 0
+    assert "every slider is at 0" in capsys.readouterr().out
+    assert np.array_equal(pixels("plain.png"), pixels("zero.png"))
+
+
+def test_edits_without_a_strength_are_exported_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("export", "bear.ply", "scarf.gdf", "ears.gdf", "-o", "none.ply") == 0
+    assert "scarf 1, ears 1" in capsys.readouterr().out
+
+
+def test_a_sweep_of_one_edit_leaves_the_others_at_zero(run: Run) -> None:
+    for edits in (("ears.gdf",), ("ears.gdf", "scarf.gdf")):
+        command = ("render", "bear.ply", *edits, "--sheet", "ears", *SMALL)
+        assert run(*command, "-o", f"{len(edits)}.png") == 0
+    assert np.array_equal(pixels("1.png"), pixels("2.png"))
+
+
+def test_an_orbit_turns_the_camera_even_with_a_leading_minus(run: Run) -> None:
+    for name, orbit in (("left", "-40,10"), ("right", "40,10"), ("near", "-40,10,3")):
+        assert run("render", "bear.ply", "--orbit", orbit, *SMALL, "-o", f"{name}.png") == 0
+    assert not np.array_equal(pixels("left.png"), pixels("right.png"))
+    assert not np.array_equal(pixels("left.png"), pixels("near.png"))
+
+
+def test_a_region_or_the_whole_scene_can_fill_the_picture(run: Run) -> None:
+    for name, frame in (("scarf", ("--frame", "scarf")), ("all", ("--frame", "all")), ("plain", ())):
+        options = (*frame, *SMALL, "--background", "#ff00ff", "-o", f"{name}.png")
+        assert run("render", "bear.ply", "scarf.gdf", *options) == 0
+    bare = {name: shown_share(f"{name}.png") for name in ("scarf", "plain", "all")}
+    assert bare["scarf"] < bare["plain"] < bare["all"]
+
+
+def shown_share(path: str) -> float:
+    """The share of a picture that shows its background."""
+    return float((np.abs(pixels(path).astype(int) - (255, 0, 255)).max(axis=2) < 8).mean())
+
+
+def test_the_frame_follows_the_orbit_and_a_distance_that_is_said_holds(run: Run) -> None:
+    for name, orbit in (("side", "90,10"), ("far", "90,10,30")):
+        options = ("--frame", "scarf", "--orbit", orbit, *SMALL, "--background", "#ff00ff")
+        assert run("render", "bear.ply", "scarf.gdf", *options, "-o", f"{name}.png") == 0
+    assert shown_share("side.png") < 0.5 < shown_share("far.png")
+
+
+def test_the_background_is_what_was_asked_for(run: Run) -> None:
+    assert run("render", "bear.ply", "--background", "#204060", *SMALL, "-o", "blue.png") == 0
+    assert tuple(pixels("blue.png")[0, 0]) == (0x20, 0x40, 0x60)
+
+
+def test_a_sweep_is_an_animation_there_and_back(run: Run) -> None:
+    assert run("render", "bear.ply", "ears.gdf", "--sweep", "ears", *SMALL, "-o", "ears.gif") == 0
+    with Image.open("ears.gif") as animation:
+        assert animation.n_frames == 2 * film.SWEEP_STEPS
+        assert animation.info["loop"] == 0
+        frames = []
+        for i in (0, film.SWEEP_STEPS, 1, animation.n_frames - 1):
+            animation.seek(i)
+            frames.append(np.asarray(animation.convert("RGB")).astype(int))
+    assert np.abs(frames[0] - frames[1]).max() > 60, "both ends of the slider"
+    assert (frames[0][0, 0] == 255).all(), "a white page stays white"
+    assert np.array_equal(frames[2], frames[3]), "the way back is the way there"
+
+
+def test_a_sheet_of_one_slider_is_a_row_of_five(run: Run) -> None:
+    assert run("render", "bear.ply", "ears.gdf", "--sheet", "ears", *SMALL, "-o", "row.png") == 0
+    height, width, _ = pixels("row.png").shape
+    assert width >= 5 * 64
+    assert 48 < height < 2 * 48
+
+
+def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: Run) -> None:
+    edits = ("scarf.gdf", "ears.gdf", "--sheet", "scarf,ears")
+    assert run("render", "bear.ply", *edits, *SMALL, "-o", "grid.png") == 0
+    grid = pixels("grid.png")
+    assert grid.shape[0] >= 5 * 48
+    assert grid.shape[1] >= 5 * 64
+    assert run("render", "bear.ply", *SMALL, "-o", "original.png") == 0
+    original = pixels("original.png")
+    places = (
+        (y, x)
+        for y in range(grid.shape[0] - 4 * 48)
+        for x in range(grid.shape[1] - 4 * 64)
+        if np.array_equal(grid[y : y + 48, x : x + 64], original)
+    )
+    assert next(places, None) is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (("--set", "hat=1"), "--set hat: there is no edit of that name; there are scarf, ears"),
+        (("--set", "scarf=nan"), "--set scarf=nan: the strength 'nan' is not a number from 0 to 1"),
+        (("--set", "scarf=much"), "--set scarf=much: the strength 'much' is not a number from 0 to 1"),
+        (("--set", "scarf=1.5"), "--set scarf=1.5: the strength '1.5' is not a number from 0 to 1"),
+        (("--set", "scarf"), "--set scarf has no NAME=S"),
+        (("--size", "0x48"), "--size 0x48 cannot be drawn; each side may be 1 to 16384 pixels"),
+        (("--size", "99999x48"), "--size 99999x48 cannot be drawn"),
+        (
+            ("--draw", "cpu", "--edit-pass", "gpu"),
+            "the CPU draws here, so the GPU cannot edit; add --draw gl",
+        ),
+        (("--size", "big"), "--size big is not a size; write it as WIDTHxHEIGHT"),
+        (("--size", f"{'9' * 5000}x1"), "--size 9999"),
+        (("--camera", "cameras.json:--1"), "cameras.json:--1 does not exist"),
+        (("--camera", f"cameras.json:{'9' * 200}"), "cameras.json:9999"),
+        (("--camera", "nope.json"), "nope.json does not exist"),
+        (("--camera", "cameras.json:3"), "cameras.json has no camera 3; it holds 3, numbered 0 to 2"),
+        (("--camera", "cameras.json", "--orbit", "1,2"), "--camera and --orbit were both given"),
+        (("--camera", "cameras.json", "--frame", "all"), "--camera and --frame were both given"),
+        (("--frame", "hat"), "--frame hat: there is no edit of that name; there are scarf, ears"),
+        (("--orbit", "30"), "--orbit 30 is not two or three numbers"),
+        (("--orbit", "a,b"), "--orbit a,b is not a list of numbers"),
+        (("--orbit", "0,91"), "--orbit 0,91: the elevation is 91"),
+        (("--orbit", "0,0,0"), "--orbit 0,0,0: the distance is 0"),
+        (("--orbit", "0,0,1e300"), "--orbit 0,0,1e300: the distance is 1e+300; above 0 and up to 1e+"),
+        (("--background", "pink"), "'pink' is not a colour"),
+        (("--sweep", "scarf"), "x.png cannot hold an animation"),
+        (("--sheet", "scarf,hat"), "--sheet hat: there is no edit of that name"),
+        (("--sheet", "scarf,scarf"), "--sheet scarf,scarf does not name one or two different edits"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_no_file(
+    run: Run, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], line: str
+) -> None:
+    assert run("render", "bear.ply", "scarf.gdf", "ears.gdf", *options, "-o", "x.png") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"progdf: {line}")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert not list(Path().glob("*x*.png"))
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (("render", "nope.ply", "-o", "x.png"), "nope.ply does not exist"),
+        (("render", "bear.ply", "nope.gdf", "-o", "x.png"), "nope.gdf does not exist"),
+        (("render", "bear.ply", "-o", "nowhere/x.png"), "the folder nowhere does not exist"),
+        (("render", "bear.ply", "-o", "x.jpg"), "x.jpg is not a .png file"),
+        (("render", "bear.ply", "-o", "x.gif"), "x.gif holds an animation; say which slider moves"),
+        (("render", "bear.ply", "--sweep", "ears", "-o", "x.gif"), "--sweep ears: no .gdf file was given"),
+        (("view", "nope.ply"), "nope.ply does not exist"),
+        (("view", "bear.ply", "scarf.gdf", "--set", "hat=1"), "--set hat: there is no edit of that name"),
+        (("export", "bear.ply", "ears.gdf", "-o", "bear.ply"), "bear.ply is one of the files to read"),
+        (("export", "bear.ply", "ears.gdf", "-o", "x.obj"), "x.obj is not a .ply file"),
+        (
+            ("export", "bear.ply", "ears.gdf", "--set", "ears=-1", "-o", "x.ply"),
+            "--set ears=-1: the strength",
+        ),
+    ],
+)
+def test_wrong_files_are_one_line_each(
+    run: Run, capsys: pytest.CaptureFixture[str], argv: tuple[str, ...], line: str
+) -> None:
+    assert run(*argv) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"progdf: {line}")
+    assert error.count("\n") == 1
+
+
+def test_a_film_without_its_encoder_names_what_to_install(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
+    assert run("render", "bear.ply", "ears.gdf", "--sweep", "ears", "-o", "x.mp4") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("progdf: x.mp4 needs a video encoder; pip install progdf-studio[video]")
+
+
+def test_an_exported_scene_is_the_composed_one(
+    run: Run, stack: Stack, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("--set", "ears=0.5", "--set", "scarf=1")
+    assert run("export", "bear.ply", "scarf.gdf", "ears.gdf", *settings, "-o", "edited.ply") == 0
+    assert "read back and compared" in capsys.readouterr().out
+    expected = compose(load_ply("bear.ply"), [Layer(stack.gdfs[0], 1.0), Layer(stack.gdfs[1], 0.5)])
+    found = load_ply("edited.ply")
+    for name in ATTRIBUTES:
+        tolerance = 1e-6 if name == "quats" else 0.0
+        assert torch.allclose(getattr(found, name), getattr(expected, name), rtol=0.0, atol=tolerance), name
+
+
+def test_an_export_that_does_not_read_back_leaves_no_file(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from viewer.commands import cli
+
+    def damaged(path: Path) -> object:
+        scene = load_ply(path)
+        return replace(scene, sh0=scene.sh0 + 1e-3) if Path(path).name != "bear.ply" else scene
+
+    monkeypatch.setattr(cli, "load_ply", damaged)
+    assert run("export", "bear.ply", "ears.gdf", "-o", "damaged.ply") == 2
+    assert "does not give back its sh0" in capsys.readouterr().err
+    assert not Path("damaged.ply").exists()
+    assert not list(Path().glob(".damaged*"))
+
+
+def test_a_second_edit_of_the_same_name_gets_a_number(stack: Stack, tmp_path: Path) -> None:
+    for file in ("a.gdf", "b.gdf"):
+        save_gdf(tmp_path / file, stack.gdfs[0])
+    gdfs = load_edits([tmp_path / "a.gdf", tmp_path / "b.gdf"], stack.scene, Path("bear.ply"))
+    assert [gdf.name for gdf in gdfs] == ["scarf", "scarf-2"]
+    assert [layer.strength for layer in layers_of(gdfs, ["scarf-2=0.5"])] == [0.0, 0.5]
+
+
+def test_the_last_camera_is_minus_one(folder: Path, stack: Stack) -> None:
+    last = read_camera(f"{folder / 'cameras.json'}:-1")
+    assert torch.equal(last.viewmat, stack.demo.cameras[2].viewmat)
+
+
+def test_another_size_shows_the_same_height_undistorted(stack: Stack) -> None:
+    camera = stack.demo.cameras[0]
+    wide = fitted(camera, (2 * camera.width, camera.height))
+    assert float(wide.K[0, 0]) == float(wide.K[1, 1]) == float(camera.K[1, 1])
+    assert float(wide.K[0, 2]) == camera.width
+    half = fitted(camera, (camera.width // 2, camera.height // 2))
+    assert torch.allclose(half.K, camera.resized(camera.width // 2, camera.height // 2).K)
+
+
+def test_an_orbit_keeps_the_framed_pivot_and_distance() -> None:
+    framed = ViewCamera(pivot=(1.0, 2.0, 3.0), distance=7.0)
+    assert parse_orbit("-30,15", framed) == replace(framed, azimuth=-30.0, elevation=15.0)
+    assert parse_orbit("0,90,2.5", framed).distance == 2.5
+    assert math.isclose(parse_orbit("1e2,-90", framed).azimuth, 100.0)

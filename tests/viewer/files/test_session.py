@@ -1,0 +1,209 @@
+"""Session files: what the window held comes back, and nothing else does."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from progdf.__main__ import main
+from progdf.cli.info import kind_of
+from progdf.errors import ProgdfError
+from progdf.formats.ply import save_ply
+from progdf.io.session import read_session, sha256
+from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app import app as application
+from viewer.camera.view_camera import eye, from_camera, to_camera
+from viewer.files import json_form as plain
+from viewer.files import session
+from viewer.files.session import Session
+from viewer.state.view_state import Comparison
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return bear_files(tmp_path)
+
+
+@pytest.fixture
+def saved(folder: Path) -> Path:
+    return saved_session(folder)
+
+
+def test_a_session_brings_back_exactly_what_was_saved(saved: Path) -> None:
+    again = session.open_session(saved)
+    assert again.view == full_view()
+    assert [kept.edit.blend for kept in again.snapshots] == ["sum"]
+    assert [gdf.name for gdf in again.document.gdfs] == ["scarf", "ears"]
+
+
+def test_a_session_can_be_read_by_people_and_moves_with_its_folder(saved: Path, tmp_path: Path) -> None:
+    table = json.loads(saved.read_text())
+    assert next(iter(table)) == "progdf_session"
+    assert table["scene"] == {"file": "bear.ply", "sha256": sha256(saved.parent / "bear.ply")}
+    assert [edit["file"] for edit in table["edits"]] == ["edits/scarf.gdf", "edits/ears.gdf"]
+    assert '"up": [0.0, 1.0, 0.0]' in saved.read_text()
+    assert str(tmp_path) not in saved.read_text()
+    elsewhere = tmp_path.with_name(tmp_path.name + "_moved")
+    tmp_path.rename(elsewhere)
+    assert session.open_session(elsewhere / saved.name).view == full_view()
+    elsewhere.rename(tmp_path)
+
+
+BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
+    (("progdf_session",), 2, "version 2"),
+    (("progdf_session",), "one", "version"),
+    (("macros",), ["import os"], "macros"),
+    (("scene",), "bear.ply", "scene"),
+    (("scene", "file"), "gone.ply", "not there"),
+    (("scene", "file"), "g" * 5000, "not there"),
+    (("scene", "file"), "", "scene"),
+    (("scene", "file"), "a\0b", "scene"),
+    (("scene", "sha256"), "0" * 64, "another bear.ply"),
+    (("edits", 1, "sha256"), "0" * 64, "another ears.gdf"),
+    (("edits",), [], "layers[0].gdf is 1 of 0"),
+    (("view",), [], "Expected"),
+    (("view", "blur"), 3, "view.blur is unknown"),
+    (("view", "camera", "distance"), 0.0, "view.camera.distance"),
+    (("view", "camera", "distance"), 1e400, "Infinity"),
+    (("view", "camera", "mode"), "walk", "walk"),
+    (("view", "camera", "up"), [0.0, 1.0], "view.camera.up"),
+    (("view", "layers", 0, "strength"), 3.0, "strength"),
+    (("view", "layers", 0, "strength"), "1", "strength"),
+    (("view", "layers", 0, "enabled"), 1, "enabled"),
+    (("view", "layers", 0, "gains", "colour"), -1.0, "gains"),
+    (("view", "layers", 0, "paint"), "AAAA", "paint"),
+    (("view", "brush", "mode"), "spray", "spray"),
+    (("view", "brush", "radius"), 0.0, "radius"),
+    (("view", "blend"), "multiply", "multiply"),
+    (("view", "compare", "mode"), "blink", "blink"),
+    (("view", "compare", "amplify"), 1e9, "amplify"),
+    (("view", "timeline", "keys", 0, "easing"), "bouncy", "easing"),
+    (("view", "timeline", "length"), -5, "length"),
+    (("view", "timeline", "keys", 0, "camera", "distance"), -1.0, "distance"),
+    (("snapshots", 0, "edit", "blend"), "none", "none"),
+    (("snapshots",), {"a": 1}, "Expected"),
+]
+
+
+@pytest.mark.parametrize(("keys", "value", "about"), BROKEN)
+def test_what_no_window_wrote_is_refused_in_one_line(
+    saved: Path, keys: tuple[str | int, ...], value: Any, about: str
+) -> None:
+    with pytest.raises(ProgdfError) as refused:
+        session.open_session(spoilt(saved, *keys, value=value))
+    told = str(refused.value)
+    assert about in told
+    assert "\n" not in told
+    assert "; " in told
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"{", b"[1]", b"{}", b"\xff\xfe", b'{"progdf_session": 1, "progdf_session": 1}', b"[" * 99_999],
+)
+def test_what_is_no_session_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "odd.session.json").write_bytes(content)
+    with pytest.raises(ProgdfError) as refused:
+        read_session(tmp_path / "odd.session.json")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_scene_that_changed_since_is_refused_by_name(saved: Path) -> None:
+    save_ply(saved.parent / "bear.ply", bear().scene[:-1])
+    with pytest.raises(ProgdfError, match=r"saved with another bear\.ply"):
+        session.open_session(saved)
+
+
+def test_what_an_older_file_does_not_hold_has_its_default(saved: Path) -> None:
+    table = json.loads(saved.read_text())
+    del table["view"]["compare"], table["view"]["camera"]["fov_y"], table["snapshots"]
+    saved.write_text(json.dumps(table))
+    again = session.open_session(saved)
+    assert again.view.compare == Comparison()
+    assert again.view.camera.fov_y == 45.0
+    assert again.snapshots == ()
+
+
+def test_arrays_come_back_bit_for_bit() -> None:
+    for array in (np.linspace(0, 1, 7, dtype=np.float32), np.zeros((0, 3), np.uint8)):
+        packed = json.loads(json.dumps(plain.plain(array)))
+        again = plain.restored(np.ndarray, packed)
+        assert again.dtype == array.dtype
+        assert np.array_equal(again, array)
+    with pytest.raises(plain.NotPlainError):
+        plain.restored(np.ndarray, {"dtype": "O", "shape": [1], "zlib": ""})
+    with pytest.raises(plain.NotPlainError):
+        plain.restored(np.ndarray, {"dtype": "<f4", "shape": [1 << 40], "zlib": ""})
+
+
+def test_a_save_that_fails_leaves_the_old_session(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = saved.read_bytes()
+    broken = replace(full_view(), background=(float("nan"), 0.0, 0.0))
+    with pytest.raises(ValueError, match="JSON"):
+        session.save(saved, Session(opened_document(saved.parent), broken))
+    assert saved.read_bytes() == before
+    assert not list(saved.parent.glob(".*"))
+
+
+def test_info_tells_what_a_session_holds(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert kind_of(saved) == "session"
+    (saved.parent / "edits" / "ears.gdf").unlink()
+    assert main(["info", str(saved)]) == 0
+    told = capsys.readouterr().out
+    assert "bear.ply (as it was saved)" in told
+    assert "ears.gdf (missing)" in told
+    assert "ears → gold" in told
+    assert "snapshots: 1" in told
+
+
+def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: Path) -> None:
+    view = replace(full_view(), compare=Comparison())
+    session.save(saved, Session(opened_document(saved.parent), view))
+    out, size = tmp_path / "a.png", ("--size", "64x48", "--engine", "cpu")
+    assert main(["render", "--session", str(saved), *size, "-o", str(out)]) == 0
+    from viewer.render.engine import Engine
+
+    engine = Engine(None, bear().scene, bear().gdfs)
+    expected = np.round(engine.image(view, (64, 48)).clip(0, 1) * 255)
+    assert np.abs(np.asarray(Image.open(out)).astype(int) - expected).max() <= 1
+    moved = replace(view, layers=(replace(view.layers[0], strength=0.0), view.layers[1]))
+    assert main(["render", "--session", str(saved), "--set", "ears=0", *size, "-o", str(out)]) == 0
+    expected = np.round(engine.image(moved, (64, 48)).clip(0, 1) * 255)
+    assert np.abs(np.asarray(Image.open(out)).astype(int) - expected).max() <= 1
+
+
+def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path: Path) -> None:
+    path = spoilt(saved, "view", "layers", value=[])
+    out, size = tmp_path / "a.png", ("--size", "32x24", "--engine", "cpu")
+    assert main(["render", "--session", str(path), *size, "-o", str(out)]) == 0
+    assert out.is_file()
+
+
+def test_an_option_that_a_session_says_itself_is_refused(
+    saved: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["render", "--session", str(saved), "--overshoot", "-o", "a.png"]) == 2
+    assert "--overshoot was given" in capsys.readouterr().err
+
+
+def test_a_pinhole_camera_becomes_the_windows_camera() -> None:
+    view = first_view(bear()).camera
+    seen = to_camera(view, 320, 240)
+    again = from_camera(view, seen, application.Document("b", bear().scene).facts().bounds)
+    assert eye(again) == pytest.approx(eye(view), abs=1e-4)
+    assert again.fov_y == pytest.approx(view.fov_y, abs=1e-3)
+
+
+def test_what_draws_without_a_window_needs_no_interface_library() -> None:
+    code = "import sys, viewer.commands.cli; print([m for m in sys.modules if 'imgui' in m or m == 'glfw'])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"

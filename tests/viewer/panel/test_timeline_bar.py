@@ -1,0 +1,311 @@
+"""The timeline in the window, by mouse and keyboard; and the films made of it."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
+from tests.helpers.full_disk import files_up_to
+from tests.helpers.ui_rig import STEP_S, Rig, bear, first_view, rig
+from viewer.files import timeline_file
+from viewer.panel import panel, timeline_bar
+from viewer.pictures import film
+from viewer.render.headless import headless_context, is_software
+from viewer.state import timeline
+from viewer.state.view_state import Keyframe, Timeline, ViewState
+
+pytestmark = pytest.mark.gl
+WINDOW = (1024, 640)
+SMALL = ("--size", "64x48", "--engine", "cpu")
+
+
+def keyed(view: ViewState | None = None, length: int = 40) -> ViewState:
+    """The scarf turned green while the camera goes half around, then back more slowly."""
+    view = view or first_view(bear(), 0.0, 0.3)
+    made = timeline.with_key(Timeline(length=length), 0, view)
+    there = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 60.0))
+    layers = (replace(view.layers[0], strength=1.0), view.layers[1])
+    made = timeline.with_key(made, length // 2, replace(there, layers=layers))
+    return replace(view, timeline=timeline.eased(made, length // 2, "linear"))
+
+
+@pytest.fixture
+def hand(tmp_path: Path) -> Iterator[Rig]:
+    with rig(keyed(), WINDOW, pictures=tmp_path) as made:
+        made.key("T")
+        yield made
+
+
+def at(hand: Rig, frame: float) -> tuple[float, float]:
+    """Where a frame of the ruler stands on the window."""
+    left = 10.0 + 3 * 25.0 + 2 * 2.0 + 10.0
+    wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar._SETTINGS_PX
+    shown = hand.stage.work.view.timeline
+    return timeline_bar.place(shown, frame, left + 8.0, wide - 16.0), WINDOW[1] - 24.0
+
+
+def frames_of(hand: Rig) -> list[int]:
+    return [key.frame for key in hand.stage.work.view.timeline.keys]
+
+
+def test_dragging_the_playhead_moves_strengths_and_picture_and_leaves_nothing_to_undo(hand: Rig) -> None:
+    before = hand.picture()
+    hand.drag(at(hand, 5), at(hand, 20))
+    assert hand.stage.work.player.frame == 20
+    assert hand.strengths == [1.0, 0.3]
+    assert np.abs(hand.picture().astype(int) - before).max() > 50
+    assert hand.stage.work.past.past == ()
+
+
+def test_dragging_a_key_moves_it_with_the_playhead_as_one_entry(hand: Rig) -> None:
+    hand.drag(at(hand, 20), at(hand, 31))
+    assert frames_of(hand) == [0, 31]
+    assert hand.stage.work.player.frame == 31
+    assert len(hand.stage.work.past.past) == 1
+    hand.key("Ctrl+Z")
+    assert frames_of(hand) == [0, 20]
+
+
+def test_a_click_on_a_key_goes_there_and_delete_takes_it_away(hand: Rig) -> None:
+    hand.drag(at(hand, 20.4), at(hand, 20.4))
+    assert (hand.stage.work.player.frame, frames_of(hand)) == (20, [0, 20])
+    hand.key("Delete")
+    assert frames_of(hand) == [0]
+    hand.key("Ctrl+Z")
+    assert frames_of(hand) == [0, 20]
+
+
+def test_k_after_a_drag_of_a_slider_sets_a_key_and_two_undos_take_both_back(hand: Rig) -> None:
+    hand.key(".")
+    hand.drag(hand.slider(1, 0.3), hand.slider(1, 0.9))
+    hand.key("K")
+    assert frames_of(hand) == [0, 1, 20]
+    assert dict(hand.stage.work.view.timeline.keys[1].strengths)[1] == pytest.approx(0.9, abs=0.01)
+    hand.key("Ctrl+Z")
+    assert frames_of(hand) == [0, 20]
+    hand.key("Ctrl+Z")
+    assert hand.strengths[1] == 0.3
+
+
+def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(hand: Rig) -> None:
+    hand.key("Space")
+    started = hand.stage.work.player.frame
+    hand.frame(30)
+    assert hand.stage.work.player.frame - started == pytest.approx(30 * STEP_S * 24, abs=1)
+    waits = hand.stage.patience()
+    assert waits is not None
+    assert 0.0 < waits <= 1 / 24, "it sleeps until the next frame of the film, not less"
+    assert len(hand.stage.latencies_ms) == 0, "a film is no slider"
+    hand.key("Space")
+    paused, drawn = hand.stage.work.player.frame, hand.stage.drawn
+    hand.frame(60)
+    assert (hand.stage.work.player.frame, hand.stage.drawn) == (paused, drawn)
+    assert hand.stage.patience() is None
+    assert hand.stage.work.past.past == ()
+
+
+def test_a_frame_between_two_of_the_film_draws_no_splats(hand: Rig) -> None:
+    hand.key("Space")
+    drawn, frame = hand.stage.drawn, hand.stage.work.player.frame
+    hand.frame(60)
+    assert hand.stage.drawn - drawn <= (hand.stage.work.player.frame - frame) % 41 + 1
+
+
+def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) -> None:
+    seen = []
+    for chord in (".", ".", ",", "Shift+.", "Shift+.", "Shift+,"):
+        hand.key(chord)
+        seen.append(hand.stage.work.player.frame)
+    assert seen == [1, 2, 1, 20, 40, 20]
+
+
+def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
+    y, gap = WINDOW[1] - 24.0, 27.0
+    hand.drag(at(hand, 30), at(hand, 30))
+    for x, expected in ((10.0 + gap + 12.0, [0, 20, 30]), (10.0 + 2 * gap + 12.0, [0, 20])):
+        hand.move(x, y)
+        hand.press()
+        hand.release()
+        assert frames_of(hand) == expected
+    hand.move(22.0, y)
+    hand.press()
+    hand.release()
+    assert hand.stage.work.player.playing
+    hand.key("Space")
+    settings = WINDOW[0] - panel.WIDTH_PX - 10.0 - timeline_bar._SETTINGS_PX + 12.0
+    hand.move(settings + 30.0, y)
+    hand.press()
+    hand.release()
+    assert hand.stage.work.view.timeline.keys[0].easing != keyed().timeline.keys[0].easing or (
+        hand.stage.work.view.timeline.keys[1].easing != "linear"
+    )
+    hand.move(settings + 80.0, y)
+    hand.press()
+    hand.release()
+    assert hand.stage.work.view.timeline.ping_pong
+    hand.drag((settings + 120.0, y), (settings + 160.0, y))
+    assert hand.stage.work.view.timeline.length > 40
+
+
+def test_what_the_bar_covers_is_not_the_pictures_to_orbit(hand: Rig) -> None:
+    camera = hand.stage.work.view.camera
+    hand.drag((300.0, WINDOW[1] - 44.0), (380.0, WINDOW[1] - 44.0))
+    assert hand.stage.work.view.camera == camera
+
+
+def test_hiding_the_interface_hides_the_bar(hand: Rig) -> None:
+    hand.key("F12")
+    shown = hand.image()[-40:, :100]
+    with rig(keyed(), WINDOW) as bare:
+        bare.key("F12")
+        assert np.array_equal(shown, bare.image()[-40:, :100])
+
+
+def test_ctrl_k_saves_the_timeline_and_render_makes_the_frames_of_it_that_the_window_showed(
+    hand: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand.key("Ctrl+K")
+    saved = tmp_path / "bear_timeline_001.json"
+    view = hand.stage.work.view
+    assert timeline_file.load(saved, view.layers) == view.timeline
+    message = hand.stage.work.message
+    assert message is not None
+    assert saved.name in message.text
+    monkeypatch.chdir(tmp_path)
+    scene, *gdfs = (str(path) for path in bear().save(tmp_path))
+    blue = "#" + "".join(f"{round(255 * c):02x}" for c in view.background)
+    command = ("render", scene, *gdfs, "--timeline", str(saved), "--background", blue, *SMALL)
+    assert main([*command, "-o", "shown"]) == 0
+    assert main([*command, "-o", "again"]) == 0
+    names = sorted(path.name for path in Path("shown").iterdir())
+    assert names == [f"frame_{i:04d}.png" for i in range(41)]
+    assert all((Path("shown") / n).read_bytes() == (Path("again") / n).read_bytes() for n in names)
+    for frame in (0, 13, 20):
+        state = timeline.shown_at(view.timeline, frame, view)
+        expected = film.to_pixels(hand.stage.engine.image(state, (64, 48)))
+        found = np.asarray(Image.open(f"shown/frame_{frame:04d}.png"))
+        assert np.abs(found.astype(int) - expected).max() <= 1
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """`progdf render` of a film of four frames of the scarf, without a moving camera."""
+    monkeypatch.chdir(tmp_path)
+    bear().save(tmp_path)
+    keys = (Keyframe(0, ((0, 0.0),)), Keyframe(3, ((0, 1.0),), easing="linear"))
+    view = first_view(bear(), 0.0, 0.0)
+    timeline_file.save(Path("film.json"), Timeline(keys, 3, fps=24), view.layers)
+    given = ("render", "bear.ply", "scarf.gdf", "ears.gdf", "--timeline", "film.json", *SMALL)
+    return lambda *arguments: main([*given, *arguments])
+
+
+def test_a_film_as_gif_keeps_its_pace_in_the_mean(run: Callable[..., int]) -> None:
+    assert run("--orbit", "20,15", "-o", "film.gif") == 0
+    with Image.open("film.gif") as animation:
+        durations = []
+        for frame in range(getattr(animation, "n_frames", 1)):
+            animation.seek(frame)
+            durations.append(animation.info["duration"])
+    assert sum(durations) == 170, "four times 1/24 s, in hundredths"
+
+
+def test_a_film_as_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> None:
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        pytest.skip("the extra video is not installed")
+    import imageio_ffmpeg
+
+    assert run("-o", "film.mp4") == 0
+    assert imageio_ffmpeg.count_frames_and_secs("film.mp4")[0] == 4
+    reader = imageio_ffmpeg.read_frames("film.mp4")
+    facts = next(reader)
+    pictures = [np.frombuffer(frame, np.uint8).reshape(48, 64, 3) for frame in reader]
+    assert (facts["size"], facts["fps"]) == ((64, 48), 24.0)
+    assert run("-o", "frames") == 0
+    for i, picture in enumerate(pictures):
+        expected = np.asarray(Image.open(f"frames/frame_{i:04d}.png")).astype(float)
+        assert np.abs(picture - expected).mean() < 8.0, "the same pictures, as well as H.264 keeps them"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("-o", "film.png"), "film.png cannot hold a film"),
+        (("-o", "taken"), "taken exists and is not an empty folder"),
+        (("-o", "none/frames"), "does not exist"),
+        (("-o", "/proc/frames"), "/proc/frames cannot be written ("),
+        (("-o", "dangling"), "dangling exists and is not an empty folder"),
+        (("-o", "x.gif", "--sweep", "scarf"), "were both given"),
+        (("-o", "x.gif", "--orbit", "0,0", "--timeline", "moving.json"), "moving.json moves the camera"),
+    ],
+)
+def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
+    arguments: tuple[str, ...], told: str, run: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("taken").mkdir()
+    Path("taken/notes.txt").write_text("mine")
+    Path("dangling").symlink_to("nowhere")
+    view = keyed()
+    timeline_file.save(Path("moving.json"), view.timeline, view.layers)
+    before = sorted(Path().iterdir())
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert sorted(Path().iterdir()) == before
+
+
+def test_an_empty_folder_is_filled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a link, or where one stands: neither can be put aside and replaced."""
+    frames = [np.zeros((4, 4, 3), np.uint8)] * 2
+    for folder in ("linked", "here"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "link").symlink_to("linked")
+    monkeypatch.chdir(tmp_path / "here")
+    for given, filled in ((tmp_path / "link", "linked"), (Path(), "here")):
+        film.write_sequence(given, frames)
+        names = sorted(path.name for path in (tmp_path / filled).iterdir())
+        assert names == ["frame_0000.png", "frame_0001.png"]
+    assert (tmp_path / "link").is_symlink()
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_frames_that_fail_on_the_way_leave_nothing(tmp_path: Path, there: bool) -> None:
+    folder = tmp_path / "frames"
+    if there:
+        folder.mkdir()
+
+    def torn() -> Iterator[film.Pixels]:
+        yield np.zeros((4, 4, 3), np.uint8)
+        raise ProgdfError("no more")
+
+    with pytest.raises(ProgdfError):
+        film.write_sequence(folder, torn())
+    assert list(tmp_path.rglob("*")) == [folder] * there
+
+
+def test_frames_for_a_full_disk_are_one_line_and_leave_no_folder(tmp_path: Path) -> None:
+    with files_up_to(20), pytest.raises(ProgdfError, match=r"frames cannot be written \("):
+        film.write_sequence(tmp_path / "frames", [np.zeros((4, 4, 3), np.uint8)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_timeline_in_use(screenshot: Callable[[str, np.ndarray], None]) -> None:
+    context = headless_context()
+    software = is_software(context)
+    context.release()
+    if not software:
+        pytest.skip("the goldens were drawn by a software GPU")
+    with rig(keyed(), WINDOW) as hand:
+        hand.key("T")
+        hand.drag(at(hand, 5), at(hand, 12))
+        hand.move(500.0, 300.0)
+        hand.frame(3)
+        screenshot("ui_timeline", hand.image()[-60:, : WINDOW[0] - round(panel.WIDTH_PX)])

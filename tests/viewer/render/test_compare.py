@@ -1,0 +1,217 @@
+"""Original against edited: held, side by side, subtracted; in the window and in files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from progdf.__main__ import main
+from progdf.metrics.image import psnr
+from tests.helpers.divided import BANNER, SIZE, beside_line
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.pictures import compare_view as compare
+from viewer.state.view_state import Comparison, ViewState
+
+
+@cache
+def whole(scarf: float, ears: float, draw: str = "cpu") -> np.ndarray:
+    """The bear without a comparison, as the default rig shows it; asked for first before a rig is up."""
+    with rig(first_view(bear(), scarf, ears), draw=draw) as hand:
+        return hand.picture()
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    whole(0.0, 0.0), whole(1.0, 1.0)
+    with rig(first_view(bear(), 1.0, 1.0)) as made:
+        yield made
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("draw", ["cpu", "gl"])
+def test_y_shows_the_original_left_and_the_edited_right_of_the_divider(draw: str) -> None:
+    original = whole(0.0, 0.0, draw)
+    with rig(first_view(bear(), 1.0, 1.0), draw=draw) as hand:
+        edited = hand.picture()
+        hand.key("Y")
+        left, right = beside_line(hand.picture(), 170)
+        assert np.array_equal(left, beside_line(original, 170)[0])
+        assert np.array_equal(right, beside_line(edited, 170)[1])
+        assert not np.array_equal(left, beside_line(edited, 170)[0])
+        hand.key("Y")
+        assert np.array_equal(hand.picture(), edited)
+
+
+@pytest.mark.gl
+def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
+    hand.key("Y")
+    before, drawn = hand.stage.work.view.camera, hand.stage.drawn
+    hand.drag((170.0, 300.0), (100.0, 310.0))
+    assert hand.stage.work.view.compare.divider == pytest.approx(100 / 340)
+    assert (hand.stage.work.view.camera, hand.stage.drawn) == (before, drawn)
+    left, right = beside_line(hand.picture(), 100)
+    assert np.array_equal(left, beside_line(whole(0.0, 0.0), 100)[0])
+    assert np.array_equal(right, beside_line(whole(1.0, 1.0), 100)[1])
+    hand.drag((100.0, 300.0), (-50.0, 300.0))
+    assert hand.stage.work.view.compare.divider == 0.0
+    assert hand.stage.work.past.past == (), "where one looks is not an edit"
+
+
+@pytest.mark.gl
+def test_beside_the_divider_a_drag_turns_both_sides(hand: Rig) -> None:
+    hand.key("Y")
+    hand.drag((250.0, 300.0), (280.0, 300.0))
+    view = hand.stage.work.view
+    assert view.compare.divider == 0.5
+    left, right = beside_line(hand.picture(), 170)
+    for side, shown in ((left, replace(view, layers=())), (right, view)):
+        image = hand.stage.engine.image(replace(shown, compare=Comparison()), SIZE)
+        expected = beside_line(np.clip(image, 0, 1) * 255, 170)[0 if side is left else 1]
+        assert np.abs(side - expected).max() <= 0.51
+
+
+@pytest.mark.gl
+def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
+    hand.key("Y")
+    hand.drag((170.0, 300.0), (120.0, 300.0))
+    left, right = beside_line(hand.picture(), 120)
+    for _ in range(8):
+        hand.key("2")  # the lower layer, the scarf
+        hand.key("Shift+Left")
+    now_left, now_right = beside_line(hand.picture(), 120)
+    assert np.array_equal(left, now_left)
+    assert not np.array_equal(right, now_right)
+
+
+@pytest.mark.gl
+def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_psnr(hand: Rig) -> None:
+    hand.key("Shift+Y")
+    view = hand.stage.work.view
+    edited = hand.stage.engine.image(view, SIZE).clip(0, 1)
+    original = hand.stage.engine.image(replace(view, layers=()), SIZE).clip(0, 1)
+    expected = np.round((4.0 * np.abs(edited - original)).clip(0, 1) * 255)
+    hand.frame()
+    assert np.abs(hand.picture()[BANNER:] - expected[BANNER:]).max() <= 1
+    assert (hand.picture()[BANNER:] == 0).mean() > 0.5
+    found = psnr(torch.from_numpy(edited), torch.from_numpy(original))
+    assert hand.stage.canvas.comparer.psnr == pytest.approx(found, abs=1e-6)
+    hand.stage.change(replace(view, compare=replace(view.compare, amplify=16.0)))
+    hand.settle()
+    assert hand.picture()[BANNER:].astype(int).sum() > 1.5 * expected[BANNER:].sum()
+
+
+@pytest.mark.gl
+def test_equal_pictures_have_no_difference() -> None:
+    with rig(first_view(bear(), 0.0, 0.0)) as hand:
+        hand.key("Shift+Y")
+        assert hand.picture()[BANNER:].max() == 0
+        assert hand.stage.canvas.comparer.psnr == math.inf
+        assert hand.stage.canvas.comparer.labels(hand.stage.work.view).line == "difference: none"
+
+
+@pytest.mark.gl
+def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> None:
+    from viewer.camera.inputs import Keys
+
+    original = whole(0.0, 0.0)
+    for chord in ("Y", "Shift+Y"):
+        hand.key(chord)
+        hand.frame(2, Keys(held=frozenset("\\")))
+        assert np.array_equal(hand.picture()[BANNER:], original[BANNER:])
+        hand.frame()
+
+
+@pytest.mark.gl
+def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
+    for chord in ("Y", "Shift+Y"):
+        hand.key(chord)
+        hand.frame(60)  # a tooltip may wait for a second of rest
+        drawn = hand.stage.drawn
+        hand.frame(3)
+        assert hand.stage.patience() is None
+        assert hand.stage.drawn == drawn
+
+
+@pytest.mark.gl
+def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) -> None:
+    with rig(first_view(bear(), 1.0, 1.0), pictures=tmp_path) as hand:
+        hand.key("Y")
+        shown = hand.picture()
+        hand.key("F2")
+        saved = np.asarray(Image.open(tmp_path / "bear_001.png"))
+        left, right = beside_line(saved, 170)
+        shown_left, shown_right = beside_line(shown, 170)
+        assert np.array_equal(left, shown_left)
+        assert np.array_equal(right, shown_right)
+
+
+def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:
+    view = ViewState()
+    split = compare.switched(view, "split")
+    assert split.compare.mode == "split"
+    assert compare.switched(split, "split") == view
+    assert compare.switched(split, "difference").compare.mode == "difference"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    bear().save(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def rendered(*options: str) -> np.ndarray:
+    common = ("bear.ply", "scarf.gdf", "--set", "scarf=1", "--size", "96x72", "--engine", "cpu")
+    assert main(["render", *common, *options, "-o", "out.png"]) == 0
+    return np.asarray(Image.open("out.png")).astype(int)
+
+
+def test_render_writes_a_split_at_the_share_that_was_said(folder: Path) -> None:
+    edited, original = rendered(), rendered("--set", "scarf=0")
+    picture = rendered("--split", "0.25")
+    assert np.array_equal(picture[26:, :21], original[26:, :21])
+    assert np.array_equal(picture[26:, 28:], edited[26:, 28:])
+    assert (picture[:, 24] == 255).all(), "the divider"
+
+
+def test_render_splits_in_the_middle_where_no_share_is_said(folder: Path) -> None:
+    assert (rendered("--split")[:, 48] == 255).all()
+
+
+def test_render_writes_a_difference_and_says_the_psnr(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edited, original = rendered(), rendered("--set", "scarf=0")
+    picture = rendered("--difference", "2")
+    expected = np.minimum(2 * np.abs(edited - original), 255)
+    assert np.abs(picture[26:] - expected[26:]).max() <= 2
+    assert "PSNR" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "about"),
+    [
+        (("--split", "1.5"), "0 to 1"),
+        (("--split=left",), "0 to 1"),
+        (("--difference", "0"), "1 to 64"),
+        (("--split", "--difference"), "one of them"),
+        (("--split", "--sheet", "scarf"), "one of them"),
+    ],
+)
+def test_a_comparison_that_makes_no_sense_is_one_line(
+    folder: Path, options: tuple[str, ...], about: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["render", "bear.ply", "scarf.gdf", "--engine", "cpu", *options, "-o", "bad.png"]
+    assert main(argv) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert about in told
+    assert not Path("bad.png").exists()

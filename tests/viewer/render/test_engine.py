@@ -1,0 +1,364 @@
+"""The engine: only the work between two states, attributes and order together, the same picture every way."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import moderngl
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from progdf.compose.reference import BLENDS, Gains, Layer, compose
+from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES
+from progdf.rasterize import render
+from tests.helpers.stacks import EARS, SCARF, Stack, bear_stack, view_of
+from viewer.camera.view_camera import to_camera
+from viewer.gl import edit_pass
+from viewer.gl.screen import read_rgb
+from viewer.render import engine as engine_module
+from viewer.render.attribute_updates import GpuEditing
+from viewer.render.engine import Engine, FrameTimings
+from viewer.render.headless import headless_context, is_software
+from viewer.state.paint import encoded
+from viewer.state.view_state import LayerState, ViewState
+
+SIZE = (96, 72)
+Compare = Callable[[str, np.ndarray], None]
+
+
+@pytest.fixture(scope="module")
+def stack() -> Stack:
+    return bear_stack(1500)
+
+
+@pytest.fixture(scope="module")
+def ctx() -> Iterator[moderngl.Context]:
+    context = headless_context()
+    yield context
+    context.release()
+
+
+@pytest.fixture(params=["gl", "cpu", "gl, edited by the GPU"])
+def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+    draw, comma, _ = request.param.partition(",")
+    made = Engine(ctx, stack.scene, stack.gdfs, draw, edit_pass="gpu" if comma else "cpu")
+    yield made
+    made.release()
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+    """OpenGL, with what edits."""
+    made = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
+    yield made
+    made.release()
+
+
+class Count:
+    """A function in its place that counts its calls."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, target: object, name: str) -> None:
+        self.calls = 0
+        original = getattr(target, name)
+
+        def counted(*args: object, **kwargs: object) -> object:
+            self.calls += 1
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(target, name, counted)
+
+
+@pytest.mark.gl
+def test_the_picture_is_the_composed_scene_drawn(engine: Engine, stack: Stack) -> None:
+    view = view_of(stack, 0.7, 0.4)
+    layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
+    expected = render(compose(stack.scene, layers), to_camera(view.camera, *SIZE)).numpy()
+    image = engine.image(view, SIZE)
+    assert image.shape == (72, 96, 3)
+    assert image.dtype == np.float32
+    assert float(np.abs(image - expected).max()) <= 0.0101, "more than the early stop at 1e-4 explains"
+
+
+@pytest.mark.gl
+def test_strength_zero_is_the_original_bit_for_bit(engine: Engine, stack: Stack) -> None:
+    original = engine.image(replace(view_of(stack), layers=()), SIZE).copy()
+    engine.image(view_of(stack, 0.8, 1.0), SIZE)
+    assert np.array_equal(engine.image(view_of(stack), SIZE), original)
+
+
+@pytest.mark.gl
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    path=st.lists(
+        st.tuples(st.sampled_from([0.0, 0.2, 0.9, 1.0]), st.sampled_from([0.0, 0.5, 1.0])), max_size=4
+    )
+)
+def test_the_picture_does_not_depend_on_the_way_to_it(
+    gl_engine: Engine, ctx: moderngl.Context, stack: Stack, path: list[tuple[float, float]]
+) -> None:
+    for scarf, ears in path:
+        gl_engine.image(view_of(stack, scarf, ears), SIZE)
+    there = gl_engine.image(view_of(stack, 0.3, 0.6), SIZE).copy()
+    fresh = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=gl_engine.edits_with)
+    assert np.array_equal(there, fresh.image(view_of(stack, 0.3, 0.6), SIZE))
+    fresh.release()
+
+
+@pytest.mark.gl
+def test_both_ways_to_draw_give_the_same_picture(ctx: moderngl.Context, stack: Stack) -> None:
+    by_gl, by_cpu = (Engine(ctx, stack.scene, stack.gdfs, draw=draw) for draw in ("gl", "cpu"))
+    for view in (view_of(stack, 1.0, 0.0), view_of(stack, 0.0, 0.5), view_of(stack, 0.2, 1.0)):
+        difference = np.abs(by_gl.image(view, SIZE) - by_cpu.image(view, SIZE))
+        assert float(difference.max()) <= 0.0101
+        assert float((difference**2).mean()) <= 1e-7, "70 dB"
+    by_gl.release()
+    by_cpu.release()
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
+    ctx: moderngl.Context, stack: Stack, blend: str
+) -> None:
+    by_gpu, by_cpu = (
+        Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=where) for where in ("gpu", "cpu")
+    )
+    assert (by_gpu.edits_with, by_cpu.edits_with) == ("gpu", "cpu")
+    weights = np.linspace(0.0, 1.0, len(stack.gdfs[EARS].region), dtype=np.float32)
+    for scarf, ears, gains in ((1.0, 0.0, Gains()), (0.3, 1.2, Gains(geometry=0.5)), (0.0, 0.0, Gains())):
+        view = replace(view_of(stack, scarf, ears), blend=blend)
+        painted = replace(view.layers[EARS], paint=encoded(weights), gains=gains)
+        view = replace(view, layers=(view.layers[SCARF], painted))
+        apart = np.abs(by_gpu.image(view, SIZE) - by_cpu.image(view, SIZE))
+        assert float((apart**2).mean()) <= 1e-10, "100 dB; on llvmpipe they are the same"
+        found = by_gpu.edits()
+        assert found is not None
+        assert found.where == "gpu"
+        assert found.error <= 1e-6
+        assert by_cpu.edits() is None
+        for name in ATTRIBUTES:
+            assert torch.equal(getattr(by_gpu.gaussians(view), name), getattr(by_cpu.gaussians(view), name))
+    by_gpu.release()
+    by_cpu.release()
+
+
+@pytest.mark.gl
+def test_beside_the_edit_pass_the_cpu_composes_means_only(ctx: moderngl.Context, stack: Stack) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    assert isinstance(engine._editing, GpuEditing)
+    engine.image(view_of(stack, 0.4, 0.4), SIZE)
+    engine.image(view_of(stack, 0.7, 0.7), SIZE)
+    assert engine._editing._composer is None
+    means = engine._editing._means.gaussians
+    assert torch.equal(means.sh0, stack.scene.sh0)
+    assert not torch.equal(means.means, stack.scene.means)
+    engine.release()
+
+
+@pytest.mark.gl
+def test_the_error_is_measured_once_for_every_stack(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    measured = Count(monkeypatch, engine._editing, "error")
+    for strength, calls in ((0.4, 1), (0.4, 1), (0.5, 2)):
+        engine.image(view_of(stack, strength), SIZE)
+        engine.edits()
+        assert measured.calls == calls
+    engine.release()
+
+
+@pytest.mark.gl
+def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    assert engine.edits_with == "cpu"
+    found = engine.edits()
+    assert found is not None
+    assert "too large" in found.obstacle
+    expected = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="cpu")
+    view = view_of(stack, 0.6, 0.6)
+    assert np.array_equal(engine.image(view, SIZE), expected.image(view, SIZE))
+    engine.release()
+    expected.release()
+
+
+@pytest.mark.gl
+def test_the_edit_pass_is_left_to_hardware_and_needs_opengl(ctx: moderngl.Context, stack: Stack) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl")
+    assert engine.edits_with == ("cpu" if is_software(ctx) else "gpu")
+    engine.release()
+    with pytest.raises(ProgdfError, match="the CPU draws here, so the GPU cannot edit"):
+        Engine(ctx, stack.scene, stack.gdfs, draw="cpu", edit_pass="gpu")
+    with pytest.raises(ValueError, match="edit_pass is 'fast'"):
+        Engine(ctx, stack.scene, draw="gl", edit_pass="fast")
+
+
+@pytest.mark.gl
+def test_the_same_state_draws_nothing(engine: Engine, stack: Stack, monkeypatch: pytest.MonkeyPatch) -> None:
+    view = view_of(stack, 0.5)
+    assert engine.needs_draw(view, SIZE)
+    engine.image(view, SIZE)
+    draws = Count(monkeypatch, engine._painter, "draw")
+    assert not engine.needs_draw(view, SIZE)
+    assert not engine.needs_draw(replace(view, overlay=True, panel=False), SIZE)
+    engine.image(replace(view, overlay=True), SIZE)
+    assert draws.calls == 0
+
+
+@pytest.mark.gl
+def test_whatever_changes_the_picture_needs_a_draw(engine: Engine, stack: Stack) -> None:
+    view = view_of(stack, 0.5, 0.5)
+    engine.image(view, SIZE)
+    turned = replace(view, camera=replace(view.camera, azimuth=3.0))
+    weaker = replace(view.layers[0], gains=Gains(colour=0.5))
+    assert engine.needs_draw(turned, SIZE)
+    assert engine.needs_draw(view, (97, 72))
+    assert engine.needs_draw(view_of(stack, 0.5, 0.501), SIZE)
+    assert engine.needs_draw(replace(view, blend="sum"), SIZE)
+    assert engine.needs_draw(replace(view, background=(0.0, 0.0, 0.0)), SIZE)
+    assert engine.needs_draw(replace(view, layers=(weaker, view.layers[1])), SIZE)
+    assert engine.needs_draw(replace(view, layers=(replace(view.layers[0], enabled=False),)), SIZE)
+
+
+@pytest.mark.gl
+def test_a_layer_that_is_off_or_at_zero_causes_no_work_at_all(engine: Engine, stack: Stack) -> None:
+    engine.image(view_of(stack, 0.5, 0.0), SIZE)
+    view = view_of(stack, 0.5, 0.0)
+    assert not engine.needs_draw(replace(view, layers=(view.layers[0],)), SIZE)
+    assert not engine.needs_draw(
+        replace(view, layers=(view.layers[0], replace(view.layers[1], name="x"))), SIZE
+    )
+
+
+@pytest.mark.gl
+def test_a_camera_move_composes_nothing(
+    engine: Engine, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = view_of(stack, 0.5)
+    engine.image(view, SIZE)
+    composed = Count(monkeypatch, engine._editing, "bring")
+    uploaded = Count(monkeypatch, engine._painter, "update")
+    engine.image(replace(view, camera=replace(view.camera, azimuth=50.0)), SIZE)
+    assert (composed.calls, uploaded.calls) == (0, 0)
+    assert engine.timings.compose_ms == engine.timings.upload_ms == 0.0
+    assert engine.timings.changed == 0
+
+
+@pytest.mark.gl
+def test_a_change_of_colour_sorts_nothing_and_a_change_of_place_does(
+    gl_engine: Engine, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gl_engine.image(view_of(stack), SIZE)
+    sorts = Count(monkeypatch, engine_module, "back_to_front")
+    gl_engine.image(view_of(stack, scarf=0.6), SIZE)
+    assert sorts.calls == 0
+    gl_engine.image(view_of(stack, scarf=0.6, ears=0.6), SIZE)
+    assert sorts.calls == 1
+
+
+@pytest.mark.gl
+def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: Engine, stack: Stack) -> None:
+    """The order on the GPU is that of the means on the GPU, in every frame of a drag."""
+    for ears in (0.0, 0.3, 0.7, 1.0):
+        view = view_of(stack, ears=ears)
+        gl_engine.image(view, SIZE)
+        means = compose(stack.scene, [Layer(stack.gdfs[EARS], ears)]).means.numpy()
+        order = engine_module.back_to_front(means, to_camera(view.camera, *SIZE))
+        assert np.array_equal(gl_engine._order, order)
+
+
+@pytest.mark.gl
+def test_only_members_of_the_moved_layer_are_composed(engine: Engine, stack: Stack) -> None:
+    engine.image(view_of(stack, 0.2, 0.5), SIZE)
+    engine.image(view_of(stack, 0.3, 0.5), SIZE)
+    assert engine.timings.changed == len(stack.gdfs[SCARF].region)
+
+
+@pytest.mark.gl
+def test_a_state_that_means_nothing_leaves_the_last_picture(engine: Engine, stack: Stack) -> None:
+    good = engine.image(view_of(stack, 0.4, 0.4), SIZE).copy()
+    for broken in (
+        replace(view_of(stack), layers=(LayerState(7, "gone", 0.5),)),
+        view_of(stack, float("nan")),
+        replace(view_of(stack, 1.0), blend="multiply"),
+    ):
+        with pytest.raises(ProgdfError):
+            engine.image(broken, SIZE)
+        assert not engine.needs_draw(view_of(stack, 0.4, 0.4), SIZE)
+        assert np.array_equal(engine.image(view_of(stack, 0.4, 0.4), SIZE), good)
+
+
+@pytest.mark.gl
+def test_a_window_gets_the_picture_upright_in_its_lower_left_corner(
+    engine: Engine, ctx: moderngl.Context, stack: Stack
+) -> None:
+    screen = ctx.framebuffer([ctx.texture((120, 100), 4)])
+    screen.clear(0.0, 1.0, 0.0)
+    timings = engine.draw(view_of(stack, 1.0), screen, SIZE)
+    shown = read_rgb(screen, (120, 100))
+    image = np.round(np.clip(engine.image(view_of(stack, 1.0), SIZE), 0.0, 1.0) * 255.0)
+    assert np.abs(shown[-72:, :96].astype(int) - image).max() <= 1
+    assert (shown[:28] == (0, 255, 0)).all()
+    assert (shown[:, 96:] == (0, 255, 0)).all()
+    assert timings.total_ms >= timings.draw_ms > 0.0
+    screen.release()
+
+
+def test_an_engine_without_a_context_draws_on_the_cpu(stack: Stack) -> None:
+    engine = Engine(None, stack.scene, stack.gdfs)
+    assert engine.draws_with == "cpu"
+    assert engine.image(view_of(stack, 1.0), SIZE).shape == (72, 96, 3)
+    with pytest.raises(ValueError, match="needs a context"):
+        Engine(None, stack.scene, draw="gl")
+
+
+@pytest.mark.gl
+def test_software_opengl_is_left_to_the_cpu_rasteriser(ctx: moderngl.Context, stack: Stack) -> None:
+    engine = Engine(ctx, stack.scene, stack.gdfs)
+    assert engine.draws_with == ("cpu" if is_software(ctx) else "gl")
+    engine.release()
+
+
+def test_an_edit_of_another_scene_is_refused(stack: Stack) -> None:
+    with pytest.raises(ProgdfError, match="another scene"):
+        Engine(None, stack.scene[:100], stack.gdfs)
+
+
+@pytest.mark.gl
+def test_a_scene_without_gaussians_is_its_background(
+    engine: Engine, ctx: moderngl.Context, stack: Stack
+) -> None:
+    empty = Engine(ctx, stack.scene[:0], draw=engine.draws_with)
+    image = empty.image(ViewState(background=(0.2, 0.4, 0.6)), (8, 4))
+    assert np.allclose(image, (0.2, 0.4, 0.6))
+    empty.release()
+
+
+@pytest.mark.gl
+def test_engines_that_come_and_go_leave_no_gl_error(ctx: moderngl.Context, stack: Stack) -> None:
+    assert ctx.error in ("GL_NO_ERROR", "GL_INVALID_OPERATION"), "asking clears what other tests left"
+    for draw in ("gl", "cpu", "gl"):
+        engine = Engine(ctx, stack.scene, stack.gdfs, draw=draw)
+        engine.image(view_of(stack, 0.5, 0.5), SIZE)
+        engine.image(view_of(stack, 0.5, 0.5), (SIZE[1], SIZE[0]))
+        engine.release()
+        assert ctx.error == "GL_NO_ERROR", draw
+
+
+def test_timings_add_up() -> None:
+    assert FrameTimings(1.0, 2.0, 3.0, 4.0).total_ms == 10.0
+
+
+def test_the_early_stop_is_the_only_rule_that_gl_leaves_out() -> None:
+    """Named here so that a change of the constant meets the tolerances above: 0.01 = 1e-4 / (1 - 0.99)."""
+    conventions = importlib.import_module("progdf.rasterize.conventions")
+    assert pytest.approx(0.01) == conventions.TRANSMITTANCE_MIN / (1.0 - conventions.ALPHA_MAX)

@@ -1,0 +1,72 @@
+"""The bear in the viewer looks as it did: pictures kept in tests/screenshots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import moderngl
+import numpy as np
+import pytest
+
+from tests.helpers.stacks import Stack, bear_stack, view_of
+from viewer.render.engine import Engine
+from viewer.render.headless import headless_context, is_software
+
+Compare = Callable[[str, np.ndarray], None]
+
+
+@pytest.fixture(scope="module")
+def stack() -> Stack:
+    return bear_stack(1500)
+
+
+@pytest.fixture(scope="module")
+def ctx() -> Iterator[moderngl.Context]:
+    context = headless_context()
+    yield context
+    context.release()
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+    """OpenGL, with what edits."""
+    made = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
+    yield made
+    made.release()
+
+
+@pytest.fixture(scope="module")
+def software_gpu(ctx: moderngl.Context) -> None:
+    """Goldens hold for one renderer; another differs in the last bits."""
+    if not is_software(ctx):
+        pytest.skip(f"goldens were drawn by llvmpipe, here is {ctx.info['GL_RENDERER']}")
+
+
+@pytest.mark.gl
+@pytest.mark.usefixtures("software_gpu")
+def test_the_goldens_are_compared_on_a_software_renderer(ctx: moderngl.Context) -> None:
+    assert "llvmpipe" in str(ctx.info["GL_RENDERER"])
+
+
+@pytest.mark.gl
+@pytest.mark.usefixtures("software_gpu")
+@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0])
+def test_the_bear_looks_as_it_did(
+    gl_engine: Engine, stack: Stack, screenshot: Compare, strength: float
+) -> None:
+    screenshot(f"scene_bear_{strength:g}", gl_engine.image(view_of(stack, strength, strength), (240, 180)))
+
+
+@pytest.mark.gl
+@pytest.mark.usefixtures("software_gpu")
+def test_a_wrong_golden_is_noticed(
+    gl_engine: Engine, stack: Stack, screenshot: Compare, request: pytest.FixtureRequest
+) -> None:
+    """scene_wrong.png is scene_bear_1.png with one square 4/255 too bright."""
+    if request.config.getoption("--regenerate-screenshots"):
+        image = gl_engine.image(view_of(stack, 1.0, 1.0), (240, 180)).copy()
+        image[60:70, 110:120] = np.clip(image[60:70, 110:120], 0.0, 0.9) + 4.0 / 255.0
+        screenshot("scene_wrong", image)
+        return
+    with pytest.raises(pytest.fail.Exception, match="100 pixels differ by more than 2/255"):
+        screenshot("scene_wrong", gl_engine.image(view_of(stack, 1.0, 1.0), (240, 180)))

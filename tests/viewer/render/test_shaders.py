@@ -1,0 +1,193 @@
+"""GLSL sources: includes, messages with file and line, layouts that match the dtypes beside them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from importlib import resources
+
+import moderngl
+import numpy as np
+import pytest
+
+from progdf.compose.layers import BLENDS
+from progdf.gaussians import ATTRIBUTES
+from progdf.rasterize import conventions
+from viewer.gl import programs
+from viewer.gl.layout import (
+    EDIT_LAYER,
+    EDIT_TARGET,
+    ORDER,
+    PLACES,
+    PROJECTED,
+    SPAN,
+    SPLAT_TEXTURES,
+    TARGETS,
+    TEXELS_PER_ROW,
+)
+from viewer.gl.programs import ShaderError, load_program, load_source
+from viewer.gl.splats import vertex_format
+from viewer.render.headless import headless_context
+
+STAGES = (
+    "project.vert",
+    "splat.vert",
+    "splat.frag",
+    "present.vert",
+    "present.frag",
+    "stretch.frag",
+    "edit.vert",
+    "edit.frag",
+    "edit_sh.frag",
+)
+COMPONENTS = {"float": 1, "vec2": 2, "vec3": 3, "vec4": 4}
+
+
+@pytest.fixture(scope="module")
+def ctx() -> Iterator[moderngl.Context]:
+    context = headless_context()
+    yield context
+    context.release()
+
+
+def text_of(name: str) -> str:
+    return (resources.files("shaders") / name).read_text(encoding="utf-8")
+
+
+def declared(name: str, qualifier: str) -> list[tuple[str, int]]:
+    """Names and components of the stage's inputs or outputs, in order."""
+    pattern = re.compile(rf"^{qualifier} (\w+) (\w+);", re.MULTILINE)
+    return [(found[2], COMPONENTS[found[1]]) for found in pattern.finditer(text_of(name))]
+
+
+def fields(dtype: np.dtype) -> list[tuple[str, int]]:
+    return [(name, int(np.prod(dtype[name].shape, dtype=int))) for name in dtype.names or ()]
+
+
+def test_the_projected_layout_is_what_one_stage_writes_and_the_next_reads() -> None:
+    assert declared("project.vert", "out") == fields(PROJECTED)
+    assert declared("splat.vert", "in") == fields(PROJECTED)
+    assert vertex_format(PROJECTED) == "2f 3f 1f 4f"
+    assert PROJECTED.itemsize == 40, "tightly packed, as transform feedback writes it"
+
+
+def test_the_order_is_one_unsigned_integer_a_gaussian() -> None:
+    assert re.search(r"^in uint splat;", text_of("project.vert"), re.MULTILINE)
+    assert np.dtype("<u4") == ORDER
+
+
+def test_every_scene_texture_is_declared_with_the_fields_of_its_dtype_in_order() -> None:
+    source = text_of("include/raw_splats.glsl")
+    samplers = dict(re.findall(r"^uniform sampler2D (\w+);\s*//\s*(.*)$", source, re.MULTILINE))
+    assert set(samplers) == {*SPLAT_TEXTURES, "shN"}
+    for name, dtype in SPLAT_TEXTURES.items():
+        assert dtype.itemsize == 16, "one rgba32f texel"
+        places = [samplers[name].index(field) for field in dtype.names or ()]
+        assert places == sorted(places), f"{name}: {samplers[name]}"
+
+
+def test_the_shaders_constants_are_the_rasterisers() -> None:
+    found = dict(re.findall(r"const float (\w+) = ([^;]+);", text_of("include/conventions.glsl")))
+    assert len(found) == 5
+    for name, value in found.items():
+        numerator, _, denominator = value.partition("/")
+        assert float(numerator) / float(denominator or 1) == getattr(conventions, name), name
+
+
+def test_the_edit_pass_counts_layers_targets_and_rules_as_the_cpu_does() -> None:
+    source = text_of("include/edit_layers.glsl")
+    numbers = dict(re.findall(r"(\w+) = (\d+)[,;]", source))
+    assert int(numbers["TEXELS_PER_ROW"]) == TEXELS_PER_ROW
+    assert EDIT_LAYER.itemsize == 16 * int(numbers["LAYER_TEXELS"])
+    assert EDIT_LAYER.fields is not None
+    assert EDIT_LAYER.fields["targets"][1] == 16, "the layer's own texel comes first"
+    assert EDIT_TARGET.names == ("full", "rest", "rank", "numbers"), "x, y, z, w in `add`"
+    assert EDIT_LAYER.names[:3] == ("places", "weights", "numbers"), "x, y, z in `part_of`"
+    assert [numbers[rule.upper()] for rule in BLENDS] == ["0", "1", "2"]
+    assert SPAN.names == ("column", "row", "texels", "slot"), "x, y, z, w in edit.vert"
+    assert re.search(r"const int SH_TARGET = (\d);", text_of("edit_sh.frag"))[1] == str(TARGETS.index("shN"))
+
+
+def test_the_edit_pass_writes_the_textures_in_the_order_of_the_targets() -> None:
+    outputs = re.findall(r"^layout\(location = (\d)\) out vec4 (\w+);", text_of("edit.frag"), re.MULTILINE)
+    assert [(int(at), name) for at, name in outputs] == list(enumerate(SPLAT_TEXTURES))
+
+
+def test_every_attribute_has_its_own_components_of_a_texture() -> None:
+    assert set(PLACES) == set(ATTRIBUTES)
+    taken = [
+        (place.texture, place.component + i) for place in PLACES.values() for i in range(place.components)
+    ]
+    assert len(set(taken)) == len(taken)
+    assert {texture for texture, _ in taken} == set(TARGETS)
+
+
+def test_every_head_says_what_the_stage_reads_and_writes() -> None:
+    for name in STAGES:
+        head = text_of(name).split("void main")[0]
+        assert "// Reads " in head, name
+        assert "// Writes " in head, name
+
+
+def test_an_include_is_taken_once_and_keeps_the_files_lines() -> None:
+    source = load_source("project.vert")
+    assert source.files[0] == "project.vert"
+    assert len(set(source.files)) == len(source.files) == 4
+    assert source.text.count("const float DILATION") == 1
+    lines = source.text.splitlines()
+    after = next(i for i, line in enumerate(lines) if line.startswith("in uint splat"))
+    number = next(
+        i for i, line in enumerate(text_of("project.vert").splitlines(), 1) if "in uint splat" in line
+    )
+    directive = max(i for i in range(after) if lines[i].startswith("#line"))
+    assert lines[directive].split()[2] == "0"
+    assert int(lines[directive].split()[1]) + after - directive - 1 == number
+
+
+def test_a_missing_include_names_the_file_and_line_that_wants_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("shaders")
+    (folder / "a.vert").write_text('#version 330 core\n\n#include "include/nope.glsl"\n')
+    monkeypatch.setattr(programs.resources, "files", lambda _: folder)
+    with pytest.raises(ShaderError, match=r"shaders/include/nope\.glsl does not exist; shaders/a\.vert:3"):
+        load_source("a.vert")
+
+
+@pytest.mark.gl
+def test_a_mistake_in_an_include_is_told_with_its_own_file_and_line(
+    ctx: moderngl.Context, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("shaders")
+    (folder / "broken.glsl").write_text("const float FINE = 1.0;\n\nfloat f() { return undeclared; }\n")
+    (folder / "a.vert").write_text(
+        '#version 330 core\n#include "broken.glsl"\nvoid main() { gl_Position = vec4(f()); }\n'
+    )
+    monkeypatch.setattr(programs.resources, "files", lambda _: folder)
+    with pytest.raises(ShaderError, match=r"shaders/broken\.glsl:3: error"):
+        load_program(ctx, "a.vert", varyings=("gl_Position",))
+
+
+@pytest.mark.gl
+def test_a_mistake_after_an_include_is_told_with_the_stages_line(
+    ctx: moderngl.Context, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("shaders")
+    (folder / "fine.glsl").write_text("const float FINE = 1.0;\n")
+    (folder / "a.vert").write_text("#version 330 core\nvoid main() { gl_Position = vec4(1.0); }\n")
+    (folder / "a.frag").write_text(
+        '#version 330 core\nout vec4 colour;\n#include "fine.glsl"\nvoid main() { colour = nothing; }\n'
+    )
+    monkeypatch.setattr(programs.resources, "files", lambda _: folder)
+    with pytest.raises(ShaderError, match=r"shaders/a\.frag:4: .*nothing"):
+        load_program(ctx, "a.vert", "a.frag")
+
+
+@pytest.mark.gl
+def test_every_program_compiles_as_gl_3_3_core(ctx: moderngl.Context) -> None:
+    load_program(ctx, "project.vert", varyings=PROJECTED.names or ()).release()
+    load_program(ctx, "splat.vert", "splat.frag").release()
+    load_program(ctx, "present.vert", "present.frag").release()
+    load_program(ctx, "present.vert", "stretch.frag").release()
+    load_program(ctx, "edit.vert", "edit.frag").release()
+    load_program(ctx, "edit.vert", "edit_sh.frag").release()

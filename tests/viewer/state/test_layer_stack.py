@@ -1,0 +1,472 @@
+"""Layers by the hand, by keys and by the command line: alone, locked, renamed, moved, gains, overshoot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from imgui_bundle import imgui
+
+from progdf.__main__ import main
+from progdf.compose.layers import BLENDS
+from progdf.compose.reference import Gains, Layer, compose
+from progdf.errors import ProgdfError
+from progdf.formats.ply import load_ply
+from progdf.gaussians import ATTRIBUTES
+from tests.helpers.stacks import Stack, bear_stack
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera.view_camera import eye, to_camera
+from viewer.commands.layer_arguments import stack_of
+from viewer.panel import layer_details as layer_fold
+from viewer.panel import panel
+from viewer.panel.strength_slider import parse_strength
+from viewer.state import change_curve, timeline
+from viewer.state import layers as stack
+from viewer.state.layer_facts import layer_rows
+from viewer.state.view_state import LayerState, ViewState
+from viewer.state.workspace import original
+
+POINTS = (700, 640)
+LEFT = POINTS[0] - panel.WIDTH_PX
+CARD_PX, HEADS, FOOTS = 97.0, 109.0, 166.0
+TOGGLES = {"solo": 106.0, "lock": 82.0, "fold": 58.0, "menu": 34.0}  # from the right edge
+THREE = ViewState(layers=(LayerState(0, "a", 0.5), LayerState(1, "b", 0.5), LayerState(2, "c", 0.5)))
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig(first_view(bear(), 0.5, 0.5), POINTS) as made:
+        yield made
+
+
+def click(hand: Rig, x: float, y: float) -> None:
+    hand.move(x, y)
+    hand.press()
+    hand.release()
+
+
+def toggle(hand: Rig, name: str, layer: int) -> None:
+    click(hand, POINTS[0] - TOGGLES[name], FOOTS + row(layer))
+
+
+def row(layer: int) -> float:
+    """How far below the top one the card of a layer is: of two, the last one lies on top."""
+    return CARD_PX * (1 - layer)
+
+
+def layers(hand: Rig) -> tuple[LayerState, ...]:
+    return hand.stage.work.view.layers
+
+
+def names(hand: Rig) -> list[str]:
+    return [layer.name for layer in layers(hand)]
+
+
+def type_name(hand: Rig, text: str, end: imgui.Key = imgui.Key.enter) -> None:
+    hand.frame(2)
+    assert imgui.get_io().want_text_input
+    imgui.get_io().add_input_characters_utf8(text)
+    hand.frame()
+    for down in (True, False):
+        hand.modifier(end, down)
+    hand.frame(2)
+
+
+def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> None:
+    top, left = round(HEADS + row(0)) - 12, POINTS[0] - 80
+    hand.move(*hand.slider(0, 0.5))
+    hand.press()
+    before = hand.image()[top : top + 24, left:]
+    hand.move(*hand.slider(0, 0.8))
+    shown = hand.image()[top : top + 24, left:]
+    hand.frame(3)
+    assert (shown != before).any()
+    np.testing.assert_array_equal(hand.image()[top : top + 24, left:], shown)
+
+
+def test_what_is_alone_shows_though_its_eye_is_closed_and_nothing_else_does() -> None:
+    view = stack.soloed(THREE, 1)
+    view = stack.changed(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))
+    assert [layer.name for layer in stack.shown(view)] == ["b"]
+    assert [layer.name for layer in stack.shown(stack.soloed(view, 2))] == ["b", "c"]
+    assert stack.shown(stack.all_shown(view)) == THREE.layers
+
+
+def test_a_layer_moves_within_the_stack_and_stops_at_its_ends() -> None:
+    for to, order in ((-5, "bac"), (0, "bac"), (1, "abc"), (2, "acb"), (9, "acb")):
+        assert "".join(layer.name for layer in stack.moved(THREE, 1, to).layers) == order
+    assert stack.moved(THREE, 3, 0) == THREE
+
+
+def test_names_stay_apart_on_one_line_and_never_empty() -> None:
+    assert stack.renamed(THREE, 0, " b\n ").layers[0].name == "b-2"
+    assert stack.renamed(THREE, 0, "  \t ") == THREE
+    assert stack.renamed(THREE, 1, "b") == THREE
+    assert len(stack.renamed(THREE, 0, "x" * 500).layers[0].name) == stack.LONGEST_NAME
+
+
+def test_a_lock_holds_strength_and_gains() -> None:
+    locked = LayerState(0, "a", 0.5, locked=True)
+    for dial in stack.DIALS:
+        assert stack.dialled(locked, dial, 0.1) == locked
+        assert stack.dial_value(stack.dialled(LayerState(0, "a", 0.5), dial, 0.1), dial) == 0.1
+
+
+def test_without_overshoot_nothing_stands_beyond_one() -> None:
+    over = stack.with_overshoot(THREE, True)
+    assert stack.nudged(over, 0, "strength", 0.6).layers[0].strength == 1.1
+    assert stack.nudged(over, 0, "strength", 9.0).layers[0].strength == stack.OVERSHOOT
+    assert stack.nudged(over, 0, "colour", 9.0).layers[0].gains.colour == 1.0
+    back = stack.with_overshoot(stack.nudged(over, 0, "strength", 9.0), False)
+    assert back.layers[0].strength == 1.0
+    assert parse_strength("130%", stack.most(over)) == stack.OVERSHOOT
+
+
+def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
+    hand.key("1")
+    for chord, field in (("Shift+H", "solo"), ("L", "locked")):
+        hand.key(chord)
+        assert [getattr(layer, field) for layer in layers(hand)] == [False, True]
+    hand.key("Right")
+    assert hand.strengths == [0.5, 0.5], "locked"
+    hand.key("L")
+    hand.key("Right")
+    assert hand.strengths == pytest.approx([0.5, 0.51])
+    hand.key("H")
+    hand.key("Alt+H")
+    assert all(layer.enabled and not layer.solo for layer in layers(hand))
+    hand.key("G")
+    assert hand.stage.work.view.unfolded == (1,)
+    hand.key("Alt+Down")
+    assert names(hand) == ["ears", "scarf"]
+    assert hand.stage.work.focus == 0, "the focus goes with its layer"
+    hand.key("M")
+    assert hand.stage.work.view.blend == BLENDS[1]
+    hand.key("O")
+    for _ in range(9):
+        hand.key("Shift+Right")
+    assert hand.strengths == [stack.OVERSHOOT, 0.5]
+    hand.key("O")
+    assert hand.strengths == [1.0, 0.5]
+
+
+def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
+    hand.key("2")
+    hand.key("Tab")
+    assert hand.stage.work.dial == "colour", "a change of colour has no other gain"
+    assert hand.stage.work.view.unfolded == (0,)
+    hand.key("Shift+Left")
+    assert layers(hand)[0].gains == Gains(colour=0.9)
+    assert hand.strengths == [0.5, 0.5]
+    hand.key("Tab")
+    assert hand.stage.work.dial == "strength"
+    hand.key("1")
+    hand.key("Shift+Tab")
+    hand.key("Shift+Tab")
+    assert hand.stage.work.dial == "geometry"
+
+
+def test_every_change_of_a_layer_is_one_undo_entry_and_comes_back(hand: Rig) -> None:
+    before = hand.picture()
+    for i, chord in enumerate(("Shift+H", "L", "Alt+Down", "O"), 1):
+        hand.key(chord)
+        assert len(hand.stage.work.past.past) == i
+    assert not np.array_equal(hand.picture(), before)
+    for _ in range(4):
+        hand.key("Ctrl+Z")
+    assert hand.stage.work.view == first_view(bear(), 0.5, 0.5)
+    assert np.array_equal(hand.picture(), before)
+
+
+def test_unfolding_is_no_undo_entry(hand: Rig) -> None:
+    hand.key("G")
+    assert hand.stage.work.past.past == ()
+
+
+@pytest.mark.parametrize(("name", "field"), [("solo", "solo"), ("lock", "locked")])
+def test_the_toggles_of_a_card_turn_their_own_layer(hand: Rig, name: str, field: str) -> None:
+    toggle(hand, name, 1)
+    assert [getattr(layer, field) for layer in layers(hand)] == [False, True]
+    assert len(hand.stage.work.past.past) == 1
+    toggle(hand, name, 1)
+    assert not any(getattr(layer, field) for layer in layers(hand))
+
+
+def test_alt_click_on_an_eye_shows_its_layer_alone(hand: Rig) -> None:
+    hand.modifier(imgui.Key.mod_alt)
+    click(hand, LEFT + 34, HEADS + row(1))
+    hand.modifier(imgui.Key.mod_alt, False)
+    assert [(layer.enabled, layer.solo) for layer in layers(hand)] == [(True, False), (True, True)]
+
+
+def test_what_is_alone_is_what_one_sees(hand: Rig) -> None:
+    toggle(hand, "solo", 1)
+    alone = hand.picture()
+    toggle(hand, "solo", 1)
+    hand.drag(hand.slider(0, 0.5), hand.slider(0, -0.5))
+    assert hand.strengths == [0.0, 0.5]
+    assert np.array_equal(hand.picture(), alone)
+
+
+def test_the_original_is_held_also_while_a_layer_is_alone() -> None:
+    view = stack.soloed(THREE, 0)
+    assert stack.shown(original(view)) == ()
+
+
+def test_a_locked_slider_does_not_move(hand: Rig) -> None:
+    toggle(hand, "lock", 0)
+    hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
+    assert hand.strengths == [0.5, 0.5]
+    click(hand, POINTS[0] - 40, HEADS + row(0))
+    hand.frame(2)
+    assert not imgui.get_io().want_text_input
+
+
+def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> None:
+    toggle(hand, "fold", 1)
+    before = hand.stage.engine.gaussians(hand.stage.work.view).sh0.clone()
+    y = 249.0 + row(1)  # the first gain
+    hand.drag((POINTS[0] - 76, y), (LEFT + 90, y))
+    assert layers(hand)[1].gains == Gains(geometry=0.0)
+    assert len(hand.stage.work.past.past) == 1
+    after = hand.stage.engine.gaussians(hand.stage.work.view)
+    assert torch.equal(after.sh0, before)
+    assert torch.equal(after.means, bear().scene.means)
+    hand.frame(30)
+    hand.double_click(LEFT + 150, y)
+    assert layers(hand)[1].gains == Gains(), "a double click brings all of it back"
+
+
+def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
+    hand.move(LEFT + 100, HEADS)
+    hand.press()
+    for y in (HEADS + 10, HEADS + 60, HEADS + CARD_PX + 30):
+        hand.move(LEFT + 100, y)
+        assert names(hand) == ["scarf", "ears"], "the order changes with the release"
+    hand.release()
+    assert names(hand) == ["ears", "scarf"]
+    assert hand.stage.work.focus == 0
+    assert len(hand.stage.work.past.past) == 1
+    hand.key("Ctrl+Z")
+    assert names(hand) == ["scarf", "ears"]
+    assert hand.stage.work.focus == 1
+
+
+def test_a_name_dragged_and_brought_back_changes_nothing(hand: Rig) -> None:
+    hand.drag((LEFT + 100, HEADS), (LEFT + 100, HEADS + 30))
+    assert hand.stage.work.past.past == ()
+
+
+def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
+    hand.double_click(LEFT + 100, HEADS + row(1))
+    type_name(hand, "golden ears")
+    assert names(hand) == ["scarf", "golden ears"]
+    assert len(hand.stage.work.past.past) == 1
+    assert not imgui.get_io().want_text_input
+    assert hand.stage.work.renaming is None
+
+
+def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None:
+    hand.key("2")
+    hand.key("Enter")
+    type_name(hand, "nothing", imgui.Key.escape)
+    assert names(hand) == ["scarf", "ears"]
+    assert hand.stage.work.renaming is None
+    hand.key("Enter")
+    type_name(hand, "ears")
+    assert names(hand) == ["ears-2", "ears"]
+
+
+def test_a_click_on_a_splat_focuses_its_layer_and_a_drag_does_not(hand: Rig) -> None:
+    places = bear().scene.means[bear().gdfs[1].region.members]
+    ear = places[places[:, 0] > 0].mean(0)
+    hand.key("2")
+    at = on_screen(hand, ear)
+    hand.drag(at, (at[0] + 40, at[1]))
+    assert hand.stage.work.focus == 0
+    hand.frame(30)  # no double click
+    at = on_screen(hand, ear)
+    before = hand.stage.work.view
+    click(hand, *at)
+    assert hand.stage.work.focus == 1
+    assert hand.stage.work.view == before
+    click(hand, 5.0, 5.0)
+    assert hand.stage.work.focus == 1, "the background is nobody's"
+
+
+def on_screen(hand: Rig, point: torch.Tensor) -> tuple[float, float]:
+    camera = to_camera(hand.stage.work.view.camera, round(LEFT), POINTS[1])
+    x, y, z = (camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]).tolist()
+    return float(camera.K[0, 0]) * x / z + LEFT / 2, float(camera.K[1, 1]) * y / z + POINTS[1] / 2
+
+
+def test_a_double_click_still_sets_the_pivot(hand: Rig) -> None:
+    before = hand.stage.work.view.camera
+    hand.double_click(*on_screen(hand, bear().scene.means[bear().gdfs[0].region.members].mean(0)))
+    after = hand.stage.work.view.camera
+    assert after.pivot != before.pivot
+    assert eye(after) == pytest.approx(eye(before), abs=1e-4)
+
+
+def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
+    made = bear()
+    rows = layer_rows(made.scene, (made.gdfs[0], made.gdfs[1], made.gdfs[0]))
+    scarf, ears = (len(gdf.region) for gdf in made.gdfs)
+    assert [row.shared for row in rows] == [(scarf, 0, scarf), (0, ears, 0), (scarf, 0, scarf)]
+    assert [row.kinds for row in rows[:2]] == [{"colour"}, {"colour", "geometry"}]
+
+
+def test_the_curve_begins_at_nothing_reaches_all_at_one_and_goes_beyond() -> None:
+    made = bear()
+    curve = layer_rows(made.scene, made.gdfs)[1].curve()
+    assert len(curve) == round(stack.OVERSHOOT * change_curve.STEPS) + 1
+    assert (curve[0], curve[change_curve.STEPS]) == (0.0, 1.0)
+    assert curve[-1] > 1.0
+    assert layer_fold.value_at(curve, 0.5) == curve[change_curve.STEPS // 2]
+    assert layer_fold.value_at((0.0, 1.0), 0.01) == pytest.approx(0.2)
+    assert layer_fold.value_at((0.0, 1.0), 5.0) == 1.0
+
+
+def test_a_large_region_is_measured_by_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bear()
+    whole = change_curve.visible_changes(made.scene, made.gdfs[0])
+    monkeypatch.setattr(change_curve, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
+    assert change_curve.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Stack, Path]:
+    made, folder = bear_stack(800), tmp_path_factory.mktemp("layers")
+    made.save(folder)
+    return made, folder
+
+
+def test_export_and_render_take_gains_solo_and_overshoot(
+    saved: tuple[Stack, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, folder = saved
+    monkeypatch.chdir(folder)
+    options = ("--set", "scarf=1", "--set", "ears=1.1", "--overshoot", "--gain", "ears:geometry=0.5")
+    edits = ("bear.ply", "scarf.gdf", "ears.gdf", *options)
+    assert main(["export", *edits, "--solo", "ears", "-o", "a.ply"]) == 0
+    expected = compose(made.scene, [Layer(made.gdfs[1], 1.1, gains=Gains(geometry=0.5))])
+    read = load_ply("a.ply")
+    for name in set(ATTRIBUTES) - {"quats"}:
+        assert torch.equal(getattr(read, name), getattr(expected, name))
+    small = ("--size", "64x48", "--engine", "cpu")
+    for out, more in (("a.png", ("--solo", "ears")), ("b.png", ())):
+        assert main(["render", *edits, *more, *small, "-o", out]) == 0
+    assert Path("a.png").read_bytes() != Path("b.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"gains": ["scarf=0.5"]}, "write NAME:KIND=G, for example scarf:colour=0.5"),
+        ({"gains": ["scarf:shine=0.5"]}, "the gains are geometry, opacity, colour"),
+        ({"gains": ["scarf:colour=2"]}, "the gain '2' is not a number from 0 to 1"),
+        ({"gains": ["scarf:colour=nan"]}, "not a number from 0 to 1"),
+        ({"gains": ["hat:colour=1"]}, "there is no edit of that name"),
+        ({"solo": ["hat"]}, "--solo hat: there is no edit of that name"),
+        ({"settings": ["scarf=1.1"]}, "not a number from 0 to 1"),
+        ({"settings": ["scarf=1.3"], "overshoot": True}, "not a number from 0 to 1.2"),
+    ],
+)
+def test_a_slip_in_naming_layers_is_one_clear_line(options: dict[str, object], told: str) -> None:
+    with pytest.raises(ProgdfError, match=told) as error:
+        stack_of(bear().gdfs, **{"settings": [], **options})  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+
+
+def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
+    saved: tuple[Stack, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(saved[1])
+    edits = ("bear.ply", "scarf.gdf", "ears.gdf", "--solo", "ears")
+    assert main(["render", *edits, "--sweep", "scarf", "-o", "a.gif"]) == 2
+    assert "ears is shown alone and hides it; show scarf alone too" in capsys.readouterr().err
+
+
+def menu(hand: Rig, layer: int, item: int) -> None:
+    """A right click on a layer's card, then one of Rename, Duplicate, Replace and Delete."""
+    hand.frame(30)
+    hand.move(LEFT + 150, HEADS + row(layer))
+    hand.press(1)
+    hand.release(1)
+    click(hand, LEFT + 180, HEADS + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 3 else 0.0))
+
+
+def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
+    """As the rule "over" has it: the last of the layers, and the first card."""
+    click(hand, LEFT + 150, HEADS)
+    assert hand.stage.work.focus == 1
+    hand.key("2")
+    assert hand.stage.work.focus == 0
+    hand.key("Alt+Up")
+    assert names(hand) == ["ears", "scarf"]
+    hand.stage.change(stack.added(hand.stage.work.view, 0, "new"))
+    hand.settle()
+    click(hand, LEFT + 150, HEADS)
+    assert layers(hand)[hand.stage.work.focus or 0].name == "new"
+
+
+def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> None:
+    before, picture = hand.stage.work.view, hand.picture()
+    menu(hand, 1, 3)
+    assert names(hand) == ["scarf"]
+    assert hand.stage.work.focus == 0
+    assert not np.array_equal(hand.picture(), picture)
+    hand.key("Ctrl+Z")
+    assert hand.stage.work.view.layers == before.layers
+    assert np.array_equal(hand.picture(), picture)
+    hand.key("1")
+    hand.key("Ctrl+Delete")
+    hand.key("Ctrl+Delete")
+    assert names(hand) == []
+    assert hand.stage.work.focus is None
+    hand.key("Ctrl+Delete")
+
+
+def test_the_menu_renames_and_asks_the_window_for_the_rest(hand: Rig) -> None:
+    menu(hand, 0, 0)
+    type_name(hand, "shawl")
+    assert names(hand) == ["shawl", "ears"]
+    menu(hand, 0, 1)
+    menu(hand, 1, 2)
+    assert hand.stage.take_requests() == ("duplicate:0", "replace:1")
+    toggle(hand, "menu", 0)
+    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+    hand.modifier(imgui.Key.escape)
+    hand.frame(2)
+    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+
+
+def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
+    hand.double_click(*hand.slider(1, 0.5))
+    assert hand.strengths == [0.5, 0.0]
+    assert len(hand.stage.work.past.past) == 1, "on the handle it is one step"
+    lens = (LEFT + 210, 396.0)
+    hand.frame(30)
+    click(hand, *lens)
+    assert hand.stage.work.view.camera.fov_y != 45.0
+    hand.frame(30)
+    hand.double_click(*lens)
+    hand.frame(3)
+    assert hand.stage.work.view.camera.fov_y == 45.0
+
+
+def test_a_replaced_layer_keeps_its_place_strength_and_keys(hand: Rig) -> None:
+    view = stack.changed(hand.stage.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x"))
+    view = timeline_with_key(view)
+    after = stack.replaced(view, 0, 7, "ears")
+    assert after.layers[0] == LayerState(7, "ears-2", 0.3)
+    assert after.layers[1] == view.layers[1]
+    assert dict(after.timeline.keys[0].strengths) == {7: 0.3, 1: 0.5}
+
+
+def timeline_with_key(view: ViewState) -> ViewState:
+    return replace(view, timeline=timeline.with_key(view.timeline, 0, view))

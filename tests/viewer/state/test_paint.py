@@ -1,0 +1,275 @@
+"""Painted strength: strokes as pure functions, by the hand, in sessions' text, and from files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from imgui_bundle import imgui
+
+from progdf.camera import Camera
+from progdf.compose.reference import Layer, compose
+from progdf.errors import ProgdfError
+from tests.helpers.hostile import NPY_HEADERS, npy
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera.view_camera import to_camera
+from viewer.commands.layer_arguments import stack_of
+from viewer.state import paint
+from viewer.state.paint import Stroke, near_mean
+from viewer.state.view_state import Brush
+
+POINTS = (700, 640)
+LINE = Stroke(
+    np.ones(5, np.float32),
+    np.array([[0, 0, 0], [10, 0, 0], [20, 0, 0], [40, 0, 0], [np.nan, np.nan, np.nan]], np.float32),
+    np.zeros(5, np.float32),
+)
+ERASE = Brush(active=True, radius=20.0, softness=0.5)
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig(replace(first_view(bear(), 1.0, 1.0), brush=ERASE), POINTS) as made:
+        made.key("2")  # the lower layer, the scarf
+        yield made
+
+
+def weights(hand: Rig, layer: int = 0) -> np.ndarray:
+    found = paint.decoded(hand.stage.work.view.layers[layer].paint, len(bear().gdfs[layer].region))
+    return np.ones(len(bear().gdfs[layer].region)) if found is None else found.numpy()
+
+
+def camera_of(hand: Rig) -> Camera:
+    return to_camera(hand.stage.work.view.camera, POINTS[0] - 300, POINTS[1])
+
+
+def scarf_on_screen(hand: Rig) -> tuple[float, float]:
+    camera, members = camera_of(hand), bear().gdfs[0].region.members
+    x, y, z = (camera.viewmat[:3, :3] @ bear().scene.means[members].mean(0) + camera.viewmat[:3, 3]).tolist()
+    return float(camera.K[0, 0] * x / z + camera.K[0, 2]), float(camera.K[1, 1] * y / z + camera.K[1, 2])
+
+
+def test_paint_survives_its_text_to_a_255th_and_full_paint_is_no_text() -> None:
+    drawn = torch.rand(300, generator=torch.Generator().manual_seed(0)).numpy()
+    found = paint.decoded(paint.encoded(drawn), 300)
+    assert found is not None
+    assert np.abs(found.numpy() - drawn).max() <= 0.5 / 255 + 1e-6
+    assert paint.encoded(np.ones(300, np.float32)) == paint.FULL
+    assert paint.decoded(paint.FULL, 300) is None
+
+
+@pytest.mark.parametrize("text", ["no base64!", "AAAA", paint.encoded(np.zeros(7, np.float32))])
+def test_damaged_or_foreign_paint_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(ProgdfError, match="paint it anew"):
+        paint.decoded(text, 5)
+
+
+def test_a_brush_is_full_inside_fades_to_its_edge_and_reaches_no_further() -> None:
+    stroke = paint.drawn_to(LINE, 0.0, 0.0, ERASE)
+    assert stroke.reached.tolist() == pytest.approx([1.0, 1.0, 0.0, 0.0, 0.0])
+    hazy = paint.drawn_to(LINE, 0.0, 0.0, replace(ERASE, softness=1.0))
+    assert hazy.reached.tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.0])
+    dense = paint.drawn_to(LINE, 0.0, 0.0, ERASE, density=4.0)
+    assert dense.reached[3] == 1.0, "the radius is in pixels at 1×"
+
+
+def test_a_stroke_does_not_depend_on_how_many_events_it_came_in() -> None:
+    whole = paint.drawn_to(paint.drawn_to(LINE, -20.0, 0.0, ERASE), 25.0, 0.0, ERASE)
+    steps = LINE
+    for x in np.linspace(-20.0, 25.0, 31):
+        steps = paint.drawn_to(steps, float(x), 0.0, ERASE)
+    assert steps.reached == pytest.approx(whole.reached, abs=1e-5)
+
+
+def result(stroke: Stroke, brush: Brush = ERASE, mode: str = "erase") -> np.ndarray:
+    found = paint.decoded(paint.painted(replace(stroke, mode=mode), brush), len(stroke.before))
+    return np.ones(len(stroke.before)) if found is None else found.numpy()
+
+
+def test_erase_and_add_go_to_none_and_to_all_as_far_as_the_brush_touched() -> None:
+    before = np.array([0.0, 1.0, 0.5, 0.25, 0.75], np.float32)
+    stroke = replace(LINE, before=before, reached=np.array([1, 1, 0.5, 0, 0], np.float32))
+    assert result(stroke, mode="erase").tolist() == pytest.approx([0.0, 0.0, 0.25, 0.25, 0.75], abs=0.003)
+    assert result(stroke, mode="add").tolist() == pytest.approx([1.0, 1.0, 0.75, 0.25, 0.75], abs=0.003)
+
+
+def step_under_a_brush(behind: float = 0.0) -> Stroke:
+    """A row of weights 0 | 1 along x under a brush that touches all; `behind`: how much deeper 1 lies."""
+    x = np.arange(-40, 40, dtype=np.float32)
+    places = np.stack([x, np.zeros_like(x), np.where(x < 0, 0.0, behind)], 1).astype(np.float32)
+    return Stroke((x >= 0).astype(np.float32), places, np.ones(80, np.float32))
+
+
+def test_smoothing_is_local_and_makes_a_ramp_of_a_step() -> None:
+    brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
+    smooth = result(step_under_a_brush(), brush, "smooth")
+    assert smooth[:15].max() < 0.01
+    assert smooth[-15:].min() > 0.99, "what is far from the step keeps its weight"
+    assert 0.3 < smooth[39] < smooth[40] < 0.7
+    assert (np.diff(smooth) >= -1 / 255).all()
+    small = result(step_under_a_brush(), replace(brush, radius=5.0), "smooth")
+    assert np.abs(np.diff(small)).max() > 2 * np.abs(np.diff(smooth)).max(), "a small brush smooths narrowly"
+
+
+def test_smoothing_does_not_mix_what_only_looks_near() -> None:
+    brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
+    apart = step_under_a_brush(behind=200.0)
+    assert result(apart, brush, "smooth") == pytest.approx(apart.before, abs=0.003)
+
+
+def test_smoothing_leaves_what_the_brush_has_not_touched_and_keeps_even_weights() -> None:
+    brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
+    step = step_under_a_brush()
+    half = replace(step, reached=(step.places[:, 0] < 10).astype(np.float32))
+    assert (result(half, brush, "smooth")[step.places[:, 0] >= 10] == 1.0).all()
+    even = replace(step, before=np.full(80, 0.6, np.float32))
+    assert result(even, brush, "smooth") == pytest.approx(np.full(80, 0.6), abs=0.003)
+
+
+def test_a_mean_of_neighbours_stays_within_them_and_does_not_depend_on_where_cells_begin() -> None:
+    rng = np.random.default_rng(0)
+    points, values = rng.normal(size=(4000, 3)).astype(np.float32), rng.random(4000).astype(np.float32)
+    means = [near_mean(points + np.float32(shift), values, 0.5) for shift in (0.0, 0.13, 0.31)]
+    for mean in means:
+        assert values.min() <= mean.min() <= mean.max() <= values.max()
+        assert mean.std() < 0.3 * values.std()
+        assert np.abs(mean - means[0]).mean() < 0.05
+    assert len(near_mean(points[:0], values[:0], 0.5)) == 0
+
+
+def test_feathering_softens_painted_edges_more_each_time_and_leaves_full_paint_full(hand: Rig) -> None:
+    hand.key("Shift+X")
+    assert hand.stage.work.view.layers[0].paint == paint.FULL
+    x, y = scarf_on_screen(hand)
+    hand.stage.work = replace(
+        hand.stage.work, view=replace(hand.stage.work.view, brush=replace(ERASE, softness=0.0))
+    )
+    hand.drag((x - 15, y), (x + 15, y))
+    hard = weights(hand)
+    assert set(np.unique(hard)) == {0.0, 1.0}
+    away = []
+    for _ in range(2):
+        hand.key("Shift+X")
+        away.append(np.abs(weights(hand) - hard).sum())
+    assert 0.0 < away[0] < away[1]
+    assert ((weights(hand) > 0.05) & (weights(hand) < 0.95)).sum() > 5
+    assert len(hand.stage.work.past.past) == 3
+    for _ in range(2):
+        hand.key("Ctrl+Z")
+    assert (weights(hand) == hard).all()
+
+
+@pytest.mark.parametrize(
+    ("mode", "modifier", "does"),
+    [
+        ("add", "Ctrl", "erase"),
+        ("erase", "Ctrl", "add"),
+        ("smooth", "Ctrl", "smooth"),
+        ("erase", "", "erase"),
+    ],
+)
+def test_ctrl_paints_the_opposite(mode: str, modifier: str, does: str) -> None:
+    assert paint.mode_while(mode, modifier) == does
+
+
+def test_shift_held_at_the_press_smooths_for_one_stroke(hand: Rig) -> None:
+    x, y = scarf_on_screen(hand)
+    hand.drag((x - 15, y), (x, y))
+    hard = weights(hand)
+    hand.modifier(imgui.Key.mod_shift)
+    hand.drag((x - 15, y), (x, y))
+    hand.modifier(imgui.Key.mod_shift, False)
+    assert weights(hand).min() > hard.min(), "smoothing brings some back"
+    assert hand.stage.work.view.brush.mode == "erase"
+
+
+def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Rig) -> None:
+    gdf, scene = bear().gdfs[0], bear().scene
+    front = paint.begun(paint.FULL, gdf, scene, camera_of(hand), through=False)
+    through = paint.begun(paint.FULL, gdf, scene, camera_of(hand), through=True)
+    assert not np.isnan(through.places).any()
+    hidden = np.isnan(front.places[:, 0])
+    assert 0.2 < hidden.mean() < 0.8, "a scarf goes around the neck"
+    camera = camera_of(hand)
+    depth = (scene.means[gdf.region.members] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2].numpy()
+    assert depth[hidden].mean() > depth[~hidden].mean()
+
+
+def test_a_stroke_on_the_picture_takes_the_edit_away_there_as_one_undo_entry(hand: Rig) -> None:
+    camera, before = hand.stage.work.view.camera, hand.picture()
+    x, y = scarf_on_screen(hand)
+    hand.drag((x - 15, y), (x + 15, y))
+    assert hand.stage.work.view.camera == camera, "the left button paints"
+    assert weights(hand).min() < 0.02
+    assert weights(hand, 1).min() == 1.0, "only the focused layer"
+    assert len(hand.stage.work.past.past) == 1
+    expected = compose(
+        bear().scene,
+        [Layer(bear().gdfs[0], 1.0, weights=torch.from_numpy(weights(hand))), Layer(bear().gdfs[1], 1.0)],
+    )
+    assert torch.allclose(hand.stage.engine.gaussians(hand.stage.work.view).sh0, expected.sh0, atol=1e-6)
+    assert np.abs(hand.picture().astype(int) - before).max() > 20
+    hand.key("Ctrl+Z")
+    assert hand.stage.work.view.layers[0].paint == paint.FULL
+
+
+def test_locked_hidden_or_no_layers_are_not_painted_and_the_window_says_why(hand: Rig) -> None:
+    x, y = scarf_on_screen(hand)
+    for chord, told in (("L", "locked"), ("H", "hidden"), ("Escape", "focused")):
+        hand.key(chord)
+        hand.drag((x, y), (x + 5, y))
+        assert weights(hand).min() == 1.0
+        assert hand.stage.work.message is not None
+        assert told in hand.stage.work.message.text
+        hand.key(chord)
+        hand.frame(30)
+
+
+def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
+    hand.key("B")
+    assert not hand.stage.work.view.brush.active
+    for chord in ("B", "X", "Shift+B", "]", "Shift+["):
+        hand.key(chord)
+    assert hand.stage.work.view.brush == Brush(True, 25.0, 0.4, "smooth", True)
+    for _ in range(40):
+        hand.key("]")
+    assert hand.stage.work.view.brush.radius == paint.LARGEST_PX
+    hand.key("Backspace")
+    assert weights(hand).max() == 0.0
+    hand.key("Shift+Backspace")
+    assert hand.stage.work.view.layers[0].paint == paint.FULL
+    assert hand.stage.work.past.past[0].edit.layers[0].paint == paint.FULL
+
+
+def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) -> None:
+    gdf = bear().gdfs[0]
+    of_scene = np.linspace(0, 1, len(bear().scene), dtype=np.float32)
+    of_region = of_scene[gdf.region.members.numpy()]
+    for name, array in (("scene", of_scene), ("region", of_region)):
+        np.save(tmp_path / f"{name}.npy", array)
+    layers = [
+        stack_of(bear().gdfs, [], paint=[f"scarf={tmp_path / name}.npy"])[0] for name in ("scene", "region")
+    ]
+    assert layers[0] == layers[1]
+    assert layers[0].paint == paint.encoded(of_region)
+    np.save(tmp_path / "long.npy", np.zeros(3))
+    np.save(tmp_path / "large.npy", of_region + 1.0)
+    for text, told in (
+        ("scarf", "NAME=WEIGHTS.npy"),
+        (f"hat={tmp_path / 'scene.npy'}", "no edit of that name"),
+        (f"scarf={tmp_path / 'none.npy'}", "none.npy does not exist"),
+        (f"scarf={tmp_path / 'long.npy'}", "would be right"),
+        (f"scarf={tmp_path / 'large.npy'}", "outside 0 to 1"),
+    ):
+        with pytest.raises(ProgdfError, match=told):
+            stack_of(bear().gdfs, [], paint=[text])
+
+
+def test_a_hostile_header_of_weights_is_one_line(tmp_path: Path) -> None:
+    npy(tmp_path / "deep.npy", NPY_HEADERS["a deep literal"])
+    with pytest.raises(ProgdfError, match=r"--paint: .* is not a readable \.npy file of weights"):
+        stack_of(bear().gdfs, [], paint=[f"scarf={tmp_path / 'deep.npy'}"])

@@ -1,0 +1,84 @@
+"""Snapshots: taken, gone back to, forgotten."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.ui_rig import bear, first_view, rig
+from viewer.app import app as application
+from viewer.state import snapshots, workspace
+
+
+def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
+    work = workspace.opened(first_view(bear(), 0.5, 0.5))
+    facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
+
+    def act(work: workspace.Workspace, action: str) -> workspace.Workspace:
+        return workspace.settled(workspace.perform(work, action, facts))
+
+    work = act(work, "snapshot")
+    assert act(work, "snapshot").snapshots == work.snapshots, "the same twice is once"
+    work = act(work, "nudge:0.25")
+    work = act(work, "snapshot")
+    assert [s.name for s in snapshots.shown(work.snapshots, work.view)] == ["original", "1", "2"]
+    entries = len(work.past.past)
+    back = act(work, "restore:1")
+    assert [layer.strength for layer in back.view.layers] == [0.5, 0.5]
+    assert back.view.blend == work.view.blend
+    assert len(back.past.past) == entries + 1
+    assert act(back, "undo").view == work.view
+    assert [layer.strength for layer in act(work, "restore:0").view.layers] == [0.0, 0.0]
+    deleted = act(work, "forget:1")
+    assert [s.name for s in deleted.snapshots] == ["2"]
+    assert act(deleted, "undo").snapshots == work.snapshots
+    assert act(act(deleted, "undo"), "redo").snapshots == deleted.snapshots
+    named = act(work, "name_snapshot:2: warm  light ")
+    assert [s.name for s in named.snapshots] == ["1", "warm light"]
+    assert act(named, "undo").snapshots == work.snapshots
+
+
+def test_going_back_keeps_edits_that_were_opened_since_at_zero() -> None:
+    view = first_view(bear(), 0.5, 0.5)
+    kept = snapshots.taken((), replace(view, layers=view.layers[:1]))
+    back = snapshots.back_to(view, kept[0])
+    assert [(layer.name, layer.strength) for layer in back.layers] == [("scarf", 0.5), ("ears", 0.0)]
+
+
+@pytest.mark.gl
+def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_deletes_it() -> None:
+    with rig(first_view(bear(), 0.5, 0.5), (1024, 640)) as hand:
+        first = hand.picture()
+        for chord in ("F3", "Shift+Left", "Shift+Left", "F3"):
+            hand.key(chord)
+        hand.wheel(900.0, 400.0, -100.0)
+        hand.rest()
+        assert hand.stage.patience() is None, "the small pictures are there"
+        entries, drawn = len(hand.stage.work.past.past), hand.image()[515:565, 745:1005]
+        assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
+        hand.move(874.0, 540.0)
+        hand.press()
+        hand.release()
+        assert hand.strengths == [0.5, 0.5]
+        assert np.array_equal(hand.picture(), first)
+        assert len(hand.stage.work.past.past) == entries + 1
+        hand.press(1)
+        hand.release(1)
+        assert [kept.name for kept in hand.stage.work.snapshots] == ["1", "2"], "only a menu opens"
+        hand.click(874.0 + 30.0, 540.0 + 18.0 + 21.0)
+        assert [kept.name for kept in hand.stage.work.snapshots] == ["2"]
+        hand.key("Ctrl+Z")
+        assert [kept.name for kept in hand.stage.work.snapshots] == ["1", "2"]
+        hand.move(874.0, 540.0)
+        hand.press(1)
+        hand.release(1)
+        hand.click(874.0 + 30.0, 540.0 + 18.0)
+        hand.frame(2)
+        hand.io.add_input_characters_utf8("dusk")
+        hand.settle()
+        hand.modifier(imgui.Key.enter)
+        hand.settle()
+        assert [kept.name for kept in hand.stage.work.snapshots] == ["dusk", "2"]

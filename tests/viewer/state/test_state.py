@@ -1,0 +1,87 @@
+"""The saved state of a run: restored at any step to the same bits, and written not too often."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.errors import ProgdfError
+from tests.helpers.trained import course, small
+from trainer.optimize.optimizer_state import PgsState
+from trainer.optimize.pgs import optimise
+from trainer.store.state import Autosave, Saved, StateFolder
+
+
+def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) -> None:
+    case = small("body")
+    wanted = course(case, steps=6)
+    straight, original = list(optimise(*wanted)), wanted[0]
+    folder = StateFolder(tmp_path / "state")
+    folder.begin({})
+
+    class Stop(Exception):  # noqa: N818
+        pass
+
+    state, made = PgsState(original), []
+    for _ in range(20):  # stopped after every step, every time restored into another state
+
+        def on_step(step: int, left: float) -> None:
+            raise Stop
+
+        try:
+            made.extend(snapshot for snapshot in optimise(*wanted, on_step, state))
+            break
+        except Stop:
+            saved = state.saved()
+            folder.save("pgs", saved.tensors, saved.values)
+            state = PgsState(original, seed=5)
+            restored = folder.load("pgs")
+            assert restored is not None
+            state.restore(restored)
+    assert len(made) == len(straight)
+    for one, other in zip(made, straight, strict=True):
+        assert torch.equal(one.offsets, other.offsets)
+        assert (one.step, one.stage, one.ends_stage, one.means) == (
+            other.step,
+            other.stage,
+            other.ends_stage,
+            other.means,
+        )
+
+
+def test_saving_waits_until_it_is_a_hundredth_of_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("trainer.store.state.time.perf_counter", lambda: now)
+    folder = StateFolder(tmp_path / "state")
+    folder.begin({})
+
+    class Slow:
+        def saved(self) -> Saved:
+            nonlocal now
+            now += 0.5  # seconds that a save takes
+            return Saved({}, {})
+
+        def restore(self, saved: Saved) -> None: ...
+
+    kept = Autosave(folder, "training", {"slow": Slow()}, every_s=10.0)
+    for _ in range(4000):
+        now += 0.1
+        kept.step_done()
+    assert 0.5 * 0.01 < kept.seconds / now < 1.01 * 0.01
+
+
+def test_a_state_folder_that_is_a_link_is_refused_and_nothing_behind_it_is_touched(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    (own / "run.json").parent.mkdir()
+    (own / "run.json").write_text("mine")
+    (own / "pictures").mkdir()
+    folder = StateFolder(tmp_path / "state")
+    folder.path.symlink_to(own)
+    with pytest.raises(ProgdfError, match="is a link"):
+        folder.begin({})
+    folder.end()
+    assert sorted(path.name for path in own.iterdir()) == ["pictures", "run.json"]

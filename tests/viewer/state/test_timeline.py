@@ -1,0 +1,353 @@
+"""Keys and playhead: what lies between keys, what each key press does to them, files that bring them back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from progdf.cli.info import kind_of
+from progdf.errors import ProgdfError
+from viewer.camera import controls
+from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, to_camera
+from viewer.files import timeline_file
+from viewer.state import history, playback, timeline, tween, workspace
+from viewer.state.layer_facts import LayerRow
+from viewer.state.playback import Player
+from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
+from viewer.state.workspace import SceneFacts, Workspace
+
+LAYERS = (LayerState(0, "scarf", 0.2), LayerState(1, "ears", 0.4))
+FACTS = SceneFacts("bear.ply", 3, Bounds(), (LayerRow(3, (0.5,) * 3, (), "", Bounds()),) * 2)
+
+
+def view(scarf: float = 0.2, ears: float = 0.4, **camera: object) -> ViewState:
+    layers = (replace(LAYERS[0], strength=scarf), replace(LAYERS[1], strength=ears))
+    return ViewState(camera=replace(ViewCamera(), **camera), layers=layers)
+
+
+def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
+    made = timeline.with_key(Timeline(length=length), 0, view(0.0, 1.0, azimuth=170.0, distance=1.0))
+    made = timeline.with_key(made, length, view(1.0, 0.5, azimuth=-170.0, distance=100.0))
+    return timeline.eased(made, 0, easing)
+
+
+def act(work: Workspace, *actions: str) -> Workspace:
+    for action in actions:
+        work = workspace.settled(workspace.perform(work, action, FACTS))
+    return work
+
+
+tracks = st.lists(
+    st.tuples(st.integers(0, 200), st.sampled_from(tween.EASINGS), st.floats(0, 1)),
+    min_size=1,
+    max_size=6,
+    unique_by=lambda point: point[0],
+).map(sorted)
+
+
+@given(tracks, st.floats(-10, 210))
+def test_between_two_keys_a_value_never_leaves_their_range(points: list[tween.Point], frame: float) -> None:
+    found = tween.value(points, frame)
+    before = [p for p in points if p[0] <= frame] or points[:1]
+    after = [p for p in points if p[0] >= frame] or points[-1:]
+    low, high = sorted((before[-1][2], after[0][2]))
+    assert low <= found <= high
+
+
+@given(tracks)
+def test_at_a_key_a_value_is_exactly_the_keys(points: list[tween.Point]) -> None:
+    assert [tween.value(points, point[0]) for point in points] == [point[2] for point in points]
+
+
+def test_smooth_leaves_and_comes_gently_and_passes_through_without_a_halt() -> None:
+    points = [(0, "smooth", 0.0), (10, "smooth", 0.5), (20, "smooth", 1.0)]
+    steps = [tween.value(points, f + 1) - tween.value(points, f) for f in range(20)]
+    assert steps[0] < 0.5 * steps[9]
+    assert steps[-1] < 0.5 * steps[10]
+    assert steps[9] == pytest.approx(steps[10])
+    assert min(steps[5:15]) > 0.04
+
+
+def test_smooth_rests_where_the_way_turns_back() -> None:
+    points = [(0, "smooth", 0.0), (10, "smooth", 1.0), (20, "smooth", 0.0)]
+    assert 1.0 - tween.value(points, 9.9) < 1e-3
+    assert 1.0 - tween.value(points, 10.1) < 1e-3
+
+
+def test_linear_is_even_and_hold_jumps_at_the_next_key() -> None:
+    assert tween.value([(0, "linear", 0.0), (10, "smooth", 1.0)], 3) == pytest.approx(0.3)
+    held = [(0, "hold", 0.0), (10, "smooth", 1.0)]
+    assert (tween.value(held, 9), tween.value(held, 10)) == (0.0, 1.0)
+
+
+def test_the_camera_turns_the_shortest_way_and_its_distance_grows_in_proportion() -> None:
+    middle = timeline.camera_at(two_keys(), 10)
+    assert middle is not None
+    assert abs(middle.azimuth) == pytest.approx(180.0)
+    assert middle.distance == pytest.approx(10.0)
+
+
+def test_turning_on_over_several_keys_goes_more_than_once_around() -> None:
+    assert tween.unwound([0.0, 170.0, -20.0, 150.0, 0.0]) == [0.0, 170.0, 340.0, 510.0, 360.0]
+
+
+ups = st.sampled_from([(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0.8, 0.0)])
+
+
+@given(ups, ups, st.floats(-180, 180), st.floats(-90, 90), st.integers(0, 20))
+@settings(deadline=None)
+def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
+    here: tuple[float, float, float],
+    there: tuple[float, float, float],
+    azimuth: float,
+    elevation: float,
+    frame: int,
+) -> None:
+    assume(here != there)  # else it stays level instead, and may bow
+    cameras = (
+        ViewCamera(up=here, azimuth=20.0, elevation=10.0),
+        ViewCamera(up=there, azimuth=azimuth, elevation=elevation),
+    )
+    found = tween.camera([(0, "linear", cameras[0]), (20, "linear", cameras[1])], frame)
+    picture, ends = axes(found), [axes(camera) for camera in cameras]
+    assert bool(to_camera(found, 64, 48).viewmat.isfinite().all())
+    assert math.dist(cross(picture.right, picture.up), picture.back) < 1e-6
+
+    def angle(a: object, b: object) -> float:
+        trace = sum(dot(getattr(a, n), getattr(b, n)) for n in ("right", "up", "back"))
+        return math.acos(max(-1.0, min(1.0, (trace - 1.0) / 2.0)))
+
+    whole = angle(ends[0], ends[1])
+    assert angle(ends[0], picture) + angle(picture, ends[1]) <= whole + 1e-2
+    if frame in (0, 20):
+        assert found == cameras[frame // 20]
+
+
+def test_before_the_first_key_and_after_the_last_everything_rests() -> None:
+    made = timeline.resized(timeline.moved_key(two_keys(), 0, 5), 40)
+    assert timeline.shown_at(made, 0, view()).layers == timeline.shown_at(made, 5, view()).layers
+    assert timeline.shown_at(made, 40, view()).camera == timeline.shown_at(made, 20, view()).camera
+
+
+def test_an_edit_opened_after_the_keys_is_left_alone_and_one_that_is_gone_is_no_trouble() -> None:
+    third = LayerState(2, "frost", 0.7)
+    shown = timeline.shown_at(two_keys(), 20, replace(view(), layers=(LAYERS[1], third)))
+    assert [layer.strength for layer in shown.layers] == [0.5, 0.7]
+
+
+def test_keys_stay_in_order_and_none_stands_on_another_or_off_the_timeline() -> None:
+    made = timeline.with_key(two_keys(), 7, view())
+    assert [key.frame for key in made.keys] == [0, 7, 20]
+    assert timeline.moved_key(made, 7, 20) == made
+    assert timeline.moved_key(made, 7, 21) == made
+    assert timeline.moved_key(made, 7, -1) == made
+    assert [key.frame for key in timeline.moved_key(made, 0, 12).keys] == [7, 12, 20]
+    assert [key.frame for key in timeline.without_key(made, 7).keys] == [0, 20]
+
+
+def test_a_timeline_is_never_shorter_than_its_last_key() -> None:
+    assert timeline.resized(two_keys(), 3).length == 20
+    assert timeline.resized(Timeline(), -5).length == 1
+    assert timeline.with_fps(Timeline(), 0).fps == 1
+
+
+def test_a_key_set_again_takes_the_new_state_and_keeps_its_easing() -> None:
+    again = timeline.with_key(two_keys("hold"), 0, view(0.6))
+    assert again.keys[0].strengths == ((0, 0.6), (1, 0.4))
+    assert again.keys[0].easing == "hold"
+
+
+def test_a_film_goes_there_once_or_there_and_back_without_doubling_its_ends() -> None:
+    there = Timeline(length=3)
+    assert list(timeline.film_frames(there)) == [0, 1, 2, 3]
+    assert list(timeline.film_frames(replace(there, ping_pong=True))) == [0, 1, 2, 3, 2, 1]
+
+
+@pytest.mark.parametrize("ping_pong", [False, True])
+def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bool) -> None:
+    made = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
+    player, seen = Player(playing=True), [0]
+    for _ in range(11):
+        player = playback.advanced(player, made, 0.1 + 1e-9)
+        seen.append(player.frame)
+    assert seen == (list(timeline.film_frames(made)) * 3)[:12]
+
+
+def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
+    made = replace(two_keys(length=20), fps=10)
+    fast, slow = Player(playing=True), Player(playing=True)
+    for _ in range(47):
+        fast = playback.advanced(fast, made, 0.0155)
+    slow = playback.advanced(slow, made, 47 * 0.0155)
+    assert fast.frame == slow.frame == 7
+
+
+def test_a_key_is_set_at_the_playhead_with_camera_and_strengths_and_can_be_undone() -> None:
+    work = act(workspace.opened(view(0.3, azimuth=33.0)), "seek:12", "key")
+    assert work.view.timeline.keys == (Keyframe(12, ((0, 0.3), (1, 0.4)), work.view.camera),)
+    assert work.player.shown
+    undone = act(work, "undo")
+    assert undone.view.timeline.keys == ()
+    assert act(undone, "redo").view.timeline == work.view.timeline
+
+
+def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo() -> None:
+    work = workspace.opened(replace(view(0.0, 1.0), timeline=two_keys()))
+    entries = len(work.past.past)
+    for action, scarf in (("seek:20", 1.0), ("step:-20", 0.0), ("jump:1", 1.0), ("seek:10", 0.5)):
+        work = act(work, action)
+        assert work.view.layers[0].strength == pytest.approx(scarf)
+    assert work.view.camera.distance == pytest.approx(10.0)
+    assert len(work.past.past) == entries
+    edited = act(replace(work, focus=1), "nudge:0.1")
+    assert [round(layer.strength, 3) for layer in act(edited, "undo").view.layers] == [0.5, 0.75]
+
+
+@pytest.mark.parametrize("leaves", [["seek:11", "seek:12", "seek:13"], ["step:1"], ["jump:1"], ["play"]])
+def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves: list[str]) -> None:
+    work = workspace.opened(replace(view(0.0, 1.0), timeline=two_keys()))
+    work = act(work, "seek:10", "focus:2", "nudge:0.3")
+    entries = len(work.past.past)
+    left = work
+    for action in leaves:  # of one drag: nothing is settled in between
+        left = workspace.perform(left, action, FACTS)
+    left = workspace.settled(workspace.played(left, 0.1))
+    assert left.view.layers != work.view.layers
+    assert len(left.past.past) == entries + 1, "one drag is one entry"
+    assert act(left, "undo").view.layers == work.view.layers
+
+
+def test_one_key_leaves_strengths_and_camera_to_the_hand() -> None:
+    work = act(workspace.opened(view(0.3)), "key", "focus:2", "nudge:0.5")
+    there = act(work, "seek:30", "seek:0")
+    assert there.view == work.view
+    only = timeline.shown_at(work.view.timeline, 0, work.view)
+    assert only.layers[0].strength == 0.3, "in a film a single key still counts"
+
+
+def test_a_gesture_under_way_is_still_one_entry_when_the_film_plays_on() -> None:
+    made = Timeline(
+        (Keyframe(0, ((0, 0.0),)), Keyframe(20, ((0, 1.0),))),
+        length=20,
+    )
+    work = act(workspace.opened(replace(view(), timeline=made)), "play")
+    for strength in (0.5, 0.6, 0.7):  # a hand on the other slider
+        layers = (work.view.layers[0], replace(work.view.layers[1], strength=strength))
+        work = workspace.played(replace(work, view=replace(work.view, layers=layers)), 0.1)
+    work = workspace.settled(work)
+    assert work.view.layers[0].strength > 0.1
+    assert len(work.past.past) == 1
+    assert act(work, "undo").view.layers[1].strength == 0.4
+
+
+def test_a_moved_key_takes_the_playhead_along_and_the_picture_stays() -> None:
+    work = act(workspace.opened(replace(view(), timeline=two_keys())), "seek:20", "length:40")
+    moved = act(work, "move_key:20>31")
+    assert moved.player.frame == 31
+    assert (moved.view.layers, moved.view.camera) == (work.view.layers, work.view.camera)
+
+
+def test_easing_goes_round_for_the_key_before_the_playhead() -> None:
+    work = act(workspace.opened(replace(view(), timeline=two_keys())), "seek:5")
+    found = []
+    for _ in range(3):
+        work = act(work, "easing")
+        found.append(work.view.timeline.keys[0].easing)
+    assert found == ["linear", "hold", "smooth"]
+    assert work.view.timeline.keys[1].easing == "smooth"
+
+
+def test_one_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
+    work = act(workspace.opened(view()), "key", "play")
+    assert not work.player.playing
+    work = act(workspace.opened(replace(view(), timeline=two_keys())), "play")
+    assert playback.patience(work.player, work.view.timeline) == pytest.approx(1 / 24)
+    hidden = act(work, "timeline")
+    assert not hidden.player.playing
+    assert playback.patience(hidden.player, hidden.view.timeline) is None
+
+
+def test_undo_of_a_longer_timeline_leaves_a_playhead_that_still_works() -> None:
+    work = act(workspace.opened(replace(view(), timeline=two_keys())), "length:90", "seek:80", "undo", "undo")
+    assert work.view.timeline.length == 20
+    assert act(work, "step:1").player.frame == 20
+
+
+def test_history_restores_the_timeline_with_the_rest() -> None:
+    past = history.record(history.begin(view()), replace(view(), timeline=two_keys()))
+    assert history.undo(past).present.edit.timeline == Timeline()
+
+
+def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
+    named = {key.action.partition(":")[0] for key in controls.KEYS}
+    assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
+    assert set(playback.ACTIONS) <= set(workspace.ACTIONS)
+
+
+def test_a_timeline_in_a_file_comes_back_whole_under_its_edits_names(tmp_path: Path) -> None:
+    made = replace(two_keys("hold"), ping_pong=True, fps=30)
+    timeline_file.save(tmp_path / "film.json", made, LAYERS)
+    assert timeline_file.load(tmp_path / "film.json", LAYERS) == made
+    swapped = (replace(LAYERS[0], gdf=1), replace(LAYERS[1], gdf=0))
+    other = timeline_file.load(tmp_path / "film.json", swapped)
+    assert dict(other.keys[1].strengths) == {1: 1.0, 0: 0.5}
+    assert next(iter(json.loads((tmp_path / "film.json").read_text()))) == "progdf_timeline"
+    assert kind_of(tmp_path / "film.json") == "timeline"
+
+
+def test_a_file_written_by_hand_needs_only_frames_and_strengths(tmp_path: Path) -> None:
+    path = tmp_path / "film.json"
+    keys = [{"frame": 10, "strengths": {"scarf": 1}}, {"frame": 0, "strengths": {"scarf": 0}}]
+    path.write_text(json.dumps({"progdf_timeline": 1, "length": 10, "keys": keys}))
+    found = timeline_file.load(path, LAYERS)
+    assert [key.frame for key in found.keys] == [0, 10]
+    assert timeline.camera_at(found, 5) is None
+    assert timeline.strengths_at(found, 5) == {0: pytest.approx(0.5)}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"progdf_timeline": 2}, "version 2"),
+        ({"keys": [{"frame": 0, "strengths": {"hat": 1.0}}]}, "'hat', which is not open"),
+        ({"keys": [{"frame": 0, "strengths": {"ears": 7.0}}]}, "outside 0 to 1.2"),
+        ({"keys": [{"frame": 99}]}, "outside 0 to the length"),
+        ({"keys": [{"frame": 1}, {"frame": 1}]}, "two keys at one frame"),
+        ({"keys": [{"frame": 0, "easing": "bouncy"}]}, "'bouncy'"),
+        ({"keys": [{"frame": 0, "camera": {"distance": 0.0}}]}, "above 0"),
+        ({"keys": [{"frame": 0, "camera": {"elevation": 91.0}}]}, "-90 to 90"),
+        ({"keys": [{"frame": 0, "camera": {"up": [0, 0, 0]}}]}, "up axis"),
+        ({"keys": [{"frame": 0.5}]}, "frame"),
+        ({"fps": 0}, "fps 0"),
+        ({"music": "loud"}, "music is unknown"),
+    ],
+)
+def test_a_mistake_in_a_file_is_one_line_that_names_it(
+    change: dict[str, object], told: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "film.json"
+    path.write_text(json.dumps({"progdf_timeline": 1, **change}))
+    with pytest.raises(ProgdfError) as raised:
+        timeline_file.load(path, LAYERS)
+    assert told in str(raised.value)
+    assert "film.json" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', "[" * 100_000, "\x00\xff"])
+def test_what_is_no_timeline_is_refused_in_one_line(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "film.json"
+    path.write_text(content)
+    with pytest.raises(ProgdfError, match="is not a timeline"):
+        timeline_file.load(path, LAYERS)
+
+
+def test_a_file_that_is_missing_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="does not exist"):
+        timeline_file.load(tmp_path / "none.json", LAYERS)

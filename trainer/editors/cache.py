@@ -1,0 +1,97 @@
+"""Painted pictures kept on disk, so that a run that comes again, or goes on, paints nothing twice.
+
+RUN/views/painted/VIEW.png              what a learned editor made of the whole view
+RUN/views/painted/VIEW.json             from what: the view's picture, the editor, all its options
+RUN/views/painted/0.25/VIEW.png         at another strength, where the editor has a dial
+RUN/views/painted/step_00200/VIEW.png   of the render at a training step (--reedit-every)
+
+A picture is taken again while its note fits. So one that was touched up by hand stays as it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import written_whole
+from progdf.io.images import to_picture, write_image
+from progdf.io.json_values import decode_json
+from trainer.store.images import read_picture
+from trainer.store.picture_list import add_pictures
+
+Recipe = Mapping[str, str | int | float | None]
+"""All that a painted picture depends on besides the picture that it is painted from."""
+
+
+@dataclass(frozen=True)
+class KeptPictures:
+    """Pictures in a folder; with no folder nothing is kept."""
+
+    folder: Path | None
+
+    def picture(
+        self,
+        name: str,
+        source: Tensor | None,
+        recipe: Recipe,
+        paint: Callable[[Tensor], Tensor],
+        place: str = "",
+    ) -> Tensor:
+        """What `paint` makes of `source`, in 8 bits: read where the note fits, else painted and kept.
+
+        Args:
+            name: of the view, a file name
+            source: the picture that is painted from; None takes the kept one as it is. [H,W,3]
+            recipe: see `Recipe`
+            paint: [H,W,3] -> [H,W,3]
+            place: subfolder
+
+        Raises:
+            ProgdfError: nothing is kept where `source` is None.
+        """
+        path = self.folder / place / f"{name}.png" if self.folder is not None else None
+        if source is None:
+            if path is None or not path.is_file():
+                raise ProgdfError(f"the painted picture {path} is gone; train again without --resume")
+            return read_picture(path)
+        if path is None:
+            return _eight_bits(paint(source))
+        note = path.with_suffix(".json")
+        wanted = {"source": digest(source), "editor": dict(recipe)}
+        if _note(note) == wanted:
+            try:
+                return read_picture(path, size=(source.shape[1], source.shape[0]))
+            except ProgdfError:
+                pass  # it was deleted or broken: painted anew
+        painted = paint(source)
+        note.unlink(missing_ok=True)  # a new picture never lies beside an old note
+        write_image(path, painted)
+        with written_whole(note) as beside:
+            beside.write_text(json.dumps(wanted, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        assert self.folder is not None
+        add_pictures(self.folder, [path, note])
+        return _eight_bits(painted)
+
+
+def digest(image: Tensor) -> str:
+    """SHA-256 of a picture as an 8-bit file holds it. [H,W,3]"""
+    pixels = np.asarray(to_picture(image))
+    return hashlib.sha256(repr(pixels.shape).encode() + pixels.tobytes()).hexdigest()
+
+
+def _eight_bits(image: Tensor) -> Tensor:
+    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
+
+
+def _note(path: Path) -> object:
+    try:
+        return decode_json(path.read_bytes())
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,1 @@
+"""From a recorded trajectory to the field that is shipped."""

@@ -1,0 +1,120 @@
+"""What is measured of an edit, on views that training has not seen and on the region's own pixels.
+
+A whole picture of which the region is 3 % would flatter every figure; so errors are taken over the pixels
+that show the region or that the edit changes (method.md 7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians, pack
+from progdf.metrics.image import ssim
+from progdf.region import Region
+from trainer.optimize.losses import Perceptual
+from trainer.views.crops import CropScene, crop_scene, moving_attributes, render_all
+from trainer.views.view import View, crop
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Held-out views, ready to be compared.
+
+    Args:
+        original: raw member rows, packed. [M,C]
+        crops: the views' boxes with the scene around the region
+        pixels: which pixels count. [h,w] bool each
+        edited: strength → the editor's pictures of the boxes
+        names: the views' names
+        looked: called at every look at all views, for a progress bar
+    """
+
+    original: Tensor
+    crops: Sequence[CropScene]
+    pixels: Sequence[Tensor]
+    edited: Mapping[float, Sequence[Tensor]]
+    names: Sequence[str]
+    looked: Callable[[], None] | None = None
+
+    def pictures(self, offsets: Tensor) -> list[Tensor]:
+        """Every view with these offsets. [M,C] -> [h,w,3] each"""
+        if not len(offsets):  # a field that moves nothing does not know how many members it has
+            offsets = torch.zeros_like(self.original)
+        if self.looked is not None:
+            self.looked()
+        rows = self.original[:, : offsets.shape[1]] + offsets
+        return render_all(self.crops, rows, moving_attributes(offsets))
+
+    def picture(self, offsets: Tensor, view: int) -> Tensor:
+        """One view with these offsets. [M,C] -> [h,w,3]"""
+        return replace(self, crops=[self.crops[view]]).pictures(offsets)[0]
+
+    def psnr(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+        """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""
+        error = count = 0.0
+        for a, b, pixels in zip(found, expected, self.pixels, strict=True):
+            error += float((a[pixels] - b[pixels]).double().square().sum())
+            count += 3 * int(pixels.sum())
+        return 99.0 if error <= 0 else min(99.0, -10 * math.log10(error / max(count, 1)))
+
+    def ssim(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+        """SSIM over the pixels that count, all views together, at most 1."""
+        total = count = 0.0
+        for a, b, pixels in zip(found, expected, self.pixels, strict=True):
+            if here := int(pixels.sum()):
+                total += here * float(ssim(a, b, pixels))
+                count += here
+        return total / count if count else 1.0
+
+    def perceptual(
+        self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual, key: Hashable = None
+    ) -> float:
+        """Mean perceptual distance of the boxes. `key`: of the expected pictures, see `Perceptual`"""
+        keys = [None if key is None else (key, i) for i in range(len(expected))]
+        with torch.no_grad():
+            values = [float(measure(a, b, k)) for a, b, k in zip(found, expected, keys, strict=True)]
+        return sum(values) / max(1, len(values))
+
+    def counted(self, offsets: Tensor) -> Tensor:
+        """The pixels that count, of all views, with these offsets. [M,C] -> [P,3]"""
+        pictures = self.pictures(offsets)
+        return torch.cat([picture[pixels] for picture, pixels in zip(pictures, self.pixels, strict=True)])
+
+
+def make_judge(
+    scene: Gaussians,
+    region: Region,
+    views: Sequence[View],
+    edited: Mapping[float, Sequence[Tensor]],
+    background: Tensor,
+    channels: int,
+    still: bool = False,
+) -> Judge:
+    """Prepare held-out views.
+
+    Args:
+        scene: the original
+        region: what is edited
+        views: held-out views
+        edited: strength → the editor's whole pictures of these views. [H,W,3]
+        background: rgb. [3]
+        channels: width of a packed row
+        still: nothing but colours will move, see `crop_scene`
+    """
+    if edited:
+        views = [v.widened([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]
+    crops = [crop_scene(scene, region.members, v.camera, v.box, background, still) for v in views]
+    pixels = []
+    for i, view in enumerate(views):
+        counts = view.mask > 0.05
+        for pictures in edited.values():
+            counts = counts | ((pictures[i] - view.image).abs().amax(dim=2) > 2 / 255)
+        pixels.append(crop(counts, view.box))
+    boxes = {s: [crop(p, v.box) for p, v in zip(ps, views, strict=True)] for s, ps in edited.items()}
+    original = pack(scene[region.members], with_shN=channels > 14)
+    return Judge(original, crops, pixels, boxes, [view.camera.name for view in views])

@@ -1,0 +1,158 @@
+"""Equal steps of a slider that look equally large: of an editor's own pictures, and of a fitted field.
+
+The editor first: an edit that turns a hue shows little at some strengths and much at others. Asked at even
+strengths, its pictures are pins between which a slider has to creep and to leap; asked at strengths that are
+evenly visible, every stage is as far from the last as the others, and s = .5 is half of what there is to see.
+The field last: it is not its recording, whose small detours it leaves out, and these are not spread evenly
+over the slider. The robot recoloured and the bear's scarf repainted, held-out views, smallest over largest of
+20 equal steps, and PSNR to the editor's own pictures at a quarter, half and three quarters:
+
+                                     robot                        scarf
+    editor's own strengths, pinned   .29   33.1 28.8 32.0 dB      .50   42.0 43.3 42.1 dB
+    evenly visible, pinned           .65   32.7 29.3 32.1         .85   42.9 45.3 42.2
+    evenly visible, not pinned       .73   32.7 29.3 32.1         .84   42.9 45.3 42.2
+    and the field even               .92   the same               .92   the same
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from itertools import accumulate, pairwise
+
+import torch
+from torch import Tensor
+
+from progdf.field import BakedField
+from progdf.field.remap import Dial, dialled, interpolated, same
+from progdf.gaussians import BASE_CHANNELS, pack
+from trainer.editors import COSTLY_DIAL, check_editor
+from trainer.editors.base import ImageEditor
+from trainer.optimize.retime import blended
+from trainer.setup.training_setup import Stand, probes
+from trainer.store.progress import RunLog
+from trainer.views.crops import GEOMETRY, render_all
+from trainer.views.view import View
+
+STEPS = 20
+"""Equal steps that a hand makes over the whole slider."""
+
+_ASKED_VIEWS, _FIELD_VIEWS = 3, 6
+_FINE = 2  # a step may begin at so many places per step
+_PASSES = 3
+_LOOKS = 2  # how often all places are looked at
+_JUMP = 0.7  # of the change in one step of an editor's dial: no strength between can be relied on
+
+
+def even_strengths(
+    editor: ImageEditor, spec: str, views: Sequence[View], plain: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
+
+    Three decimals each, as they name folders. `plain` itself where the editor has strengths of its own, where
+    each picture costs a model's work, or where the whole change is one jump.
+
+    Args:
+        editor: see `ImageEditor`
+        spec: what it was made of, `KIND:WHAT`
+        views: of which a few are looked at
+        plain: shares of the visible change, ascending, the last 1
+    """
+    if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_DIAL:
+        return plain
+    few = views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
+
+    def seen(s: float) -> Tensor:
+        return torch.cat([editor.edit(view, s).flatten() for view in few])
+
+    even = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
+    pictures = [seen(float(s)) for s in even]
+    steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
+    if max(steps) > _JUMP * sum(steps):
+        return plain
+    _, due = _spread(even, pictures, 1)
+    asked = interpolated(torch.tensor(plain, dtype=torch.float64), even, due)
+    found = (*(round(float(s), 3) for s in asked[:-1]), 1.0)
+    rises = all(b - a > 5e-4 for a, b in zip((0.0, *found), found, strict=False))
+    return found if rises else plain
+
+
+def evened(field: BakedField, stand: Stand, log: RunLog | None = None) -> tuple[BakedField, Dial]:
+    """The field with a slider whose equal steps look equally large in training views, and where it all went.
+
+    A network keeps its slider.
+    """
+    if field.origin is not None or not field.attributes:
+        return field, same()
+    moving = list(field.attributes)
+    small = probes(stand, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
+    rows = pack(stand.scene[stand.region.members], with_shN=field.channels > BASE_CHANNELS)
+    done = 0
+
+    def seen(s: float) -> Tensor:
+        nonlocal done
+        done += 1
+        advance(done, "strengths")
+        return torch.cat([p.flatten() for p in render_all(small, rows + field.offsets(s), moving)])
+
+    with (
+        nullcontext(_silent)
+        if log is None
+        else log.steps("even the slider", _LOOKS * (STEPS * _FINE + 1)) as advance
+    ):
+        dial = even_dial(seen)
+    return dialled(field, dial), dial
+
+
+def _silent(done: int, word: str) -> None:
+    pass
+
+
+def even_dial(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
+    """The dial under which equal steps change what is seen equally, wherever they begin.
+
+    Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
+    robot's .93, but .68 where they begin half a step later; with them .92 and .88).
+
+    Args:
+        seen: strength -> what is seen, any fixed shape; asked at even strengths and those found, and taken
+            to go straight between two of them
+        passes: how often to spread the strengths, the best of all wins
+    """
+    even = torch.linspace(0, 1, STEPS * _FINE + 1, dtype=torch.float64)
+    places = even
+    for _ in range(_LOOKS):
+        looked, pictures = places, [seen(float(s)) for s in places]
+        best, following = -1.0, places
+        for _ in range(passes + 1):
+            current = following
+            shown = [blended(pictures, looked, float(s)) for s in current]
+            evenness, following = _spread(current, shown, _FINE)
+            if evenness > best:
+                best, places = evenness, current
+    return Dial(places[::_FINE].contiguous(), even[::_FINE].contiguous())
+
+
+def _spread(places: Tensor, pictures: Sequence[Tensor], reach: int) -> tuple[float, Tensor]:
+    """How even steps over `reach` intervals are, and as many places at which they should be more so.
+
+    Args:
+        places: strengths, ascending from 0 to 1. [n+1] float64
+        pictures: what is seen there
+        reach: intervals in a step
+
+    Returns:
+        Smallest over largest step, 0..1; the new places. [n+1]
+    """
+    count = len(places) - 1
+    steps = [float((pictures[i + reach] - pictures[i]).abs().mean()) for i in range(count + 1 - reach)]
+    if max(steps) <= 0:
+        return 1.0, places
+    covering = [steps[max(0, i - reach + 1) : i + 1] for i in range(count)]
+    pace = [sum(c) / len(c) for c in covering]
+    floor = 1e-3 * max(pace)  # so that the places stay apart
+    way = torch.tensor([0.0, *accumulate(max(p, floor) for p in pace)], dtype=torch.float64)
+    even = torch.linspace(0, 1, count + 1, dtype=torch.float64)
+    due = interpolated(even, way / way[-1], places)
+    due[0], due[-1] = 0.0, 1.0
+    return min(steps) / max(steps), due

@@ -1,0 +1,200 @@
+"""A run's neural field: begun while PGS runs or after it, finished on the recorded trajectory, baked.
+
+`--field auto` does not try it. Measured on playbot_31k, its robot recoloured (a draft's recording, 27 numbers
+move, 108 bytes a member for their end alone), worst / mean dB on held-out views: separable 132 bytes 34.3 /
+38.0, 150 bytes 37.0 / 41.7, 159 bytes 40.1 / 43.1, in two seconds; a tiny network with codes of 8 125 bytes
+37.0 / 41.2, in a minute, and codes of 16 gain nothing. At few bytes the network is ahead by 3 dB, at the
+default target of 40 dB it does not arrive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field import BakedField, NeuralSettings, PositionFloor, baked_neural, position_floor
+from progdf.field.evaluate import FieldJudge
+from progdf.field.neural import Inputs, NeuralShape
+from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
+from progdf.field.separable import moving_attributes
+from progdf.field.trajectory import Trajectory
+from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
+from trainer.optimize.losses import Perceptual, l1
+from trainer.optimize.pgs import Stage
+from trainer.optimize.settings import slider_meant
+from trainer.options import NETWORK_OPTIONS, TrainOptions, plain_options
+from trainer.setup.training_setup import Stand, probes
+from trainer.store.progress import RunLog
+from trainer.store.state import Saved, StateFolder
+from trainer.views.crops import crop_scene, render_all
+
+from .evaluate import Judge
+from .fit import visibility
+from .memory_bank import Alongside
+
+PART = "network"
+"""Of the saved state: a network that was trained alongside, once the trajectory is recorded."""
+
+_FINISHING = 0.5  # of the steps that a network takes which was not trained alongside
+
+
+@dataclass(frozen=True)
+class NetworkFit:
+    """A neural field as a run ships it.
+
+    Args:
+        field: baked, with the network as its origin
+        floor: what the members' places tell of the edit
+        unbaked: PSNR of the network's own answers over the slider, its ends not pinned, dB
+    """
+
+    field: BakedField
+    floor: PositionFloor
+    unbaked: tuple[float, ...]
+
+    def figures(self) -> dict[str, Any]:
+        """For report.json."""
+        curve, form = self.unbaked, self.field.origin
+        assert form is not None
+        floor = {k: round(v, 3) for k, v in self.floor.unpredictable.items()}
+        return {
+            "unbaked": {"psnr_mean": round(sum(curve) / len(curve), 2), "psnr_worst": round(min(curve), 2)},
+            "bake_error": dict(form.error or {}),
+            "baked_bytes_per_gaussian": round(self.field.baked_bytes_per_member, 1),
+            "position_floor": {
+                "unpredictable": floor,
+                "psnr_mean": round(self.floor.psnr_mean, 2),
+                "psnr_worst": round(self.floor.psnr_worst, 2),
+            },
+        }
+
+
+def network_settings(options: Mapping[str, Any]) -> NeuralSettings:
+    """What the options, JSON values of this or an older run, say of the network."""
+    said = {name: options.get(name, default) for name, default in NETWORK_OPTIONS.items()}
+    inputs: Inputs = "position" if said["fit"] == "alongside" else said["inputs"]
+    steps = EFFORT[said["size"]][0] // 3 if options.get("quick") else 0
+    seed = int(options.get("seed", 0))
+    return NeuralSettings(said["size"], inputs, said["code"], said["bins"], steps, seed=seed)
+
+
+def begin_alongside(
+    options: TrainOptions, stand: Stand, rates: Tensor, stages: Sequence[Stage]
+) -> Alongside | None:
+    """The network that is trained beside PGS, where the options ask for one.
+
+    Args:
+        options: see `TrainOptions`
+        stand: scene, region, views
+        rates: learning rates of PGS; what has none does not move. [C]
+        stages: of PGS
+    """
+    if options.field != "neural" or options.fit != "alongside":
+        return None
+    channels = len(rates)
+    slices = attribute_slices(channels)
+    attributes = tuple(name for name, columns in slices.items() if bool((rates[columns] > 0).any()))
+    rows = pack(stand.scene[stand.region.members], with_shN=channels > BASE_CHANNELS)
+    settings = network_settings(plain_options(options))
+    seen = visibility(stand.scene, stand.region.members, stand.train)
+    small = probes(stand)
+
+    def render(offsets: Tensor) -> Tensor:
+        return torch.cat(
+            [picture.reshape(-1, 3) for picture in render_all(small, rows + offsets, attributes)]
+        )
+
+    strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
+    if slider_meant(options.slider, options.editor, strengths) == "even":
+        strengths = [(i + 1) / len(stages) for i in range(len(stages))]
+    return Alongside(
+        NeuralFit(rows, channels, attributes, settings, seen), channels, strengths, steps, render
+    )
+
+
+def keep(alongside: Alongside, folder: StateFolder) -> None:
+    """Save the network for the end of the run, when the trajectory is whole."""
+    folder.save(PART, alongside.fit.saved(), {"shape": asdict(alongside.fit.shape)})
+
+
+def fit_network(
+    trajectory: Trajectory,
+    stand: Stand,
+    seen: Judge,
+    judge: Judge,
+    weights: Tensor,
+    options: Mapping[str, Any],
+    perceptual: Perceptual,
+    log: RunLog,
+    begun: Saved | None = None,
+) -> NetworkFit:
+    """Train a network on a trajectory, or finish one that was trained alongside, and bake it.
+
+    Args:
+        trajectory: what was recorded
+        stand: scene, region, views
+        seen: training views, which tell how much each attribute shows
+        judge: held-out views
+        weights: how visible each member is. [M]
+        options: of the run, JSON values
+        perceptual: for the loss of pictures
+        log: where progress is told
+        begun: what `keep` saved
+
+    Raises:
+        ProgdfError: the edit moves nothing, or the training breaks down.
+    """
+    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    attributes = tuple(moving_attributes(offsets))
+    if not attributes:
+        raise ProgdfError("the edit moves nothing that a network could learn; use --field auto")
+    rows = pack(stand.scene[stand.region.members])
+    settings = network_settings(options)
+    fit = NeuralFit(rows, offsets.shape[2], attributes, settings, weights)
+    steps = fit.settings.steps
+    if begun is not None:
+        layout = begun.values["shape"]
+        fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
+        steps = round(_FINISHING * steps)
+    fit.scale_to(offsets, rendered_importance(offsets, seen.counted))
+    weight = float(options.get("picture_loss", NETWORK_OPTIONS["picture_loss"]))
+    pictures = _picture_loss(stand, trajectory, perceptual, weight, settings.seed) if weight > 0 else None
+    try:
+        with log.steps("field", steps) as advance:
+            trained(
+                fit, trajectory.s, offsets, steps, pictures, lambda n, loss: advance(n, f"loss {loss:.5f}")
+            )
+    except FloatingPointError as error:
+        raise ProgdfError(f"{error}; try another --size, or --field auto") from error
+    network = fit.field(tuple(float(s) for s in trajectory.s))
+    errors = FieldJudge(trajectory.s, offsets, judge.counted)
+    return NetworkFit(
+        baked_neural(network, rows, trajectory.at, judge.counted),
+        position_floor(trajectory.s, offsets, rows[:, :3], weights, errors),
+        errors.curve(network.bound(rows)),
+    )
+
+
+def _picture_loss(
+    stand: Stand, trajectory: Trajectory, perceptual: Perceptual, weight: float, seed: int
+) -> PictureLoss:
+    """L_pred of ProGDF: L1 + LPIPS between the field's and the recording's picture of a drawn view."""
+    members = stand.region.members
+    crops = [crop_scene(stand.scene, members, v.camera, v.box, stand.background) for v in stand.train]
+    rows = pack(stand.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    moving = tuple(moving_attributes(trajectory.end[None]))
+    draws = torch.Generator().manual_seed(seed)
+
+    def loss(found: Tensor, recorded: Tensor) -> Tensor:
+        view = crops[int(torch.randint(len(crops), (1,), generator=draws))]
+        with torch.no_grad():
+            expected, _ = view.render(rows + recorded, moving)
+        image, _ = view.render(rows + found, moving)
+        return weight * (l1(image, expected) + perceptual(image, expected))
+
+    return loss

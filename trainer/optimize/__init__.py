@@ -1,0 +1,1 @@
+"""The edit optimisation that records a trajectory."""

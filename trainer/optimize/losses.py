@@ -1,0 +1,161 @@
+"""What the optimiser minimises: L1, a perceptual term, and the clamp whose gradient is not lost.
+
+L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view; method.md 3 has the weights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from progdf.errors import ProgdfError
+from progdf.metrics.lpips import Features, Lpips, Net
+
+_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
+
+
+def l1(image: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute difference. [h,w,3], [h,w,3] -> []"""
+    return (image - target).abs().mean()
+
+
+class Perceptual(Protocol):
+    """A perceptual distance of images of range 0..1 that are at least 31 pixels each way."""
+
+    @property
+    def name(self) -> str:
+        """As report.json names it."""
+        ...
+
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
+        """[h,w,3], [h,w,3] -> []; what is computed of the target is kept under `key`, None keeps nothing."""
+        ...
+
+    def forget(self) -> None:
+        """Drop what is kept of targets."""
+        ...
+
+
+class LpipsLoss:
+    """LPIPS (Zhang et al. 2018); the targets' features are computed once per key, while they fit in memory.
+
+    Args:
+        network: see `Lpips.load`
+        name: as report.json names it
+        room: bytes that may be kept; VGG16 needs 30 MB for a target of 256 pixels, AlexNet 2.5 MB
+    """
+
+    def __init__(self, network: Lpips, name: str = "lpips-alex", room: int = 1 << 30) -> None:
+        self.name = name
+        self._network = network
+        self._room, self._free = room, room
+        self._kept: dict[Hashable, Features] = {}
+
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
+        """See `Perceptual`."""
+        seen = self._kept.get(key) if key is not None else None
+        if seen is None:
+            with torch.no_grad():
+                seen = self._network.features(target)
+            size = sum(layer.numel() * layer.element_size() for layer in seen)
+            if key is not None and size <= self._free:
+                self._kept[key] = seen
+                self._free -= size
+        return self._network.distance(self._network.features(image), seen)
+
+    def forget(self) -> None:
+        """See `Perceptual`."""
+        self._kept.clear()
+        self._free = self._room
+
+
+class GradientL1:
+    """The stand-in where LPIPS weights are absent: L1 of the image gradients at full and half resolution."""
+
+    name = "gradient-l1"
+
+    def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
+        """See `Perceptual`."""
+        a, b = image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
+        total = image.new_zeros(())
+        for _ in range(2):
+            for axis in (2, 3):
+                total = total + (a.diff(dim=axis) - b.diff(dim=axis)).abs().mean()
+            a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
+        return total
+
+    def forget(self) -> None:
+        """Nothing is kept."""
+
+
+def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
+    """LPIPS, or its stand-in and one line that says why and how to get the real one; "" where all is well."""
+    try:
+        return LpipsLoss(Lpips.load(net), f"lpips-{net}"), ""
+    except ProgdfError as error:
+        return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
+
+
+def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
+    """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
+
+    The paper penalises every parameter's step with α·β^(t/s) (eq. 5), which freezes the edit at its weights;
+    what helps is that early steps are short (method.md 3, L_prog).
+    """
+    return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
+
+
+def progressive_change(
+    moved: Tensor, previous: Tensor, step: int, grows: bool, alpha: float = 0.05, beta: float = 1.1
+) -> Tensor:
+    """The paper's progressive constraint as it is printed: L_prog = α·β^(±t/50)·Σ|ΔΘ|, without its λ2. []
+
+    ΔΘ is what the last step changed, summed over all raw parameters of all members. "growth" is the printed
+    exponent +t/50, which allows ever shorter steps; "decay" is −t/50, which lets go of them.
+    """
+    period = 50.0
+    factor: float = alpha * beta ** ((step if grows else -step) / period)
+    change = (moved - previous.detach()).abs().sum()
+    return factor * change
+
+
+def sharpness(
+    image: Tensor, target: Tensor, form: Literal["hinge", "paper"], inside: Tensor | None = None
+) -> Tensor:
+    """The paper's L_render. []
+
+    "paper" is the printed −∇²R, signed, over the whole picture. "hinge" asks for no more than the target
+    has: max(0, S(target) − S(image)), S the mean of |∇²Y| inside the region, Y the luma.
+
+    Args:
+        image: the render. [h,w,3]
+        target: what it should be. [h,w,3]
+        form: see above
+        inside: the pixels that count under "hinge"; None: all. [h,w] bool
+    """
+    if form == "paper":
+        return -laplacian(image.mean(dim=2)).mean()
+    weights = torch.ones_like(image[1:-1, 1:-1, 0]) if inside is None else inside[1:-1, 1:-1].to(image.dtype)
+    count = weights.sum().clamp_min(1.0)
+
+    def edges(picture: Tensor) -> Tensor:
+        return (laplacian(picture @ picture.new_tensor(_LUMA)).abs() * weights).sum() / count
+
+    return (edges(target) - edges(image)).clamp_min(0.0)
+
+
+def laplacian(luma: Tensor) -> Tensor:
+    """Sum of the four neighbours minus four times the pixel, where all four exist. [h,w] -> [h-2,w-2]"""
+    around = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:]
+    return around - 4.0 * luma[1:-1, 1:-1]
+
+
+def eroded(mask: Tensor, by: int = 2) -> Tensor:
+    """The mask without its rim of `by` pixels, beyond the picture counting as inside. [h,w] -> [h,w] bool"""
+    outside = (mask <= 0.5).float()
+    return max_pool2d(outside[None, None], 2 * by + 1, 1, by)[0, 0] < 0.5

@@ -1,0 +1,125 @@
+"""Members that no training view shows: in an edit of colours they follow the seen ones on their own surface.
+
+Nothing pulls at a member that is out of every view's sight, so it keeps its old colour: white spots in a room
+at night, for whoever looks where no camera stood. Its neighbours along the surface, of the same colour, know
+what the edit does there (see `neighbours.surface_likeness`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians, attribute_slices
+from progdf.rasterize import alpha_weights
+from trainer.editors.base import EditKind
+from trainer.options import TrainOptions
+from trainer.regions.neighbors import surface_likeness
+from trainer.setup.training_setup import Stand
+from trainer.views.view import View
+
+_SEEN = 3.0
+"""Σ αT over all pixels and views, in pixels: a member of a sparse region with less got next to nothing."""
+
+_SHARE = 0.01
+"""Of the visible weight of a typical member. Where members are dense nearly all have less than `_SEEN`, and
+their own pixels still tell them their colors (`color_solver`)."""
+
+_SOURCES = 6
+
+
+@dataclass(frozen=True)
+class Followers:
+    """Who follows whom, as places among the members.
+
+    Args:
+        places: the followers. [U] int64
+        sources: seen members that each of them follows. [U,k] int64
+        weights: how much it follows each, adding up to 1. [U,k]
+    """
+
+    places: Tensor
+    sources: Tensor
+    weights: Tensor
+
+    def led(self, offsets: Tensor) -> Tensor:
+        """The offsets with the followers' colours moved as their sources' are. [M,C] -> [M,C]"""
+        if not len(self.places):
+            return offsets
+        slices = attribute_slices(offsets.shape[1])
+        led = offsets.clone()
+        for name in ("sh0", "shN"):
+            if name in slices:
+                known = offsets[self.sources, slices[name]].float()
+                led[self.places, slices[name]] = (self.weights[..., None] * known).sum(dim=1).to(led.dtype)
+        return led
+
+
+def followers_of(options: TrainOptions, stand: Stand, kind: EditKind) -> Followers:
+    """Those of a run: nobody but in an edit of colours that is to be followed (`--follow`)."""
+    if kind != "colour" or not options.follow:
+        nobody = torch.zeros(0, dtype=torch.int64)
+        return Followers(nobody, nobody[:, None], torch.zeros(0, 1))
+    return find_followers(stand.scene, stand.region.members, stand.train)
+
+
+def find_followers(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Followers:
+    """The members that no view shows, and the nearest seen ones along the surface.
+
+    A follower whose neighbours are all unseen follows what these follow; one from which no seen member can be
+    reached stays as it is.
+
+    Args:
+        scene: the original
+        members: rows of the region. [M] int64
+        views: the training views
+    """
+    shown = torch.zeros(len(members))
+    for view in views:
+        camera = view.camera
+        shown += alpha_weights(scene, camera, torch.ones_like(view.mask), near=camera.near)[
+            members, 2
+        ].float()
+    return _following(scene[members], shown >= least_shown(shown))
+
+
+def least_shown(shown: Tensor) -> float:
+    """Visible weight below which a member counts as unseen: a share of what the member behind an average
+    visible pixel gets (Σ w² / Σ w, which members that hardly show do not change), at most `_SEEN`.
+
+    Args:
+        shown: Σ αT of each member over all pixels and views, in pixels. [M]
+    """
+    own = float(shown.square().sum() / shown.sum().clamp_min(1e-12))
+    return min(_SEEN, _SHARE * own)
+
+
+def _following(region: Gaussians, seen: Tensor) -> Followers:
+    """See `find_followers`; `seen`: [M] bool"""
+    unseen = (~seen).nonzero()[:, 0]
+    k = min(_SOURCES, int(seen.sum()))
+    sources = torch.zeros(len(seen), k, dtype=torch.int64)
+    weights = torch.zeros(len(seen), k)
+    if k == 0 or not len(unseen):
+        return Followers(unseen[:0], sources[:0], weights[:0])
+    sources[seen, 0], weights[seen, 0] = seen.nonzero()[:, 0], 1.0
+    near, likeness = surface_likeness(region, unseen)
+    decided = seen.clone()
+    while True:  # from where views look, outwards
+        open_rows = ~decided[unseen]
+        known = likeness * decided[near] * open_rows[:, None]
+        reached = known.sum(dim=1) > 1e-6
+        if not bool(reached.any()):
+            break
+        found = known[reached].topk(k, dim=1)
+        through = near[reached].gather(1, found.indices)
+        best = weights[through].argmax(dim=2, keepdim=True)
+        rows = unseen[reached]
+        sources[rows] = sources[through].gather(2, best)[..., 0]
+        weights[rows] = found.values / found.values.sum(dim=1, keepdim=True)
+        decided[rows] = True
+    followers = unseen[decided[unseen]]
+    return Followers(followers, sources[followers], weights[followers])

@@ -1,0 +1,1 @@
+"""The whole job, from a scene to a .gdf and its report."""

@@ -1,0 +1,279 @@
+"""`progdf demo`: a scene of our own, three trained edits, pictures of what the sliders do, and the window."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from progdf.cli.options import parsed
+from progdf.compose.reference import Layer, compose
+from progdf.demo_scenes import DemoScene, bear, room
+from progdf.errors import ProgdfError
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gdf.file import Gdf, load_gdf
+from progdf.io.atomic import make_folder, written_whole
+from progdf.io.cameras import save_cameras
+from progdf.io.images import contact_sheet, write_image
+from progdf.rasterize import render
+from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions, check_ranges
+from trainer.store.state import StateFolder
+
+STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
+MOST_GAUSSIANS = 5_000_000
+"""As many as large trained scenes have: what --size says at most."""
+_HERO_HEIGHT = 400
+_GRID = (0.0, 1 / 3, 2 / 3, 1.0)
+
+
+@dataclass(frozen=True)
+class DemoEdit:
+    """One edit of the demo: what it is called, which parts it may change, how."""
+
+    name: str
+    parts: tuple[str, ...]
+    editor: str
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much training an edit gets, see `TrainOptions`."""
+
+    views: int
+    image_size: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class Show:
+    """What the demo does with one scene.
+
+    Args:
+        make: size and seed -> the scene
+        size: Gaussians if nobody says how many
+        view: which of the scene's cameras takes the pictures
+        inside: whether the edits are trained from the scene's own cameras, as one cannot see in from outside
+        draft: the effort of --quick
+        full: the effort otherwise
+        edits: two edits that share no Gaussian, and one that shares Gaussians with both
+    """
+
+    make: Callable[[int, int], DemoScene]
+    size: int
+    view: int
+    inside: bool
+    draft: Effort
+    full: Effort
+    edits: tuple[DemoEdit, DemoEdit, DemoEdit]
+
+
+_COAT = ("body", "head", "ears", "arms", "legs")
+SHOWS = {
+    "bear": Show(
+        bear,
+        size=24_000,
+        view=2,
+        inside=False,
+        draft=Effort(views=10, image_size=160, steps=160),
+        full=Effort(views=24, image_size=256, steps=480),
+        edits=(
+            DemoEdit("scarf", ("scarf",), "recolor:#3d4fc4"),
+            DemoEdit("gold", _COAT, "recolor:#d9a012"),
+            DemoEdit("frost", (*_COAT, "scarf"), "recolor:#62b3ea"),
+        ),
+    ),
+    "room": Show(
+        room,
+        size=40_000,
+        view=0,
+        inside=True,
+        # from inside each view shows a part only: more of them, and more steps to come round to each
+        draft=Effort(views=16, image_size=160, steps=200),
+        full=Effort(views=30, image_size=256, steps=560),
+        edits=(
+            DemoEdit("rug", ("rug",), "recolor:#3a55b4"),
+            DemoEdit("walls", ("walls",), "recolor:#e0a458"),
+            DemoEdit(
+                "dusk",
+                ("walls", "rug", "floor", "ceiling", "table", "stool", "ball", "picture"),
+                "tint:#4f6fd8",
+            ),
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Make a scene, train three region edits of it, write pictures, open the window if there is a display."""
+
+    scene: Literal["bear", "room"] = "bear"
+    """A bear in the grass to look at from all around, or a room to stand in."""
+    size: int | None = None
+    """Number of Gaussians; by default 24000 for the bear, 40000 for the room."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
+    """Folder for the scene, the edits and the pictures; made if need be."""
+    quick: bool = False
+    """A draft in a third of the time: fewer views, smaller, fewer steps."""
+    seed: int = 0
+    """Of the scene and of the training."""
+    threads: int = 0
+    """CPU threads; 0 takes all cores."""
+    window: bool = True
+    """Open the window at the end, where there is a display."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the demo. Raises ProgdfError for options that cannot be met."""
+    options = parsed(DemoOptions, argv, "progdf demo")
+    _check(options)
+    begun = time.perf_counter()
+    show = SHOWS[options.scene]
+    scene = show.make(show.size if options.size is None else options.size, options.seed)
+    write_scene(options.out, scene)
+    print(f"{options.scene}: {len(scene.gaussians)} Gaussians in {options.out / 'scene.ply'}")
+    gdfs = {name: load_gdf(path, scene.gaussians) for name, path in _train(options, show, scene).items()}
+    print()
+    for picture in write_pictures(options.out, scene, gdfs, show.view):
+        print(f"look at {picture}")
+    command = ["view", str(options.out / "scene.ply"), *(str(_gdf(options.out, edit)) for edit in show.edits)]
+    command += ["--background", _hex(scene.background)]
+    print(
+        f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:\n  progdf {shlex.join(command)}",
+        flush=True,
+    )
+    if options.window and _has_display():
+        # another process, as the trainer and the viewer share nothing but files
+        return subprocess.run([sys.executable, "-m", "progdf", *command], check=False).returncode
+    return 0
+
+
+def _check(options: DemoOptions) -> None:
+    """Raises ProgdfError for a number that cannot be, before anything is made or written."""
+    if options.size is not None and options.size > MOST_GAUSSIANS:
+        raise ProgdfError(f"--size is {options.size}; {MOST_GAUSSIANS} or fewer would be right")
+    check_ranges(("--seed", options.seed, 0, LARGEST_SEED), ("--threads", options.threads, 0, MOST_THREADS))
+
+
+def write_scene(folder: Path, scene: DemoScene) -> None:
+    """Write scene.ply, labels.npy ([N] uint8) and cameras.json; the folder is made if need be.
+
+    Raises:
+        ProgdfError: the folder cannot be made or written to.
+    """
+    make_folder(folder)
+    save_ply(folder / "scene.ply", scene.gaussians)
+    with written_whole(folder / "labels.npy") as beside:
+        np.save(beside, scene.labels.numpy())
+    save_cameras(folder / "cameras.json", scene.cameras)
+
+
+def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
+    """Write what three sliders do: each alone, two against each other, and in large.
+
+    Args:
+        folder: where scene.ply lies and the pictures go
+        scene: its cameras and background
+        gdfs: the edits by name; the first two share no Gaussian
+        view: which camera
+
+    Returns:
+        sliders.png, two-sliders.png, hero.png
+    """
+    gaussians = load_ply(folder / "scene.ply")
+    camera = scene.cameras[view]
+
+    def shot(height: int, strengths: Mapping[str, float]) -> Tensor:
+        layers = [Layer(gdfs[name], strength) for name, strength in strengths.items()]
+        sized = camera.resized(round(height * camera.width / camera.height), height)
+        with torch.no_grad():
+            return render(compose(gaussians, layers), sized, background=scene.background)
+
+    names = list(gdfs)
+    first, second, third = names
+    sliders = contact_sheet(
+        [[shot(300, {name: strength}) for strength in STRENGTHS] for name in names],
+        names,
+        [f"{strength:.0%}" for strength in STRENGTHS],
+        "One slider per edit",
+        "  ·  ".join(f"{name}: {gdf.instruction}" for name, gdf in gdfs.items()),
+    )
+    steps = [f"{strength:.0%}" for strength in _GRID]
+    grid = contact_sheet(
+        [[shot(260, {first: a, second: b}) for b in _GRID] for a in _GRID],
+        [f"{first} {step}" for step in steps],
+        [f"{second} {step}" for step in steps],
+        "Two sliders, every mixture",
+    )
+    hero = torch.cat([shot(_HERO_HEIGHT, {third: strength}) for strength in STRENGTHS], dim=1)
+    written = []
+    for name, image in (("sliders", sliders), ("two-sliders", grid), ("hero", hero)):
+        written.append(folder / f"{name}.png")
+        write_image(written[-1], image)
+    return written
+
+
+def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path]:
+    """Train the edits; their .gdf files by name. A demo that was stopped goes on where it was."""
+    from .resume import found  # only now: `--help` and the pictures need none of it
+    from .run import train
+
+    runs = {edit.name: _run(options, show, scene, edit) for edit in show.edits}
+    here = {name: found(run) for name, run in runs.items()}
+    for edit in show.edits:
+        print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
+        run = runs[edit.name]
+        goes_on = "stopped" in here.values() and here[edit.name] != "nothing"
+        if not goes_on:
+            StateFolder(run.out / "state").clear()  # of a demo with other options
+        try:
+            train(replace(run, resume=goes_on))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"what is done is kept in {options.out}; give the same command again to go on"
+            ) from None
+    return {edit.name: _gdf(options.out, edit) for edit in show.edits}
+
+
+def _run(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
+    """How one edit is trained."""
+    ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
+    folder = options.out
+    effort = show.draft if options.quick else show.full
+    return TrainOptions(
+        scene=folder / "scene.ply",
+        out=folder / edit.name,
+        region=f"labels:{folder / 'labels.npy'}:{ids}",
+        editor=edit.editor,
+        cameras=folder / "cameras.json" if show.inside else None,
+        views=effort.views,
+        image_size=effort.image_size,
+        steps=effort.steps,
+        seed=options.seed,
+        threads=options.threads,
+    )
+
+
+def _gdf(folder: Path, edit: DemoEdit) -> Path:
+    return folder / edit.name / f"{edit.name}.gdf"
+
+
+def _hex(color: tuple[float, float, float]) -> str:
+    return "#" + "".join(f"{round(255 * channel):02x}" for channel in color)
+
+
+def _has_display() -> bool:
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

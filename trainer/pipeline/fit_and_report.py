@@ -1,0 +1,222 @@
+"""The end of every run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.compose.reference import Layer, compose
+from progdf.field.remap import same
+from progdf.field.trajectory import Trajectory
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
+from progdf.gdf.file import Gdf, fingerprint, save_gdf
+from progdf.io.images import write_image
+from progdf.io.json_values import decode_json
+from trainer.fit.active import Dropped, dropped_of
+from trainer.fit.evaluate import Judge, make_judge
+from trainer.fit.evenness import evened
+from trainer.fit.fit import expected_looks, fit_field, judged_field, visibility
+from trainer.fit.network import fit_network
+from trainer.optimize.losses import Perceptual
+from trainer.optimize.retime import lay_over
+from trainer.optimize.settings import slider_meant
+from trainer.options import CLIP_MODEL, FieldKind
+from trainer.report.measures import Texts, clip_course, expected_measures, figures, measure
+from trainer.report.report import report_picture
+from trainer.setup.training_setup import Stand
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import RunFolder, read_views, write_json
+from trainer.store.state import Saved
+from trainer.views.crops import only_recolors
+from trainer.views.view import View
+
+_RANK_VIEWS = 4
+_REPORT_ALONE = ("options", "time", "memory_mb", "memory_by_stage_mb", "curves")
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run leaves.
+
+    Args:
+        folder: the run's folder
+        gdf: path of the .gdf file
+        report: what report.json holds
+        trajectory: the recorded trajectory
+    """
+
+    folder: RunFolder
+    gdf: Path
+    report: Mapping[str, Any]
+    trajectory: Trajectory
+
+
+def finished(
+    folder: RunFolder,
+    stand: Stand,
+    trajectory: Trajectory,
+    about: Mapping[str, Any],
+    perceptual: Perceptual,
+    log: RunLog,
+    choice: FieldKind,
+    begun: Saved | None = None,
+) -> RunResult:
+    """Fit, measure, and write NAME.gdf, report.json and report.png. `begun`: see `network.fit_network`."""
+    options = about["options"]
+    scene, region = stand.scene, stand.region
+    dropped: Dropped | None = None
+    with log.stage("fit"):
+        judge = kept_judge(folder, stand, stand.held_out, trajectory)
+        few = stand.train[:: max(1, len(stand.train) // _RANK_VIEWS)][:_RANK_VIEWS]
+        seen = kept_judge(folder, stand, few, trajectory)
+        with log.looks("weigh the members", len(stand.train)) as looked:
+            weights = visibility(scene, region.members, stand.train, looked)
+        if choice == "neural":
+            network = fit_network(trajectory, stand, seen, judge, weights, options, perceptual, log, begun)
+            fitted = judged_field(trajectory, judge, network.field, options["target_psnr"])
+        else:
+            network = None
+            target, budget = options["target_psnr"], options.get("bytes_budget")
+            refine = options.get("refine", False)
+            with log.looks("fit the field", expected_looks(trajectory, choice)) as looked:
+                fitted = fit_field(
+                    trajectory,
+                    replace(seen, looked=looked),
+                    replace(judge, looked=looked),
+                    weights,
+                    choice,
+                    target,
+                    budget,
+                    refine,
+                )
+            if options.get("drop_invisible", False):
+                dropped = dropped_of(stand, trajectory, judge, fitted)
+                fitted = dropped.fitted
+                log.say(dropped.line())
+    with log.stage("even"):
+        slider = slider_meant(options.get("slider", "stages"), options["editor"], trajectory.strengths)
+        field, dial = fitted.chosen.field, same()
+        if slider == "even":
+            field, dial = evened(field, stand, log)
+        laid = lay_over(folder.trajectory, dial)
+    log.say(
+        f"{fitted.chosen.label}, {fitted.why}: "
+        f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
+        f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
+    )
+    if not fitted.met:
+        if (budget := options.get("bytes_budget")) is not None and network is None:
+            log.say(f"no field takes --bytes-budget {budget:g} or less; the smallest was kept")
+        else:
+            log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
+    with log.stage("report"):
+        clip = clip_course(judge, stand.held_out, field, texts(options))
+        if clip.reason and (options.get("text_before") or options.get("text_after")):
+            log.say(f"CLIP directional similarity is not measured: {clip.reason}")
+        with log.looks("measure the edit", expected_measures(trajectory)) as looked:
+            watched = replace(judge, looked=looked)
+            measured = measure(watched, trajectory, fitted, field, dial, perceptual, clip)
+        end = end_rows(stand, trajectory)
+        if dropped is not None:
+            region, field, end = dropped.region(region), dropped.field(field), end[dropped.kept]
+        gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
+        endpoint, outside = exactness(scene, gdf, end)
+        title = f"{options['name']}: {options['editor']}"
+        picture = report_picture(judge, measured, about["losses"], title)
+    measures = figures(measured, endpoint, outside)
+    if network is not None:
+        measures["field"] |= network.figures()
+    if dropped is not None:
+        measures["field"]["dropped"] = dropped.figures()
+    report = {
+        **measures,
+        "trajectory": {
+            "recordings": len(trajectory),
+            "slider": slider,
+            "s": [round(float(s), 4) for s in laid.s],
+            "stages": list(trajectory.strengths),
+            "stages_at": [round(s, 4) for s, _ in laid.asked],
+            "attribute_worth_db": about["attribute_worth_db"],
+        },
+        "objective": about["objective"],
+        "losses": about["losses"],
+        "kind": about.get("kind"),
+        "kind_trial": about.get("kind_trial"),
+        "agreement": about.get("agreement"),
+        "followed": about.get("followed", 0),
+        "up": about.get("up"),
+        "time": {**(_earlier(folder, "time") if log.refits else {}), **log.rounded_seconds()},
+        "memory_mb": log.memory.peak(),
+        "memory_by_stage_mb": {
+            **(_earlier(folder, "memory_by_stage_mb") if log.refits else {}),
+            **log.memory.by_stage,
+        },
+        "options": options,
+    }
+    # the .gdf has the options beside it, is small, and the same training writes the same file
+    own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}
+    save_gdf(folder.gdf(options["name"]), replace(gdf, report=own))
+    write_json(folder.report, report)
+    write_image(folder.picture, picture)
+    edit = report["edit"]
+    log.say(
+        f"held-out views: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
+        + "".join(
+            f"; s={float(s):.3g} {e['psnr']} dB (2 keyframes {e['keyframes2']})"
+            for s, e in report["between"].items()
+        )
+    )
+    log.say(f"wrote {folder.gdf(options['name'])}")
+    return RunResult(folder, folder.gdf(options["name"]), report, laid)
+
+
+def kept_judge(folder: RunFolder, stand: Stand, views: Sequence[View], trajectory: Trajectory) -> Judge:
+    """Some views beside their edited pictures, as the run keeps them."""
+    names = [view.camera.name for view in views]
+    edited = {s: read_views(folder, "edited", names, s) for s in trajectory.strengths}
+    channels, still = trajectory.end.shape[1], only_recolors(trajectory.offsets)
+    return make_judge(stand.scene, stand.region, views, edited, stand.background, channels, still)
+
+
+def end_rows(stand: Stand, trajectory: Trajectory) -> Tensor:
+    """Raw member rows of the finished edit: original + end, in float32. [M,C]"""
+    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    return rows + trajectory.end
+
+
+def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
+    """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
+    outside = torch.ones(len(scene), dtype=torch.bool)
+    outside[gdf.region.members] = False
+    finished = compose(scene, [Layer(gdf, 1.0)])
+    packed = pack(finished[gdf.region.members], with_shN=end.shape[1] > BASE_CHANNELS)
+    endpoint = float((packed - end).abs().max())
+    change = 0.0
+    for s in (0.3, 1.0):
+        edited = compose(scene, [Layer(gdf, s)])
+        for name in ATTRIBUTES:
+            before, after = getattr(scene, name)[outside], getattr(edited, name)[outside]
+            if before.numel() and not torch.equal(before, after):
+                change = max(change, float((after - before).abs().max()))
+    return endpoint, change
+
+
+def texts(options: Mapping[str, Any]) -> Texts:
+    """What CLIP is asked: the options' texts; what a learned editor was told is what one sees after."""
+    kind, _, told = options["editor"].partition(":")
+    after = options.get("text_after") or (told.strip().strip("\"'") if kind == "instruct" else "")
+    return Texts(options.get("text_before", ""), after, options.get("clip_model") or CLIP_MODEL)
+
+
+def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
+    """Figures of the stages that this command did not run again."""
+    try:
+        stages = decode_json(folder.report.read_bytes())[part]
+        return {str(stage): figure for stage, figure in stages.items() if isinstance(figure, int | float)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}

@@ -1,0 +1,83 @@
+"""`--reedit-every K`: every K steps the editor looks at the renders as they are now, and training goes on
+towards what it makes of those (the iterative dataset update of Instruct-NeRF2NeRF, Haque et al. 2023).
+
+Renders show one scene, so what each view was given of its own is gone from them. That helps a model which
+decides anew at every look, as diffusion does. It does not help a style network, which paints like pictures
+alike: in style 12 on playbot's robot .25 of the change is what no scene can show, .26, .27 and .27 after one,
+two and three looks, and the style doubles. The pictures lie on disk under their step: they are what a stopped
+run goes on with, and the same run again paints none of them twice.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import pack
+from trainer.editors import Painter, make_editor
+from trainer.editors.base import EditKind
+from trainer.options import TrainOptions
+from trainer.setup.training_setup import Stand, editor_settings, eight_bits, to_confine
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import RunFolder
+from trainer.views.view import crop, pictured
+
+
+class Reedit:
+    """New targets for the training views, every so many steps of a stage; see `pgs.Renewal`.
+
+    Args:
+        editor: paints
+        stand: scene, region and the training views with their final boxes
+        every: steps between two edits, counted over all stages
+        confined: put back what changes outside the region
+        log: where it is told
+    """
+
+    def __init__(self, editor: Painter, stand: Stand, every: int, confined: bool, log: RunLog) -> None:
+        self._editor, self._stand, self._every, self._confined, self._log = (
+            editor,
+            stand,
+            every,
+            confined,
+            log,
+        )
+        self._shown = 0  # the step whose pictures are the targets now; 0: none
+
+    def __call__(self, step: int, local: int, strength: float, offsets: Tensor) -> list[Tensor] | None:
+        """See `pgs.Renewal`. A run that goes on between two edits finds the last one's pictures on disk."""
+        due = step - step % self._every
+        if due <= step - local or due == self._shown:
+            return None
+        self._shown = due
+        stand, members = self._stand, self._stand.region.members
+        renders: list[Tensor | None] = [None] * len(stand.train)
+        if due == step:
+            rows = pack(stand.scene[members], with_shN=stand.scene.sh_degree > 0) + offsets
+            scene = stand.scene.replace_rows(members, rows)
+            with torch.no_grad():
+                renders = [pictured(scene, view.camera, stand.background).clamp(0, 1) for view in stand.train]
+            self._log.say(f"step {step}: the editor looks at {len(renders)} renders again")
+        targets = []
+        for view, now in zip(stand.train, renders, strict=True):
+            made = self._editor.edit_again(view, strength, now, due)
+            targets.append(crop(eight_bits(view.confined(made) if self._confined else made), view.box))
+        return targets
+
+
+def reedit(
+    options: TrainOptions, stand: Stand, kind: EditKind, folder: RunFolder, log: RunLog
+) -> Reedit | None:
+    """What --reedit-every asks for; None where it asks for nothing.
+
+    Raises:
+        ProgdfError: the editor cannot look at a picture again.
+    """
+    if not options.reedit_every:
+        return None
+    views = [*stand.train, *stand.held_out]
+    editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
+    if not isinstance(editor, Painter):
+        raise ProgdfError(f"--reedit-every means nothing to {options.editor}; leave it out")
+    return Reedit(editor, stand, options.reedit_every, to_confine(editor, options, kind), log)

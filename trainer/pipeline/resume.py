@@ -1,0 +1,206 @@
+"""What a training command finds in its folder: nothing, a stopped run to go on with, or a finished one."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import disk_full
+from progdf.io.json_values import decode_json, typed
+from progdf.region import Region
+from trainer.options import MOST_THREADS, TrainOptions, plain_options, settled
+from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
+
+_ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
+"""Options that change no bit of the result; `quick` is worked into others."""
+
+REGION = "region"
+"""Of the saved state: members and score."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is to be done in a run folder.
+
+    Args:
+        does: "start" from nothing, "go on" from the saved state; "nothing", as the run is finished
+        threads: with how many; a run keeps to those it began with, as sums depend on them
+        notes: lines for the log
+    """
+
+    does: Literal["start", "go on", "nothing"]
+    threads: int
+    notes: tuple[str, ...] = ()
+
+
+def kept_region(options: TrainOptions) -> Region | None:
+    """The region of a stopped run that is to go on: what it was made from need not be looked at again."""
+    state = RunFolder(options.out).state
+    saved = state.load(REGION) if options.resume and state.identity() is not None else None
+    if saved is None:
+        return None
+    with state.restoring(REGION):
+        return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"])
+
+
+def open_session(
+    folder: RunFolder, options: TrainOptions, edit: Mapping[str, str], region: Region, threads: int
+) -> Session:
+    """Find out what is to be done, and make the folder ready for it.
+
+    Args:
+        folder: claimed and locked
+        options: settled
+        edit: see `claim`
+        region: what may change
+        threads: that the options ask for
+
+    Raises:
+        ProgdfError: a stopped run that would be lost without --resume; with it, other options than the run's.
+    """
+    saved = _saved_identity(folder)
+    if options.resume and saved is None and folder.report.is_file():
+        _check_options(folder, _finished_options(folder), options, "leave --resume away to train anew")
+        return Session("nothing", threads)
+    remove_leftovers(folder)
+    now = _identity(options, threads)
+    if options.resume and saved is not None:
+        remedy = "give --resume the run's own options, or train anew in another folder"
+        _check_options(folder, saved.options, options, remedy)
+        for what, was in (("scene", saved.scene), ("cameras", saved.cameras)):
+            if was != now[what]:
+                raise ProgdfError(
+                    f"the {what} is no longer what {folder.root} was begun with; bring it back and go on "
+                    "with --resume, or train anew in another folder"
+                )
+        notes = []
+        if saved.torch != now["torch"]:
+            notes.append(f"torch was {saved.torch} and is {now['torch']}: the last bits may differ")
+        if saved.threads != threads:
+            notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
+        return Session("go on", saved.threads, tuple(notes))
+    if saved is not None and (step := _saved_step(folder)):
+        raise ProgdfError(
+            f"{folder.root} holds a run that was stopped at step {step} of {saved.options.get('steps')}; "
+            f"add --resume to go on with it, or delete {folder.state.path} to start over"
+        )
+    begin_log(folder, edit)
+    folder.state.begin(now)
+    folder.state.save(REGION, {"members": region.members, "score": region.score}, {"name": region.name})
+    notes = (
+        ["nothing to resume was saved yet, so the run starts from the beginning"] if options.resume else []
+    )
+    return Session("start", threads, tuple(notes))
+
+
+def found(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
+    """What --resume would find in the folder, of a run with these very options."""
+    folder, options = RunFolder(options.out), settled(options)
+    saved = _saved_identity(folder)
+    if saved is None and not folder.report.is_file():
+        return "nothing"
+    try:
+        _check_options(folder, saved.options if saved else _finished_options(folder), options, "")
+    except ProgdfError:
+        return "nothing"
+    return "stopped" if saved else "finished"
+
+
+@contextmanager
+def one_line(folder: RunFolder) -> Iterator[None]:
+    """Whatever stops a run, the person is told in one line what is left and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"what is done is kept in {folder.root}; give the same command with --resume to go on"
+        ) from None
+    except (OSError, ProgdfError) as error:
+        if disk_full(error):
+            trouble = f"the disk of {folder.root} is full; free some space"
+        elif isinstance(error, OSError):
+            trouble = f"{folder.root} cannot be written ({error.strerror or error}); make it writable"
+        else:
+            raise
+        raise ProgdfError(f"{trouble}, then go on with --resume") from error
+
+
+@contextmanager
+def still_there(folder: RunFolder) -> Iterator[None]:
+    """If the run's folder is removed meanwhile, that is what the person is told."""
+    try:
+        yield
+    except (OSError, ProgdfError) as error:
+        if folder.state.path.is_dir():
+            raise
+        raise ProgdfError(f"{folder.state.path} was removed during the run; train again") from error
+
+
+def _identity(options: TrainOptions, threads: int) -> dict[str, Any]:
+    """All that decides the bits of a run's result, as JSON values."""
+    return {
+        "options": plain_options(options),
+        "scene": _digest(options.scene),
+        "cameras": _digest(options.cameras) if options.cameras is not None else None,
+        "threads": threads,
+        "torch": torch.__version__,
+    }
+
+
+class _Identity(msgspec.Struct):
+    """What `_identity` gave, read from run.json."""
+
+    options: dict[str, Any]
+    scene: str
+    cameras: str | None
+    threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
+    torch: str
+
+
+def _saved_identity(folder: RunFolder) -> _Identity | None:
+    found = folder.state.identity()
+    if found is None:
+        return None
+    try:
+        return typed(found, _Identity)
+    except ValueError as error:
+        raise folder.state.damaged(folder.state.path / "run.json", error) from None
+
+
+def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOptions, remedy: str) -> None:
+    for name, now in plain_options(options).items():
+        was = saved.get(name)
+        if name in ("scene", "cameras") and was is not None and now is not None:
+            was, now = (str(Path(path).resolve()) for path in (was, now))
+        if was != now and name not in _ABOUT_THE_COMMAND:
+            option = "--" + name.replace("_", "-")
+            raise ProgdfError(f"{folder.root} was begun with {option} {was}, not {now}; {remedy}")
+
+
+def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
+    try:
+        return typed(decode_json(folder.report.read_bytes())["options"], dict[str, Any])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProgdfError(f"{folder.report} is damaged; leave --resume away to train anew") from error
+
+
+def _saved_step(folder: RunFolder) -> int:
+    """How far the optimisation was when it was saved; 0: not begun."""
+    saved = folder.state.load("training")
+    if saved is None:
+        return 0
+    with folder.state.restoring("training"):
+        return int(saved.values["pgs"]["step"])
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,306 @@
+"""PGS over a run's training views, saved as it goes: recordings in, a trajectory out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import Trajectory
+from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.scene.bounds import scene_sphere
+from trainer.editors.base import EditKind
+from trainer.fit.network import begin_alongside, keep
+from trainer.optimize.color_solver import iterations, make_solver, solve
+from trainer.optimize.groups import Groups, group_stage, restored_groups, way
+from trainer.optimize.losses import Perceptual, eroded
+from trainer.optimize.objective import Losses, Objective, loss_table
+from trainer.optimize.optimizer_state import PgsState
+from trainer.optimize.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
+from trainer.optimize.retime import record, retime, straight_recordings, with_recordings
+from trainer.optimize.settings import group_steps, loss_weights, pgs_settings, slider_meant, solves_colors
+from trainer.optimize.unseen import Followers
+from trainer.optimize.view_dependence import NEEDED, view_dependence
+from trainer.options import TrainOptions
+from trainer.setup.training_setup import Pictures, Stand, probes
+from trainer.store.interrupts import held
+from trainer.store.progress import RunLog
+from trainer.store.state import Autosave, Resumable, Saved, StateFolder
+from trainer.views.crops import (
+    COLORS,
+    GEOMETRY,
+    CropScene,
+    crop_scene,
+    moving_attributes,
+    only_recolors,
+    render_all,
+)
+from trainer.views.view import crop
+
+PART = "training"
+"""Of the saved state: all that changes while the members are optimised."""
+
+_TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A snapshot as it is kept.
+
+    Args:
+        step, stage, ends_stage, means: see `Snapshot`
+        offsets: of the members, in half precision. [M,C] float16
+    """
+
+    step: int
+    stage: int
+    ends_stage: bool
+    offsets: Tensor
+    means: Mapping[str, float]
+
+
+class Recordings:
+    """All recordings so far, a `state.Resumable`: each is written once, to a file of its own.
+
+    Args:
+        folder: where
+    """
+
+    def __init__(self, folder: StateFolder) -> None:
+        self.made: list[Recording] = []
+        self._folder, self._written = folder, 0
+
+    def add(self, found: Snapshot) -> None:
+        """Keep one."""
+        offsets = found.offsets.half()
+        self.made.append(Recording(found.step, found.stage, found.ends_stage, offsets, found.means))
+
+    def saved(self) -> Saved:
+        """How many there are; those that came since the last time are written first."""
+        for index in range(self._written, len(self.made)):
+            kept = self.made[index]
+            values = {"step": kept.step, "stage": kept.stage, "ends_stage": kept.ends_stage}
+            self._folder.save("recordings", {"offsets": kept.offsets}, values | {"means": kept.means}, index)
+        self._written = len(self.made)
+        return Saved({}, {"count": self._written})
+
+    def restore(self, saved: Saved) -> None:
+        """Read as many as there were; what a killed run wrote beyond them will be written again."""
+        self._written = saved.values["count"]
+        found = [self._folder.load("recordings", index) for index in range(self._written)]
+        if None in found:
+            raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
+        self.made = [Recording(offsets=kept.tensors["offsets"], **kept.values) for kept in found if kept]
+
+
+def trained(
+    options: TrainOptions,
+    stand: Stand,
+    edited: Pictures,
+    kind: EditKind,
+    perceptual: Perceptual,
+    folder: StateFolder,
+    log: RunLog,
+    renewal: Renewal | None = None,
+    followers: Followers | None = None,
+) -> tuple[Trajectory, Losses]:
+    """Optimise the members, from the beginning or from where the saved state stands.
+
+    Args:
+        options: see `TrainOptions`
+        stand: scene, region, views with boxes that hold the edit
+        edited: strength → the edited training views, whole
+        kind: what the edit moves
+        perceptual: distance of pictures
+        folder: where the state is saved
+        log: where progress is told
+        renewal: see `pgs.Renewal`
+        followers: members that take their colours from others
+
+    Returns:
+        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
+
+    Raises:
+        ProgdfError: the loss is not finite.
+        KeyboardInterrupt: interrupted; the state is saved.
+    """
+    scene, members = stand.scene, stand.region.members
+    options = _with_bands_decided(options, stand, kind, log)
+    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    still = not moving_attributes(learning_rates(kind, original.shape[1], 1.0, options.rates)[None], GEOMETRY)
+    crops = [crop_scene(scene, members, v.camera, v.box, stand.background, still) for v in stand.train]
+    steps = iterations(options.steps) if solves_colors(options, kind) else options.steps
+    steps = max(steps, len(edited) + 1)  # each stage is to have one
+    stages = [
+        Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
+        for (s, pictures), steps in zip(edited.items(), _shared(steps, len(edited)), strict=True)
+    ]
+    groups = None
+    if group_steps(options, kind):
+        groups = _groups(options, original, crops, [stage.targets for stage in stages], folder, log)
+        stages = groups.staged(original, crops, stages)
+    extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
+    settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
+    inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
+    objective = Objective(perceptual, loss_weights(options, kind), inside)
+    solver = None
+    if solves_colors(options, kind):
+        with log.stage("weights"):
+            solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
+
+    state, recordings = PgsState(original, settings.seed), Recordings(folder)
+    beside = begin_alongside(options, stand, settings.rates, stages)
+    parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
+    kept = Autosave(folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every)
+    if kept.restore():
+        if beside is not None:
+            beside.refill([(made.step, made.offsets) for made in recordings.made])
+        log.say(f"going on at step {state.step} of {steps}, with {len(recordings.made)} recordings")
+    with log.steps("optimise", steps) as advance, held() as stopped:
+
+        def step_done(step: int, left: float) -> None:
+            if beside is not None:
+                beside.step()
+            advance(step, f"loss to the edit {left:.4f}")
+            if stopped():
+                kept.save()
+                raise KeyboardInterrupt
+            kept.step_done()
+
+        way_there = (
+            solve(original, solver, stages, state, step_done, followers)
+            if solver is not None
+            else optimise(
+                original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
+            )
+        )
+        try:
+            for found in way_there:
+                recordings.add(found)
+                if beside is not None:
+                    beside.add(found.step, found.offsets)
+        except FloatingPointError as error:
+            kept.save()
+            raise ProgdfError(
+                f"training broke down: {error}; the state before it is kept: mend the edited views and go on "
+                "with --resume, or try --kind style in another folder"
+            ) from error
+    kept.save()
+    if beside is not None:
+        keep(beside, folder)
+    losses = loss_table([(made.step, made.means) for made in recordings.made])
+    left = [made.means["left"] for made in recordings.made]
+    log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
+    log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
+    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
+    end = stages[-1].place(state.average).clone()
+    if followers is not None and len(followers.places):
+        count = len(followers.places)
+        if solver is not None:
+            log.say(f"{count} members that no view shows follow their neighbours")
+        elif no_worse(followers, end, original, crops, stages):
+            snapshots = [(step, stage, last, followers.led(made)) for step, stage, last, made in snapshots]
+            end = followers.led(end)
+            log.say(f"{count} members that no view shows follow their neighbours")
+        else:
+            log.say(
+                f"{count} members that hardly show keep what they learnt: "
+                "following their neighbours would take the training views away from the edit"
+            )
+    if groups is not None:
+        ends = [made for made in recordings.made if made.ends_stage]
+        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
+        snapshots = way(original, groups, offsets, [made.step for made in ends], settings.snapshots)
+    return record(snapshots, end, list(edited)), losses
+
+
+def no_worse(
+    followers: Followers,
+    end: Tensor,
+    original: Tensor,
+    crops: Sequence[CropScene],
+    stages: Sequence[Stage],
+) -> bool:
+    """Whether the training views stay as near to the finished edit as they are, to a hundredth."""
+
+    def error(offsets: Tensor) -> float:
+        pairs = zip(render_all(crops, original + offsets, COLORS), stages[-1].targets, strict=True)
+        return sum(float((picture - target).square().sum()) for picture, target in pairs)
+
+    return error(followers.led(end)) <= 1.01 * error(end)
+
+
+def _with_bands_decided(options: TrainOptions, stand: Stand, kind: EditKind, log: RunLog) -> TrainOptions:
+    """`options.sh` as "on" or "off": a colour edit trains the bands where the region's own show (`sheen`)."""
+    if options.sh != "auto" or stand.scene.sh_degree == 0:
+        return options
+    if kind != "colour" or options.rates == "3dgs":
+        return replace(options, sh="on")
+    change = view_dependence(stand.scene[stand.region.members], [view.camera for view in stand.train])
+    needed = change >= NEEDED
+    log.say(
+        f"the region's colours change with the view by {change:.3f} of 1: "
+        f"the SH bands beyond DC are {'trained' if needed else 'left as they are'} ({NEEDED:g} is needed)"
+    )
+    return replace(options, sh="on" if needed else "off")
+
+
+def _groups(
+    options: TrainOptions,
+    original: Tensor,
+    crops: Sequence[CropScene],
+    targets: Sequence[Sequence[Tensor]],
+    folder: StateFolder,
+    log: RunLog,
+) -> Groups:
+    """The group stage, or what was saved of it."""
+    done = folder.load("groups")
+    if done is not None:
+        return restored_groups(original, done.tensors)
+    steps = group_steps(options, "geometry")
+    try:
+        with log.steps("move parts", steps * len(targets)) as advance:
+            groups = group_stage(
+                original,
+                crops,
+                targets,
+                steps,
+                options.seed,
+                lambda step, loss: advance(step, f"loss {loss:.4f}"),
+            )
+    except FloatingPointError as error:
+        raise ProgdfError(
+            f"training broke down: {error}; mend the edited views and go on with --resume"
+        ) from error
+    folder.save("groups", groups.saved(), {})
+    for line in groups.lines():
+        log.say(line)
+    return groups
+
+
+def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions, log: RunLog) -> Trajectory:
+    """Without jitter, and at the slider values where its change is due; every recording is rendered once."""
+    moving = moving_attributes(trajectory.end)
+    small = probes(stand, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
+    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    shown: list[Tensor] = []
+    with log.steps("time the slider", len(trajectory)) as advance:
+        for i in range(len(trajectory)):
+            images = render_all(small, rows + trajectory.node(i), moving)
+            shown.append(torch.cat([image.flatten() for image in images]))
+            advance(i + 1, "recordings")
+    if options.recording == "smooth":
+        kept = straight_recordings(trajectory, shown)
+        trajectory, shown = with_recordings(trajectory, kept), [shown[i] for i in kept]
+    slider = slider_meant(options.slider, options.editor, trajectory.strengths)
+    return retime(trajectory, shown, slider)
+
+
+def _shared(steps: int, stages: int) -> list[int]:
+    """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
+    marks = [steps * i // (stages + 1) for i in range(stages)]
+    return [b - a for a, b in pairwise([*marks, steps])]

@@ -1,0 +1,1 @@
+"""Regions that pictures tell of."""

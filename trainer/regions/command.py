@@ -1,0 +1,147 @@
+"""`progdf region`: what a region selects, as a picture or as a file of rows."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.errors import ProgdfError
+from progdf.formats.load_report import counted, grouped
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import Gaussians
+from progdf.io.atomic import written_whole
+from progdf.io.cameras import load_cameras, read_camera
+from progdf.io.images import write_image
+from progdf.region import Region
+from progdf.scene.bounds import front
+from progdf.scene.region_spec import parse_region
+from progdf.scene.subject import fitted_eye, subject_rows
+from progdf.scene.up_axis import find_up
+from trainer.options import check_ranges
+from trainer.views.view import drawn, near_enough, seen_colors
+
+from .from_pictures import RegionSettings, region_kinds
+from .options import RegionOptions
+
+_TINT = torch.tensor([1.0, 0.32, 0.05])
+_TINTED = 0.55
+_PALE = 0.72
+"""The region keeps less than half of its own colour; the rest goes so far towards white, without its hue."""
+
+_FOV, _FILLED = math.radians(45.0), 0.9
+_SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
+
+
+def show(options: RegionOptions) -> str:
+    """Write what the options ask for; a line with the region's count, and where it lies.
+
+    Raises:
+        ProgdfError: scene, region or camera that do not work, or an output that is neither .png nor .npy.
+    """
+    suffix = options.out.suffix.lower()
+    if suffix not in (".png", ".npy"):
+        raise ProgdfError(
+            f"{options.out} is no .png or .npy file; a region is shown in the one or kept in the other"
+        )
+    if options.camera is not None and options.orbit is not None:
+        raise ProgdfError("--camera and --orbit were both given; give one of them")
+    check_ranges(("--lift-threshold", options.lift_threshold, 0, 1))
+    size = _size(options.size)
+    scene = load_scene(options.scene)
+    said: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        settings = RegionSettings(
+            options.cameras, 30, lambda: Path(folder), options.lift, options.lift_threshold,
+            up=options.up, scene=options.scene, say=said.append,
+        )  # fmt: skip
+        region = parse_region(options.spec, scene, kinds=region_kinds(settings))
+    if suffix == ".npy":
+        stored = io.BytesIO()
+        np.save(stored, region.members.numpy())
+        with written_whole(options.out) as beside:
+            beside.write_bytes(stored.getvalue())
+    else:
+        given = [] if options.cameras is None else load_cameras(options.cameras)
+        up = find_up(scene, given, options.up).direction
+        cameras = near_enough(_cameras(options, scene, up, size), scene)
+        write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
+    share = 100 * len(region) / max(1, len(scene))
+    said.append(f"wrote {options.out}: {counted(len(region))} of {grouped(len(scene))} ({share:.3g} %)")
+    return "\n".join(said)
+
+
+def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
+    """The scene in pale grey with the region tinted; what hides the region hides it here too. [H,W,3] 0..1"""
+    colors = seen_colors(scene, camera)
+    grey = (colors @ torch.tensor([0.299, 0.587, 0.114]))[:, None].clamp(0.0, 1.0)
+    shown = (grey + _PALE * (1 - grey)).expand(-1, 3).clone()
+    rows = region.members
+    # a light tint of its own brightness, so that shape and shading stay readable
+    shown[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * grey[rows]), _TINTED)
+    return drawn(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
+
+
+def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
+    if options.camera is not None:
+        return [replace(read_camera(options.camera), lens=None)]
+    if options.orbit is None:
+        return [_fitted(scene, up, azimuth, elevation, None, size) for azimuth, elevation in _SIDES]
+    words = options.orbit.split(",")
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)) or not -90 <= numbers[1] <= 90:
+        raise ProgdfError(
+            f"--orbit {options.orbit} is no AZIMUTH,ELEVATION[,DISTANCE] with an elevation of -90 to 90; "
+            "write for example --orbit 30,15"
+        )
+    away = numbers[2] if len(numbers) == 3 else None
+    if away is not None and not 0 < away <= 1e9:
+        raise ProgdfError(f"--orbit {options.orbit}: the distance must be above 0 and up to 1e9")
+    return [_fitted(scene, up, numbers[0], numbers[1], away, size)]
+
+
+def _fitted(
+    scene: Gaussians, up: Tensor, azimuth: float, elevation: float, away: float | None, size: tuple[int, int]
+) -> Camera:
+    """A camera that what the scene is about fills, from this direction; as `progdf render --orbit`."""
+    ahead = front(up)
+    side = torch.linalg.cross(up, ahead)
+    around, above = math.radians(azimuth), math.radians(elevation)
+    back = math.cos(above) * (math.cos(around) * ahead + math.sin(around) * side) + math.sin(above) * up
+    axes = look_at(back, torch.zeros(3), up)[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]])
+    shown = scene[subject_rows(scene, up)]
+    tangent = _FILLED * math.tan(0.5 * _FOV)
+    radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
+    eye = fitted_eye(shown.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
+    if away is not None:
+        depth = float(eye @ back - (shown.means @ back).median())
+        eye = eye + (away - depth) * back
+    return Camera(look_at(eye, eye - back, up), intrinsics(_FOV, *size), *size)
+
+
+def _sheet(pictures: Sequence[Tensor]) -> Tensor:
+    """One picture as it is, four in two rows. [H,W,3]"""
+    if len(pictures) == 1:
+        return pictures[0]
+    half = len(pictures) // 2
+    return torch.cat([torch.cat(list(pictures[:half]), dim=1), torch.cat(list(pictures[half:]), dim=1)])
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal()) or not all(
+        1 <= int(side) <= 8192 for side in (width, height)
+    ):
+        raise ProgdfError(f"--size {text} is no size; write WIDTHxHEIGHT of up to 8192, for example 640x480")
+    return int(width), int(height)

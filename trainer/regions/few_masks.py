@@ -1,0 +1,124 @@
+"""What a handful of rough masks leaves wrong in a region, and puts right: strays, loose pieces, holes.
+
+Many masks outvote each other's mistakes. With a few, what stands behind the region and is seen past its
+border by one view alone would be taken whole: a tree behind a bear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from progdf.formats.load_report import counted
+from progdf.gaussians import Gaussians
+
+FEW = 8
+"""Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""
+
+_LINKS, _REACH = 8, 2.5
+"""A member is linked to its 8 nearest that are nearer than 2.5 times what is usual for the eighth."""
+
+_PIECE = 0.1
+"""Of the largest connected surface: smaller ones are strays."""
+
+_AROUND, _FILLED, _ROUNDS = 12, 0.75, 3
+"""A hole is what has three quarters members among its 12 nearest, in up to three rounds."""
+
+
+def without_strays(
+    scene: Gaussians,
+    member: Tensor,
+    views: Tensor,
+    views_inside: Tensor,
+    say: Callable[[str], None] | None = None,
+) -> Tensor:
+    """The members that two masks hold where two views see them, in large connected surfaces.
+
+    Args:
+        scene: N Gaussians
+        member: by their score alone. [N] bool
+        views: how many views with a mask show each. [N]
+        views_inside: in how many of these it lies inside the mask. [N]
+        say: hears in a line each what was taken away
+
+    Returns:
+        [N] bool
+    """
+    twice = member & ((views < 2) | (views_inside >= 2))
+    _tell(
+        say,
+        int(member.sum()) - int(twice.sum()),
+        "inside one mask only, where two views see it, left to what surrounds them",
+    )
+    if not bool(twice.any()):
+        return twice
+    rows = twice.nonzero()[:, 0]
+    piece = _pieces(scene.means[rows].numpy())
+    sizes = np.bincount(piece)
+    # what two masks hold counts, not what one view alone shows: a tree may be larger than the bear
+    sure = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
+    weight = sure if sure.any() else sizes
+    kept = torch.from_numpy((weight >= _PIECE * weight.max())[piece])
+    result = torch.zeros_like(member)
+    result[rows[kept]] = True
+    dropped = int((~kept).sum())
+    pieces = int((weight >= _PIECE * weight.max()).sum())
+    _tell(say, dropped, f"apart from the {counted(pieces, 'largest connected surface')}, left out")
+    return result
+
+
+def holes_of(
+    scene: Gaussians, member: Tensor, views_outside: Tensor, say: Callable[[str], None] | None = None
+) -> Tensor:
+    """The Gaussians to add, as members surround them and no two views see them outside the masks.
+
+    Args:
+        scene: N Gaussians
+        member: the region so far. [N] bool
+        views_outside: how many views show each outside their mask. [N]
+        say: hears how many they are
+
+    Returns:
+        Sorted rows. [H] int64
+    """
+    if not bool(member.any()):
+        return torch.zeros(0, dtype=torch.int64)
+    means = scene.means
+    inner = means[member]
+    low, high = inner.amin(dim=0), inner.amax(dim=0)
+    inside = ((means >= low) & (means <= high)).all(dim=1)
+    rows = (inside & ~member & (views_outside < 2)).nonzero()[:, 0].numpy()
+    if not len(rows):
+        return torch.zeros(0, dtype=torch.int64)
+    count = min(_AROUND + 1, len(means))
+    near = cKDTree(means.numpy()).query(means.numpy()[rows], k=count)[1].reshape(len(rows), -1)[:, 1:]
+    filled = member.numpy().copy()
+    for _ in range(_ROUNDS):
+        filled[rows[filled[near].mean(axis=1) >= _FILLED]] = True
+    holes = torch.from_numpy(np.flatnonzero(filled & ~member.numpy()))
+    _tell(say, len(holes), "in holes of it, added")
+    return holes
+
+
+def _pieces(points: np.ndarray) -> np.ndarray:
+    """Which connected piece each point belongs to. [P,3] -> [P] int"""
+    count = min(_LINKS + 1, len(points))
+    if count < 2:
+        return np.zeros(len(points), np.int64)
+    apart, near = cKDTree(points).query(points, k=count)
+    held = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
+    first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[held]
+    links = coo_matrix((np.ones(len(first), np.bool_), (first, near[held])), (len(points), len(points)))
+    pieces: np.ndarray = connected_components(links, directed=False)[1]
+    return pieces
+
+
+def _tell(say: Callable[[str], None] | None, count: int, what: str) -> None:
+    if say is not None and count:
+        say(f"the masks: {counted(count)} {what}")

@@ -1,0 +1,101 @@
+"""Neighbours among splats: the nearest ones, and which of them lie on the same surface."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from progdf.gaussians import Gaussians
+from progdf.rasterize.threads import threads
+from progdf.scene.bounds import normals_of
+from progdf.sh import sh0_to_rgb
+
+_NEIGHBOURS = 96
+_ROUNDS = 100
+
+# Standard deviations within one surface. The bear's parts lift back with IoU .977-.999, the worst without the
+# normals with .905, without the sizes .871, without the planes .957. Colours and distance gain nothing there,
+# but not everywhere do parts differ in size. The first three may be half as large again.
+_NEAR = 8  # the distance to this neighbour is the unit of the next two
+_ALONG, _OFF_PLANE = 2.0, 0.5
+_TURN = 0.18  # radians between the normals
+_COLOUR = 0.16  # sRGB, length of the difference
+_SIZE = 0.25  # natural logarithm of the three scales, length of the difference
+
+
+def nearest_rows(points: Tensor, rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The k nearest other points of some of the points, exactly.
+
+    Args:
+        points: all points, finite. [N,3]
+        rows: those whose neighbours are wanted. [Q] int64
+        k: how many, 1..N−1; fewer where there are not as many points
+
+    Returns:
+        Their rows, nearest first, [Q,k] int64; their distances [Q,k].
+    """
+    k = min(k, len(points) - 1)
+    tree = cKDTree(points.double().numpy())
+    distances, found = tree.query(points[rows].double().numpy(), k + 1, workers=threads())
+    dropped = found == rows.numpy()[:, None]
+    dropped[~dropped.any(axis=1), -1] = True  # more points than k in its own place, and it is not among them
+    others = ~dropped
+    return (
+        torch.from_numpy(found[others].reshape(len(rows), k)),
+        torch.from_numpy(distances[others].reshape(len(rows), k)).float(),
+    )
+
+
+def surface_vote(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
+    """Whether what surrounds each undecided Gaussian, on its own surface, belongs to the members.
+
+    Nearness in space alone would give the lining of a scarf to the neck under it. What counts is nearness
+    along the surface: neighbours in each other's tangent plane that face the same way and have the same
+    colour and size. Undecided neighbours vote as they are voted on themselves (the harmonic extension of the
+    decided ones), so that a decision travels along a surface to where no view looks.
+
+    Args:
+        scene: N Gaussians
+        member: whether each decided Gaussian is a member; ignored for the undecided. [N] bool
+        undecided: rows to decide. [U] int64
+
+    Returns:
+        −1 none does .. 1 all do, 0 where no decided Gaussian is in reach. [U]
+    """
+    near, weights = surface_likeness(scene, undecided)
+    vote = 2.0 * member.float() - 1.0
+    vote[undecided] = 0.0
+    for _ in range(_ROUNDS):
+        vote[undecided] = (weights * vote[near]).sum(dim=1)
+    return vote[undecided]
+
+
+def surface_likeness(scene: Gaussians, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest others of some Gaussians [Q,k] int64, and how likely each lies on the same surface [Q,k].
+
+    The likelihoods of each add up to 1; see `surface_vote` for what they go by.
+    """
+    near, distances = nearest_rows(scene.means, rows, _NEIGHBOURS)
+    return near, _likeness(scene, rows, near, distances)
+
+
+def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
+    """How likely each neighbour is of the same surface; sums to 1. [Q,k]"""
+    unit = distances[:, min(_NEAR, distances.shape[1]) - 1, None].clamp_min(1e-12)
+    normals, colours = normals_of(scene), sh0_to_rgb(scene.sh0)
+    sizes = scene.log_scales.sort(dim=1).values
+    across = scene.means[near] - scene.means[rows, None]
+    off_plane = torch.maximum(
+        (across * normals[rows, None]).sum(dim=2).abs(), (across * normals[near]).sum(dim=2).abs()
+    )
+    # 1 − cos is half the angle squared
+    turned = (2 - 2 * (normals[rows, None] * normals[near]).sum(dim=2).abs()).clamp_min(0.0)
+    unlike = (
+        (distances / (_ALONG * unit)) ** 2
+        + (off_plane / (_OFF_PLANE * unit)) ** 2
+        + turned / _TURN**2
+        + (colours[near] - colours[rows, None]).square().sum(dim=2) / _COLOUR**2
+        + (sizes[near] - sizes[rows, None]).square().sum(dim=2) / _SIZE**2
+    )
+    return torch.softmax(-0.5 * unlike, dim=1)

@@ -1,0 +1,63 @@
+"""`progdf views`: the originals that a person draws masks or edits on, and the cameras they belong to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.formats.scene_file import load_scene
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.images import write_image
+from progdf.region import everything
+from progdf.scene.bounds import is_surrounding
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.region_spec import parse_region
+from progdf.scene.up_axis import find_up
+from trainer.options import check_ranges
+from trainer.views.choose import choose_views
+from trainer.views.view import BACKGROUND, INSIDE, fit_size, named, near_enough, pictured, region_rig
+
+from .from_pictures import RegionSettings, region_kinds
+from .options import ViewsOptions
+
+
+def write(options: ViewsOptions) -> str:
+    """Write OUT/original/NAME.png and OUT/cameras.json; what to do with them, in a line.
+
+    Raises:
+        ProgdfError: scene, cameras or region that do not work, or a folder that has such cameras already.
+    """
+    check_ranges(("--views", options.views, 1, 96), ("--image-size", options.image_size, 32, 4096))
+    out, background = options.out, torch.tensor(BACKGROUND)
+    if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
+        raise ProgdfError(f"{out / 'cameras.json'} is there already; give --out another folder")
+    scene = load_scene(options.scene)
+    given = [] if options.cameras is None else load_cameras(options.cameras)
+    up = find_up(scene, given, options.up).direction
+    region = None
+    if options.region is not None:
+        settings = RegionSettings(options.cameras, options.views, lambda: out / "segmented", up=options.up)
+        region = parse_region(options.region, scene, kinds=region_kinds(settings))
+    if given:
+        # what is drawn is straight, and so are the masks: no lens
+        cameras = [replace(fit_size(camera, options.image_size), lens=None) for camera in given]
+    elif is_surrounding(scene, up):
+        raise ProgdfError(f"{options.scene} {INSIDE}")
+    elif region is not None:
+        cameras = region_rig(scene, region, options.views, options.image_size, up)
+    else:
+        cameras = orbit_rig(scene, options.views, options.image_size, options.image_size, up=up)
+    cameras = near_enough(named(cameras), scene)
+    if len(cameras) > options.views:
+        choice = choose_views(scene, region or everything(scene), cameras, options.views, background)
+        cameras = [view.camera for view in choice.views]
+    for camera in cameras:
+        write_image(out / "original" / f"{camera.name}.png", pictured(scene, camera, background))
+    save_cameras(out / "cameras.json", cameras)
+    return (
+        f"wrote {len(cameras)} views to {out / 'original'}; draw masks (white on black) as "
+        f"{out}/NAME.png for some of them, then progdf train {options.scene} "
+        f"--cameras {out / 'cameras.json'} --region masks:{out} …"
+    )

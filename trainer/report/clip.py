@@ -1,0 +1,139 @@
+"""CLIP directional similarity (Gal et al. 2022, StyleGAN-NADA): does the picture change as the words do?
+
+    cos( f(I_s) − f(I_0), f(text after) − f(text before) ),  f: CLIP features of unit length
+
+Signed, over the slider, the mean of held-out views and never the best of several positions; undefined where
+nothing changes, as at s = 0. Weights are gigabytes: they are read from this machine, never fetched unasked.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize, pad
+
+from progdf.errors import ProgdfError
+from trainer.options import CLIP_MODEL
+from trainer.store.pretrained import BROKEN
+
+EXTRA = "pip install progdf-studio[clip]"
+
+_MEAN, _SPREAD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of CLIP's input
+
+
+@dataclass(frozen=True)
+class Clip:
+    """CLIP's two networks; make it with `load_clip`.
+
+    Args:
+        network: a `transformers.CLIPModel`
+        tokenizer: its tokenizer
+        size: side of the pictures it takes, pixels
+        name: as report.json names it
+    """
+
+    network: Any
+    tokenizer: Any
+    size: int
+    name: str
+
+    def pictures(self, images: Sequence[Tensor]) -> Tensor:
+        """Features of pictures [H,W,3] of range 0..1, of unit length. [n,D]"""
+        shift, scale = torch.tensor(_MEAN)[:, None, None], torch.tensor(_SPREAD)[:, None, None]
+        inputs = torch.stack([(_square(image, self.size) - shift) / scale for image in images])
+        with torch.no_grad():
+            return normalize(_features(self.network.get_image_features(pixel_values=inputs)), dim=-1)
+
+    def texts(self, sentences: Sequence[str]) -> Tensor:
+        """Features of sentences, of unit length; words beyond CLIP's 77 tokens are cut. [n,D]"""
+        tokens = self.tokenizer(list(sentences), padding=True, truncation=True, return_tensors="pt")
+        with torch.no_grad():
+            features = self.network.get_text_features(
+                input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+            )
+        return normalize(_features(features), dim=-1)
+
+
+def load_clip(model: str = CLIP_MODEL) -> Clip:
+    """Read CLIP from this machine.
+
+    Args:
+        model: id on the Hugging Face hub, downloaded before, or a folder of a saved model
+
+    Raises:
+        ProgdfError: transformers is not installed, or the model is not on this machine, or is no CLIP.
+    """
+    try:
+        from transformers import AutoConfig, AutoTokenizer, CLIPModel
+        from transformers.utils import logging as speaks
+    except ImportError as error:
+        raise ProgdfError(f"CLIP needs the package transformers ({error}); {EXTRA}") from error
+    speaks.set_verbosity(logging.ERROR)
+    speaks.disable_progress_bar()
+    try:
+        config = AutoConfig.from_pretrained(model, local_files_only=True)
+    except BROKEN as error:
+        raise ProgdfError(_missing(model)) from error
+    if config.model_type != "clip":
+        raise ProgdfError(f"{model} is a {config.model_type} model, no CLIP; give --clip-model {CLIP_MODEL}")
+    try:
+        network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
+        tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
+    except BROKEN as error:
+        raise ProgdfError(_missing(model)) from error
+    return Clip(network.float().eval(), tokenizer, int(config.vision_config.image_size), _name(model))
+
+
+def direction(before: Tensor, after: Tensor, text_before: Tensor, text_after: Tensor) -> list[float | None]:
+    """Directional similarity of each picture, −1..1; None where the picture or the text does not change.
+
+    Args:
+        before, after: features of the pictures, of unit length. [n,D]
+        text_before, text_after: features of the texts, of unit length. [D]
+    """
+    said = (text_after - text_before).double()
+    seen = (after - before).double()
+    lengths = seen.norm(dim=1) * said.norm()
+    cosines = (seen @ said) / lengths.clamp_min(1e-30)
+    # features of equal pictures differ by rounding, which has a direction too
+    return [float(c) if float(n) > 1e-9 else None for c, n in zip(cosines, lengths, strict=True)]
+
+
+def _features(found: Any) -> Tensor:
+    """transformers 5 returns an output object, 4 the features themselves."""
+    features = found if isinstance(found, Tensor) else found.pooler_output
+    assert isinstance(features, Tensor)
+    return features.float()
+
+
+def _square(image: Tensor, size: int) -> Tensor:
+    """The whole picture, on a white square, as large as CLIP takes it. [H,W,3] -> [3,size,size]
+
+    CLIP's own way cuts the sides off a picture that is no square; a region near the edge would be lost.
+    """
+    height, width = image.shape[:2]
+    side = max(height, width)
+    left, top = (side - width) // 2, (side - height) // 2
+    planes = image.permute(2, 0, 1)[None]
+    planes = pad(planes, (left, side - width - left, top, side - height - top), value=1.0)
+    scaled = interpolate(planes, size=(size, size), mode="bicubic", align_corners=False, antialias=True)
+    return scaled[0].clamp(0.0, 1.0)
+
+
+def _name(model: str) -> str:
+    return Path(model).name if Path(model).is_dir() else model
+
+
+def _missing(model: str) -> str:
+    if Path(model).is_dir() or model.startswith((".", "/", "~")):
+        return f"{model} holds no whole CLIP model with safetensors weights; give --clip-model such a folder"
+    return (
+        f"the weights of {model} are not on this machine, or not whole; download them with "
+        f"'hf download {model}', or give --clip-model the folder of a saved model"
+    )

@@ -1,0 +1,308 @@
+"""What a run reached: errors over the slider on held-out views, how the slider feels, what CLIP says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field import BakedField
+from progdf.field.evaluate import sample_strengths
+from progdf.field.remap import Dial
+from progdf.field.trajectory import Trajectory
+from progdf.metrics.slider import SliderStatistics, slider_statistics
+from trainer.fit.evaluate import Judge
+from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
+from trainer.optimize.losses import Perceptual
+from trainer.views.view import View
+
+from .clip import Clip, direction, load_clip
+
+COMPARED = "keyframes2"
+"""The baseline whose courses stand beside the field's: what anyone would do first."""
+
+_EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
+_NODES = 6  # recordings at which the field is looked at
+CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
+
+
+@dataclass(frozen=True)
+class Course:
+    """Errors of pictures along the slider, over all held-out views.
+
+    Args:
+        s: slider values, ascending
+        psnr: over the pixels that count, dB, at most 99
+        ssim: over the same, at most 1
+        lpips: of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `edit.perceptual`)
+    """
+
+    s: tuple[float, ...]
+    psnr: tuple[float, ...]
+    ssim: tuple[float, ...]
+    lpips: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Direction:
+    """CLIP directional similarity along the slider.
+
+    Args:
+        s: slider values; none where nothing was measured
+        similarity: mean over held-out views, −1..1; None where it is undefined, as at 0
+        model: the CLIP model, "" where nothing was measured
+        reason: why nothing was measured, "" where it was
+    """
+
+    s: tuple[float, ...] = ()
+    similarity: tuple[float | None, ...] = ()
+    model: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Texts:
+    """What the pictures show before and after, in words, and which CLIP reads them."""
+
+    before: str
+    after: str
+    model: str
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Everything about the fitted field that the report tells, measured on held-out views.
+
+    Args:
+        fitted: the field and its baselines, on the trajectory's slider
+        shown: the field as it is shipped, on a slider of its own
+        dial: from the trajectory's slider to that
+        asked: slider value of what the editor was asked for, and the strength that it was asked at
+        slider: how the slider feels
+        at_recordings: worst PSNR of the field at the recordings themselves, dB
+        trajectory: "slider" and the compared baseline against the recorded trajectory
+        editor: the same against the editor's own pictures, at the strengths it was asked for
+        perceptual: name of the perceptual distance
+        clip: see `Direction`
+    """
+
+    fitted: Fitted
+    shown: BakedField
+    dial: Dial
+    asked: Sequence[tuple[float, float]]
+    slider: SliderStatistics
+    at_recordings: float
+    trajectory: Mapping[str, Course]
+    editor: Mapping[str, Course]
+    perceptual: str
+    clip: Direction
+
+
+def measure(
+    judge: Judge,
+    trajectory: Trajectory,
+    fitted: Fitted,
+    shown: BakedField,
+    dial: Dial,
+    perceptual: Perceptual,
+    clip: Direction,
+) -> Measured:
+    """Measure the chosen field beside the compared baseline.
+
+    Args:
+        judge: held-out views
+        trajectory: what was recorded
+        fitted: the field and its baselines
+        shown: the field as it is shipped
+        dial: from the trajectory's slider to the shipped field's
+        perceptual: LPIPS, or its stand-in
+        clip: measured already, or the reason why not
+    """
+    field = fitted.chosen.field
+    fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
+    slider = slider_statistics(lambda s: judge.pictures(shown.offsets(s)), masks=judge.pixels)
+    samples = sample_strengths()[::_EVERY]
+    recorded = courses(judge, fields, samples, lambda s: judge.pictures(trajectory.at(s)), perceptual)
+    recorded = {n: replace(c, s=tuple(dial.at(s) for s in c.s)) for n, c in recorded.items()}
+    asked = tuple((dial.at(s), strength) for s, strength in trajectory.asked)
+    drawn = against_editor(judge, {**fields, "slider": shown}, asked, perceptual)
+    nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
+    worst = min(
+        (judge.psnr(judge.pictures(field.offsets(s)), judge.pictures(trajectory.at(s))) for s in nodes),
+        default=fitted.chosen.worst,
+    )
+    return Measured(fitted, shown, dial, asked, slider, worst, recorded, drawn, perceptual.name, clip)
+
+
+def expected_measures(trajectory: Trajectory) -> int:
+    """About how often `measure` looks at its views, for a progress bar."""
+    return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
+
+
+def clip_course(judge: Judge, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
+    """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
+
+    Args:
+        judge: held-out views
+        views: the same, whole
+        field: what the slider shows
+        texts: see `Texts`
+    """
+    for text, option in ((texts.before, "--text-before"), (texts.after, "--text-after")):
+        if not text.strip():
+            return Direction(reason=f"{option} was not given: it takes a text for each end of the slider")
+    try:
+        clip = load_clip(texts.model)
+    except ProgdfError as error:
+        return Direction(reason=str(error))
+    before, after = clip.texts([texts.before, texts.after])
+    if torch.equal(before, after):
+        return Direction(reason="--text-before and --text-after say the same to CLIP")
+    original = clip.pictures([view.image for view in views])
+    course = [
+        _mean(direction(original, _seen(clip, judge, views, field.offsets(s)), before, after)) if s else None
+        for s in CLIP_STRENGTHS
+    ]
+    return Direction(CLIP_STRENGTHS, tuple(course), clip.name)
+
+
+def figures(measured: Measured, endpoint_error: float, outside_change: float) -> dict[str, Any]:
+    """The part of report.json that depends on the field (see docs of the command line)."""
+    fitted, slider = measured.fitted, measured.slider
+    course, drawn, linear = (
+        measured.trajectory["slider"],
+        measured.editor["slider"],
+        measured.editor[COMPARED],
+    )
+    similarity = measured.clip.similarity
+    return {
+        "field": {
+            **field_figures(fitted.chosen),
+            "parameters": stored_numbers(measured.shown),
+            "psnr_at_recordings": round(measured.at_recordings, 2),
+            "ssim_mean": _four(sum(course.ssim) / len(course.ssim)),
+            "ssim_worst": _four(min(course.ssim)),
+            "lpips_mean": _four(sum(course.lpips) / len(course.lpips)),
+            "lpips_worst": _four(max(course.lpips)),
+            "endpoint_error": endpoint_error,
+            "outside_change": outside_change,
+            "target_met": fitted.met,
+        },
+        "choice": choice_figures(fitted),
+        "baselines": {name: field_figures(errors) for name, errors in fitted.baselines.items()},
+        "slider": {
+            "monotone": slider.monotone,
+            "uniformity": round(slider.uniformity, 3),
+            "largest_jump": round(slider.largest_jump, 5),
+            "t50": round(slider.t50, 3),
+            "t90": round(slider.t90, 3),
+        },
+        "between": {
+            f"{round(s, 4):g}": {"psnr": round(ours, 2), COMPARED: round(plain, 2), "strength": strength}
+            for (s, strength), ours, plain in zip(measured.asked, drawn.psnr, linear.psnr, strict=True)
+            if s < 1.0
+        },
+        "edit": {
+            "psnr_to_views": round(drawn.psnr[-1], 2),
+            "ssim_to_views": _four(drawn.ssim[-1]),
+            "lpips_to_views": _four(drawn.lpips[-1]),
+            "perceptual": measured.perceptual,
+            "clip_direction": similarity[-1] if similarity else None,
+            **({"clip_model": measured.clip.model} if similarity else {"clip_reason": measured.clip.reason}),
+        },
+        "curves": {
+            "against_trajectory": {name: _listed(found) for name, found in measured.trajectory.items()},
+            "against_editor": {name: _listed(found) for name, found in measured.editor.items()},
+            "change": {
+                "from_original": [_four(distance) for distance in slider.distances],
+                "per_step": [_four(step) for step in slider.steps],
+            },
+            "clip_direction": {"s": measured.clip.s, "similarity": similarity} if similarity else None,
+        },
+    }
+
+
+def courses(
+    judge: Judge,
+    fields: Mapping[str, BakedField],
+    strengths: Sequence[float],
+    truth: Callable[[float], Sequence[Tensor]],
+    perceptual: Perceptual,
+) -> dict[str, Course]:
+    """Each field's errors on held-out views, over the slider.
+
+    Args:
+        judge: the views
+        fields: by name
+        strengths: slider values, ascending
+        truth: what the pictures should be at one of them. -> [h,w,3] each
+        perceptual: LPIPS, or its stand-in
+    """
+    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in fields}
+    for s in strengths:
+        expected = truth(s)
+        for name, field in fields.items():
+            found = judge.pictures(field.offsets(s))
+            rows[name].append(
+                (
+                    judge.psnr(found, expected),
+                    judge.ssim(found, expected),
+                    judge.perceptual(found, expected, perceptual, "measured"),
+                )
+            )
+        perceptual.forget()
+    return {
+        name: Course(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
+        for name, found in rows.items()
+    }
+
+
+def against_editor(
+    judge: Judge,
+    fields: Mapping[str, BakedField],
+    asked: Sequence[tuple[float, float]],
+    perceptual: Perceptual,
+) -> dict[str, Course]:
+    """Each field's errors against the editor's own pictures.
+
+    Args:
+        judge: held-out views with these pictures
+        fields: by name
+        asked: slider value and the strength that the editor was asked at, ascending
+        perceptual: LPIPS, or its stand-in
+    """
+    strength = dict(asked)
+    return courses(judge, fields, tuple(strength), lambda s: judge.edited[strength[s]], perceptual)
+
+
+def _seen(clip: Clip, judge: Judge, views: Sequence[View], offsets: Tensor) -> Tensor:
+    """CLIP's features of the whole views with these offsets. [n,D]"""
+    whole = []
+    for view, scene, picture in zip(views, judge.crops, judge.pictures(offsets), strict=True):
+        x0, y0, x1, y1 = scene.box
+        image = view.image.clone()
+        image[y0:y1, x0:x1] = picture
+        whole.append(image)
+    return clip.pictures(whole)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return _four(sum(known) / len(known)) if known else None
+
+
+def _listed(course: Course) -> dict[str, list[float]]:
+    return {
+        "s": [_four(s) for s in course.s],
+        "psnr": [round(value, 2) for value in course.psnr],
+        "ssim": [_four(value) for value in course.ssim],
+        "lpips": [_four(value) for value in course.lpips],
+    }
+
+
+def _four(value: float) -> float:
+    return round(value, 4)

@@ -1,0 +1,218 @@
+"""report.png: what a run reached, to look at; its figures come from `measures`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.field import BakedField
+from progdf.field.evaluate import sample_strengths
+from progdf.io.images import contact_sheet, to_picture
+from trainer.fit.evaluate import Judge
+from trainer.optimize.objective import Losses
+
+from .measures import COMPARED, Course, Direction, Measured
+from .plots import PAPER, Plot, Points, draw_plot
+
+SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+Columns = Sequence[tuple[float, float | None]]
+"""Slider value of each picture, and the strength at which the editor was asked there; None: it was not."""
+
+_CLOSE = 1 / 16  # a picture is shown where the editor was asked if that is so near
+_SPAN = (0.0, 1.0)
+_THUMBNAIL, _PLOT_HEIGHT = 240, 270
+_TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
+
+
+def report_picture(judge: Judge, measured: Measured, losses: Losses, title: str) -> Tensor:
+    """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
+
+    Args:
+        judge: held-out views; the one that shows most of the region is pictured
+        measured: see `Measured`
+        losses: mean of every loss term per recording
+        title: one line
+    """
+    chosen, linear = measured.shown, measured.fitted.baselines[COMPARED].field
+    columns = columns_of(measured.asked)
+    sheet = to_picture(
+        contact_sheet(
+            [strip(judge, chosen, columns), editor_strip(judge, columns), strip(judge, linear, columns)],
+            ["slider", "the editor", "2 keyframes"],
+            [headed(*column) for column in columns],
+            title,
+            f"held-out view {judge.names[best_view(judge)]}"
+            + ("; grey: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
+        )
+    )
+    rows = [_against_trajectory(measured)]
+    if len(judge.edited) > 1:
+        rows.append(_against_editor(measured))
+    rows.append(_feel(measured, losses))
+    return _stacked(sheet, rows)
+
+
+def best_view(judge: Judge) -> int:
+    """The view that shows most of the region."""
+    return max(range(len(judge.pixels)), key=lambda i: int(judge.pixels[i].sum()))
+
+
+def columns_of(asked: Sequence[tuple[float, float]]) -> Columns:
+    """Five slider values to show: `SHOWN`, or close by where the editor was asked.
+
+    Args:
+        asked: slider value and the strength that the editor was asked at, ascending, the last (1, 1)
+    """
+    columns: list[tuple[float, float | None]] = [(0.0, 0.0)]
+    for s in SHOWN[1:]:
+        at, strength = min(asked, key=lambda pair: abs(pair[0] - s))
+        columns.append((at, strength) if abs(at - s) <= _CLOSE else (s, None))
+    return columns
+
+
+def strip(judge: Judge, field: BakedField, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
+    """The best view at five strengths, as thumbnails of one size."""
+    best = best_view(judge)
+    return [thumbnail(judge.picture(field.offsets(s), best), width) for s, _ in columns]
+
+
+def editor_strip(judge: Judge, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
+    """What the editor makes of the best view; grey where it was not asked."""
+    best = best_view(judge)
+    blank = torch.full((*judge.crops[best].size, 3), 0.94)
+    original = judge.crops[best].original().clamp(0, 1)
+    own = [original, *(blank if at is None else judge.edited[at][best] for _, at in columns[1:])]
+    return [thumbnail(image, width) for image in own]
+
+
+def thumbnail(image: Tensor, width: int) -> Tensor:
+    """Scaled to a width, or less where that would make it tall, on paper. [H,W,3] -> [h,width,3]"""
+    picture = to_picture(image)
+    scale = min(width / picture.width, 1.25 * width / picture.height)
+    size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
+    page = Image.new("RGB", (width, size[1]), PAPER)
+    page.paste(picture.resize(size, Image.Resampling.LANCZOS), ((width - size[0]) // 2, 0))
+    return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
+
+
+def _against_trajectory(measured: Measured) -> list[Plot]:
+    fitted = measured.fitted
+    s = [measured.dial.at(s) for s in sample_strengths()]
+    fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
+    curves: dict[str, Points] = {
+        f"{_words(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
+        for name, found in fields.items()
+    }
+    return [
+        Plot("PSNR to the recorded trajectory, dB", curves, "slider", span=_SPAN),
+        Plot(
+            "SSIM to the trajectory",
+            _lines(measured.trajectory, lambda c: c.ssim),
+            "slider",
+            high=1.0,
+            span=_SPAN,
+        ),
+        Plot(
+            f"{_distance(measured)} to the trajectory",
+            _lines(measured.trajectory, lambda c: c.lpips),
+            "slider",
+            low=0.0,
+            span=_SPAN,
+        ),
+    ]
+
+
+def _against_editor(measured: Measured) -> list[Plot]:
+    courses = measured.editor
+    return [
+        Plot(
+            "PSNR to the editor's own pictures, dB", _lines(courses, lambda c: c.psnr), "slider", span=_SPAN
+        ),
+        Plot(
+            "SSIM to the editor's pictures", _lines(courses, lambda c: c.ssim), "slider", high=1.0, span=_SPAN
+        ),
+        Plot(
+            f"{_distance(measured)} to the editor's pictures",
+            _lines(courses, lambda c: c.lpips),
+            "slider",
+            low=0.0,
+            span=_SPAN,
+        ),
+    ]
+
+
+def _feel(measured: Measured, losses: Losses) -> list[Plot]:
+    slider = measured.slider
+    plots = [
+        Plot(
+            "visible change from the original",
+            {"change": (_even(len(slider.distances)), slider.distances)},
+            "slider",
+            span=_SPAN,
+        ),
+        Plot(
+            f"visible change of each 1/{len(slider.steps)} of the slider",
+            {"change": (_even(len(slider.steps)), slider.steps)},
+            f"slider, 0 to 1; least over largest {slider.uniformity:.2f}",
+            form="bars",
+        ),
+        _training(losses, measured.perceptual),
+    ]
+    return [*plots, _clip(measured.clip)] if measured.clip.s else plots
+
+
+def _training(losses: Losses, perceptual: str) -> Plot:
+    """Every term over the steps that paid for it, weighted as it was."""
+    names = {**_TERMS, "perceptual": "LPIPS" if perceptual.startswith("lpips") else "gradient L1"}
+    lines: dict[str, Points] = {}
+    for term, column in losses.items():
+        rows = zip(losses["step"], column, strict=True)
+        paid = [(step, value) for step, value in rows if step is not None and value is not None]
+        if term != "step":
+            lines[names.get(term, term)] = ([step for step, _ in paid], [value for _, value in paid])
+    return Plot("loss terms as weighted", lines, "optimiser steps", "log")
+
+
+def _clip(found: Direction) -> Plot:
+    defined = [(s, v) for s, v in zip(found.s, found.similarity, strict=True) if v is not None]
+    line = ([s for s, _ in defined], [v for _, v in defined])
+    return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0, span=_SPAN)
+
+
+def _lines(courses: Mapping[str, Course], value: Callable[[Course], Sequence[float]]) -> dict[str, Points]:
+    return {_words(name): (course.s, value(course)) for name, course in courses.items()}
+
+
+def _distance(measured: Measured) -> str:
+    return "LPIPS" if measured.perceptual.startswith("lpips") else measured.perceptual
+
+
+def headed(s: float, asked: float | None) -> str:
+    """What stands above a column; the editor's strength where it is another number."""
+    own = "" if asked is None or abs(asked - s) < 5e-3 else f", editor {asked:.2g}"
+    return f"s = {round(s, 2):g}{own}"
+
+
+def _words(name: str) -> str:
+    return name.replace("keyframes", "") + " keyframes" if name.startswith("keyframes") else name
+
+
+def _even(count: int) -> list[float]:
+    return [i / max(1, count - 1) for i in range(count)]
+
+
+def _stacked(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:
+    """The sheet with rows of plots below it."""
+    page = Image.new("RGB", (sheet.width, sheet.height + len(rows) * _PLOT_HEIGHT), PAPER)
+    page.paste(sheet, (0, 0))
+    for i, plots in enumerate(rows):
+        width = sheet.width // len(plots)
+        for j, plot in enumerate(plots):
+            drawn = draw_plot(plot, width, _PLOT_HEIGHT)
+            page.paste(drawn, (j * width, sheet.height + i * _PLOT_HEIGHT))
+    return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)

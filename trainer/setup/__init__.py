@@ -1,0 +1,1 @@
+"""What training works on: cameras, their number and size, the originals."""

@@ -1,0 +1,183 @@
+"""What training works on: the views that look at the region, and what the editor makes of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.io.cameras import load_cameras
+from progdf.io.images import write_image
+from progdf.rasterize.threads import threads
+from progdf.region import Region
+from progdf.scene.bounds import is_surrounding
+from progdf.scene.up_axis import UpAxis, find_up
+from trainer.editors import EditorSettings, ImageEditor
+from trainer.editors.base import EditKind
+from trainer.editors.procedural import ColourEditor
+from trainer.options import TrainOptions
+from trainer.store.picture_list import add_pictures
+from trainer.store.progress import Advance
+from trainer.store.run_folder import RunFolder
+from trainer.views.choose import choose_views, split_views
+from trainer.views.crops import CropScene, crop_scene
+from trainer.views.view import BACKGROUND, INSIDE, View, fit_size, named, near_enough, region_rig
+
+from .resolution import sized
+
+_PROBES = 3
+
+Pictures = Mapping[float, Sequence[Tensor]]
+"""Strength → whole edited pictures, one per view. [H,W,3] each"""
+
+
+@dataclass(frozen=True)
+class Stand:
+    """The scene, the region, the views on it, and what is to be said of these."""
+
+    scene: Gaussians
+    region: Region
+    train: Sequence[View]
+    held_out: Sequence[View]
+    background: Tensor
+    notes: Sequence[str] = ()
+    up: UpAxis | None = None
+
+
+def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand:
+    """The views: the best of the given cameras, or of a rig that looks at the region.
+
+    Raises:
+        ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
+    """
+    background = torch.tensor(BACKGROUND)
+    given = [] if options.cameras is None else load_cameras(options.cameras)
+    up = find_up(scene, given, options.up)
+    if options.cameras is None and is_surrounding(scene, up.direction):
+        raise ProgdfError(f"{options.scene} {INSIDE}")
+
+    def cameras_of(image_size: int, views: int) -> list[Camera]:
+        if options.cameras is not None:
+            found = [fit_size(camera, image_size) for camera in given]
+        else:  # half as many again, as some will find the region hidden
+            found = region_rig(scene, region, views + views // 2, image_size, up.direction)
+        return near_enough(named(found), scene)
+
+    cameras, views, unresolved = sized(options, scene, region, cameras_of)
+    choice = choose_views(scene, region, cameras, views, background)
+    train, held_out = split_views(choice, max(1, len(choice.views) // 5))
+    notes = [f"up is {up.name}, {up.reason}"]
+    notes += [unresolved] if unresolved else []
+    notes += [choice.line()] if len(choice.views) < choice.offered else []
+    if any(view.camera.lens for view in choice.views):
+        notes.append(
+            "the cameras have lenses that bend photographs, the views here are straight: "
+            "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
+        )
+    return Stand(scene, region, train, held_out, background, notes, up)
+
+
+def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:
+    """What the editor is asked for: its own strengths, or `stages` even ones where any will do."""
+    return editor.stages or tuple((i + 1) / stages for i in range(stages))
+
+
+def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
+    """What the options say to a learned editor, and where it keeps its pictures."""
+    return EditorSettings(
+        options.model,
+        options.guidance,
+        options.image_guidance,
+        options.edit_steps,
+        options.edit_seed,
+        options.edit_size,
+        options.stages > 1,
+        options.confine,
+        folder.painted,
+    )
+
+
+def to_confine(editor: ImageEditor, options: TrainOptions, kind: EditKind) -> bool:
+    """Whether what the editor changed outside the region is to be put back."""
+    wanted = kind != "geometry" if options.confine == "auto" else options.confine == "yes"
+    return wanted and not editor.confined
+
+
+def edited_views(
+    editor: ImageEditor,
+    views: Sequence[View],
+    strengths: Sequence[float],
+    folder: RunFolder,
+    confined: bool,
+    advance: Advance,
+) -> dict[float, list[Tensor]]:
+    """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
+
+    Args:
+        editor: see `ImageEditor`
+        views: all views
+        strengths: what the editor is asked for
+        folder: where the pictures go
+        confined: put back what changed outside the region; members would be pulled over it otherwise
+        advance: progress
+    """
+    paths = {
+        strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
+    }
+
+    def edit(asked: tuple[float, int]) -> Tensor:
+        strength, i = asked
+        made = editor.edit(views[i], strength)
+        picture = eight_bits(views[i].confined(made) if confined else made)
+        write_image(paths[strength][i], picture)
+        return picture
+
+    add_pictures(folder.views, [path for some in paths.values() for path in some])
+    asked = [(strength, i) for strength in strengths for i in range(len(views))]
+    edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
+    with ThreadPoolExecutor(threads()) as pool:
+        # the others have a network, or draw: these use all cores by themselves
+        made = pool.map(edit, asked) if isinstance(editor, ColourEditor) else map(edit, asked)
+        try:
+            for done, ((strength, _), picture) in enumerate(zip(asked, made, strict=True), 1):
+                edited[strength].append(picture)
+                advance(done, f"strength {strength:g}")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return edited
+
+
+def widened(stand: Stand, edited: Pictures) -> Stand:
+    """The training views with boxes that hold all that the edit changes."""
+    views = [
+        view.widened([pictures[i] for pictures in edited.values()]) for i, view in enumerate(stand.train)
+    ]
+    return replace(stand, train=views)
+
+
+def probes(stand: Stand, count: int = _PROBES, still: bool = False) -> list[CropScene]:
+    """A few training views at half size, in which movement is measured. `still`: see `crop_scene`"""
+    chosen = stand.train[:: max(1, len(stand.train) // count)][:count]
+    return [
+        crop_scene(
+            stand.scene,
+            stand.region.members,
+            view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
+            (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
+            stand.background,
+            still,
+        )
+        for view in chosen
+    ]
+
+
+def eight_bits(image: Tensor) -> Tensor:
+    """What is left of an image in an 8-bit file. [H,W,3] -> [H,W,3]"""
+    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0

@@ -1,0 +1,150 @@
+"""How a run tells what it does: a bar with loss and time left on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from progdf.terminal import printable
+
+from .memory import PeakMemory
+from .state import Saved
+
+Advance = Callable[[int, str], None]
+"""Steps done so far, and a short word about them (the loss)."""
+
+_EVERY_S = 5.0
+
+
+class RunLog:
+    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds, and
+    the peak memory at its end.
+
+    The seconds are part of a run's saved state (`state.Resumable`): those of all its sessions add up.
+
+    Args:
+        path: log.txt; what is in it stays
+        quiet: the file only
+        refits: a later command on a finished run, whose own time counts apart
+    """
+
+    def __init__(self, path: Path, quiet: bool = False, refits: bool = False) -> None:
+        self.seconds: dict[str, float] = {}
+        self.refits = refits
+        self._earlier = 0.0
+        self._running: dict[str, float] = {}
+        self.memory = PeakMemory()
+        self._start = time.perf_counter()
+        self._file = path.open("a", encoding="utf-8", buffering=1)
+        self._console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._bar = self._console.is_terminal and not quiet
+
+    def rounded_seconds(self) -> dict[str, float]:
+        """Seconds by stage, and of all sessions of the run together: the total, or of a refit its own."""
+        all_of_it = {"refit" if self.refits else "total": self._total()}
+        return {name: round(seconds, 2) for name, seconds in {**self.seconds, **all_of_it}.items()}
+
+    def saved(self) -> Saved:
+        """Seconds so far; those of the stages that have not ended too."""
+        now = time.perf_counter()
+        running = {name: now - begun for name, begun in self._running.items()}
+        seconds = {
+            name: self.seconds.get(name, 0.0) + running.get(name, 0.0) for name in self.seconds | running
+        }
+        memory = {"by_stage": self.memory.by_stage, "peak": self.memory.peak()}
+        return Saved({}, {"seconds": seconds, "total": self._total(), "memory": memory})
+
+    def restore(self, saved: Saved) -> None:
+        """Add the seconds of the sessions before, and remember their peaks of memory."""
+        for name, seconds in saved.values["seconds"].items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        self._earlier = saved.values["total"]
+        self.memory.restore(**saved.values["memory"])
+
+    def note(self, text: str) -> None:
+        """A line for the file alone."""
+        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {printable(text)}\n")
+
+    def say(self, text: str) -> None:
+        """One line."""
+        self.note(text)
+        if self._bar:
+            self._console.print(f"[dim]{time.perf_counter() - self._start:6.1f} s[/dim]  {_escaped(text)}")
+        else:
+            self._console.print(_escaped(text), soft_wrap=True)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure a part of the run under `name`; a name that comes again adds up."""
+        begun = self._running[name] = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.memory.end(name)
+            del self._running[name]
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+
+    @contextmanager
+    def steps(self, what: str, total: int) -> Iterator[Advance]:
+        """A long stage of `total` steps: a bar on a terminal, a line every few seconds elsewhere."""
+        if self._bar:
+            columns = (
+                SpinnerColumn(),
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[word]}"),
+                TimeRemainingColumn(),
+            )
+            with Progress(*columns, console=self._console, transient=True) as progress:
+                task = progress.add_task(what, total=total, word="")
+                yield lambda done, word: progress.update(task, completed=done, word=word)
+            return
+        begun = last = time.perf_counter()
+
+        def advance(done: int, word: str) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            if now - last >= _EVERY_S and done < total:
+                last = now
+                left = (now - begun) / max(done, 1) * (total - done)
+                self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
+
+        yield advance
+
+    @contextmanager
+    def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:
+        """The same for a stage whose work comes in about `total` equal parts: call it at each."""
+        done = 0
+        with self.steps(what, total) as advance:
+
+            def looked() -> None:
+                nonlocal done
+                done += 1
+                advance(min(done, total), "")
+
+            yield looked
+
+    def close(self) -> None:
+        """End the file."""
+        with suppress(OSError):  # a full disk, which whoever could not write to it has told already
+            self._file.close()
+
+    def _total(self) -> float:
+        return self._earlier + time.perf_counter() - self._start
+
+
+def _escaped(text: str) -> str:
+    return printable(text).replace("[", "\\[")

@@ -1,0 +1,223 @@
+"""The run folder: what lies where, whose folder it is, and pictures of views out and in.
+
+RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
+RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
+RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
+RUN/views/painted/…                              what a learned editor painted, see editors/kept.py
+RUN/segmented/PROMPT/VIEW.png                    where text:"…" found it; a folder for masks:DIR
+RUN/state/…                                      what a stopped run needs to go on, see state.py
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import FILE_NAME
+from progdf.io.atomic import is_temporary, remove_abandoned, written_whole
+from progdf.io.images import write_image
+from progdf.io.json_values import decode_json
+
+from .images import read_picture
+from .picture_list import add_pictures, remove_pictures_but_of
+from .state import StateFolder
+
+_SIGNATURE = "progdf train"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths of one run."""
+
+    root: Path
+
+    @property
+    def trajectory(self) -> Path:
+        """The recorded trajectory."""
+        return self.root / FILE_NAME
+
+    @property
+    def cameras(self) -> Path:
+        """All views' cameras, `progdf.load_cameras` reads them."""
+        return self.root / "cameras.json"
+
+    @property
+    def report(self) -> Path:
+        """Figures, JSON."""
+        return self.root / "report.json"
+
+    @property
+    def picture(self) -> Path:
+        """Figures, to look at."""
+        return self.root / "report.png"
+
+    @property
+    def segmented(self) -> Path:
+        """Masks of text:"…", a folder a prompt; they are made before the run begins."""
+        return self.root / "segmented"
+
+    @property
+    def log(self) -> Path:
+        """What happened."""
+        return self.root / "log.txt"
+
+    @property
+    def state(self) -> StateFolder:
+        """What a stopped run needs to go on."""
+        return StateFolder(self.root / "state")
+
+    def gdf(self, name: str) -> Path:
+        """The edit."""
+        return self.root / f"{name}.gdf"
+
+    @property
+    def views(self) -> Path:
+        """Pictures of the views, a folder a kind, and the list of those that the run has written."""
+        return self.root / "views"
+
+    @property
+    def painted(self) -> Path:
+        """What a learned editor painted, with a list of its own."""
+        return self.views / "painted"
+
+    def view(self, kind: str, name: str, strength: float = 1.0) -> Path:
+        """A view's picture; `kind` is original, edited, mask or final."""
+        folder = self.views / kind
+        return (folder if strength == 1.0 else folder / f"{strength:g}") / f"{name}.png"
+
+
+def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
+    """The run's folder, if a run of this edit may be put there; nothing is made.
+
+    Args:
+        root: the folder
+        edit: what identifies the edit (scene, region, editor)
+
+    Raises:
+        ProgdfError: it is a file, or holds no run, or the run of another edit.
+    """
+    if root.exists() and not root.is_dir():
+        raise ProgdfError(f"{root} is a file; give --out a folder")
+    folder = RunFolder(root)
+    if root.is_dir() and not all(
+        is_temporary(entry.name) or entry == folder.segmented for entry in root.iterdir()
+    ):
+        first = (
+            folder.log.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0]
+            if folder.log.is_file()
+            else ""
+        )
+        if not first.startswith(_SIGNATURE):
+            raise ProgdfError(f"{root} is not empty and no run of progdf train; give --out another folder")
+        earlier = _json_or_nothing(first.removeprefix(_SIGNATURE))
+        for what, value in edit.items():
+            if earlier.get(what) != value:
+                raise ProgdfError(
+                    f"{root} holds a run with another {what} ({earlier.get(what)}); "
+                    "give --out another folder, or delete this one"
+                )
+    return folder
+
+
+def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
+    """Make the run's folder, or take over that of an earlier run of the same edit; see `check_folder`."""
+    folder = check_folder(root, edit)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise ProgdfError(f"{root} cannot be made ({reason}); give --out a place to write to") from error
+    return folder
+
+
+def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
+    """A new log.txt; its first line tells that the folder is a run, and of which edit."""
+    with written_whole(folder.log) as beside:
+        line = f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n"
+        beside.write_text(line, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def locked(folder: RunFolder) -> Iterator[None]:
+    """Nobody else trains in this folder meanwhile; the system lets go when the process ends, however.
+
+    Raises:
+        ProgdfError: somebody does.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    handle = os.open(folder.root, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ProgdfError(
+                    f"{folder.root} is being trained by another process; wait for it, or stop it first"
+                ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def remove_leftovers(folder: RunFolder) -> None:
+    """Delete what a run that was killed was just about to write."""
+    for place, _, _ in os.walk(folder.root):
+        remove_abandoned(Path(place))
+
+
+def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
+    """One PNG per view. Pictures by view name, [H,W,3] or [H,W]."""
+    paths = [folder.view(kind, name, strength) for name in pictures]
+    for path, image in zip(paths, pictures.values(), strict=True):
+        write_image(path, image)
+    add_pictures(folder.views, paths)
+
+
+def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: float = 1.0) -> list[Tensor]:
+    """The pictures of the named views. [H,W,3] each
+
+    Raises:
+        ProgdfError: one is missing or broken.
+    """
+    pictures = []
+    for name in names:
+        path = folder.view(kind, name, strength)
+        try:
+            pictures.append(read_picture(path))
+        except ProgdfError as error:
+            what = "is damaged" if path.is_file() else "is gone"
+            raise ProgdfError(f"{path} {what}; train again, with --resume if the run was stopped") from error
+    return pictures
+
+
+def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
+    """Delete pictures of views that an earlier run of the same edit had and this one has not."""
+    for place in (folder.views, folder.painted):
+        remove_pictures_but_of(place, set(names))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON, whole or not at all."""
+    with written_whole(path) as beside:
+        beside.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _json_or_nothing(text: str) -> dict[str, Any]:
+    try:
+        content = decode_json(text)
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}

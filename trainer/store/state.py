@@ -1,0 +1,233 @@
+"""RUN/state: what a run needs to go on after it was stopped at any moment, to the same bits.
+
+    state/run.json                  which run it is: options, scene, region; from first moment to last
+    state/PART.safetensors          one part of it, such as what trains: tensors, JSON values in the header
+    state/PART/000012.safetensors   one entry of a list that only grows, such as the recordings
+
+Every file is written beside its place, flushed to the disk and renamed, so that kill -9 leaves the last whole
+one. Nothing in them is ever executed. Without run.json there is nothing to resume, whatever else lies there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import written_whole
+from progdf.io.json_values import decode_json, typed
+from progdf.io.tensors import read_tensors, write_tensors
+
+SHARE = 0.01
+"""Of the time, at most, that saving the state may take."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What was saved of a part.
+
+    Args:
+        tensors: by name
+        values: JSON values by name; floats come back bit for bit
+    """
+
+    tensors: Mapping[str, Tensor]
+    values: Mapping[str, Any]
+
+
+class Resumable(Protocol):
+    """Something that trains for many steps and can be stopped between any two.
+
+    The members' optimisation is one (`descent.PgsState`). Whatever trains beside it, such as a field fitted
+    alongside, implements these two and is given to `Autosave` under a name of its own: all members of one
+    `Autosave` go into one file, so that they are always of the same step. What they hold must decide every
+    later bit: parameters, both Adam moments and the step count, and the state of every random generator,
+    which is a uint8 tensor as `Generator.get_state()` gives it. What can be computed again from the run's
+    inputs and the recordings stays out. Dropout and the like must draw from a generator of their own.
+    """
+
+    def saved(self) -> Saved:
+        """Everything that the next steps depend on; the tensors may be the live ones."""
+        ...
+
+    def restore(self, saved: Saved) -> None:
+        """Take over what `saved` gave, of a run with the same options."""
+        ...
+
+
+@dataclass(frozen=True)
+class StateFolder:
+    """RUN/state.
+
+    A part that is short and repeats bit for bit need not be saved while it runs: `save` its result when it is
+    done, and `load` it (None: not done yet) on the way back.
+    """
+
+    path: Path
+
+    @property
+    def _run(self) -> Path:
+        return self.path / "run.json"
+
+    def identity(self) -> dict[str, Any] | None:
+        """What `begin` was told; None where no run was stopped."""
+        try:
+            return typed(decode_json(self._run.read_bytes()), dict[str, Any])
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except ValueError as error:
+            raise self.damaged(self._run, error) from error
+
+    def begin(self, identity: Mapping[str, Any]) -> None:
+        """Drop what is saved and start anew as the run that `identity`, JSON values, describes.
+
+        Raises:
+            ProgdfError: the folder is a link, behind which nothing of the run's can be.
+        """
+        if self.path.is_symlink():
+            raise ProgdfError(f"{self.path} is a link, and nothing behind it is touched; remove the link")
+        self.clear()
+        self.path.mkdir(exist_ok=True)
+        with written_whole(self._run) as beside:
+            beside.write_text(json.dumps(identity, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+            _flush(beside)
+
+    def save(
+        self, part: str, tensors: Mapping[str, Tensor], values: Mapping[str, Any], index: int | None = None
+    ) -> None:
+        """Save a part of the run, or one entry of a growing list.
+
+        Raises:
+            OSError: the disk is full or the folder is gone; what was saved before is still whole.
+        """
+        path = self._file(part, index)
+        if index is not None and self.path.is_dir():
+            path.parent.mkdir(exist_ok=True)
+        header = {"values": json.dumps(dict(values), ensure_ascii=False)}
+        with written_whole(path) as beside:
+            write_tensors(beside, tensors, header, checksum=True)
+            _flush(beside)
+
+    def load(self, part: str, index: int | None = None) -> Saved | None:
+        """What was saved of a part; None where nothing was.
+
+        Raises:
+            ProgdfError: the file is damaged.
+        """
+        path = self._file(part, index)
+        if not path.is_file():
+            return None
+        try:
+            tensors, metadata = read_tensors(path)
+            return Saved(tensors, typed(decode_json(metadata["values"]), dict[str, Any]))
+        except (OSError, KeyError, ValueError) as error:
+            raise self.damaged(path, error) from error
+
+    @contextmanager
+    def restoring(self, part: str) -> Iterator[None]:
+        """Take over what was saved of a part; values that do not fit make one line, see `load`."""
+        try:
+            yield
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
+            raise self.damaged(self._file(part, None), type(error).__name__) from error
+
+    def clear(self) -> None:
+        """Remove everything, run.json first: a rest of it is no run. Nothing behind a link is touched."""
+        if self.path.is_symlink():
+            return
+        self._run.unlink(missing_ok=True)
+        for entry in self.path.iterdir() if self.path.is_dir() else ():
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
+
+    def end(self) -> None:
+        """The run is finished: remove the folder."""
+        self.clear()
+        shutil.rmtree(self.path, ignore_errors=True)  # not if it is a link
+
+    def damaged(self, path: Path, reason: object) -> ProgdfError:
+        """The line for a file of the state that is not what was saved."""
+        return ProgdfError(f"{path} is damaged ({reason}); delete {self.path} and train again")
+
+    def _file(self, part: str, index: int | None) -> Path:
+        return self.path / (f"{part}.safetensors" if index is None else f"{part}/{index:06d}.safetensors")
+
+
+class Autosave:
+    """Saves what trains together, in one file, every so often.
+
+    Args:
+        folder: where to
+        part: name of the file
+        members: what trains, by name
+        every_s: seconds between two saves, longer where saving would take more than a hundredth of the time;
+            0 saves after every step
+    """
+
+    def __init__(
+        self, folder: StateFolder, part: str, members: Mapping[str, Resumable], every_s: float
+    ) -> None:
+        self.seconds = 0.0
+        self.saves = 0
+        self._folder, self._part, self._members, self._every_s = folder, part, members, every_s
+        self._last = time.perf_counter()
+
+    def restore(self) -> bool:
+        """Give every member what was saved of it; False where nothing was."""
+        saved = self._folder.load(self._part)
+        if saved is None:
+            return False
+        with self._folder.restoring(self._part):
+            for name, member in self._members.items():
+                tensors = {
+                    key.removeprefix(f"{name}/"): tensor
+                    for key, tensor in saved.tensors.items()
+                    if key.startswith(f"{name}/")
+                }
+                member.restore(Saved(tensors, saved.values[name]))
+        return True
+
+    def step_done(self) -> None:
+        """Save if it is time to."""
+        cost = self.seconds / max(1, self.saves)
+        if not self._every_s or time.perf_counter() - self._last >= max(self._every_s, cost / SHARE):
+            self.save()
+
+    def save(self) -> None:
+        """Save now. Raises OSError where it cannot; the last save stays whole."""
+        begun = time.perf_counter()
+        parts = {name: member.saved() for name, member in self._members.items()}
+        tensors = {f"{name}/{key}": t for name, part in parts.items() for key, t in part.tensors.items()}
+        self._folder.save(self._part, tensors, {name: part.values for name, part in parts.items()})
+        self._last = time.perf_counter()
+        self.seconds += self._last - begun
+        self.saves += 1
+
+
+def generator(state: Tensor) -> torch.Generator:
+    """A random generator that goes on where the one of this `get_state()` was. [n] uint8"""
+    made = torch.Generator()
+    made.set_state(state)
+    return made
+
+
+def _flush(path: Path) -> None:
+    """What is renamed into place must be on the disk before its name is."""
+    handle = os.open(path, os.O_RDONLY if sys.platform != "win32" else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,1 @@
+"""The views an edit is trained on."""

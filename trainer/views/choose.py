@@ -1,0 +1,219 @@
+"""Which cameras an edit is trained from, and which it is measured with.
+
+A scene comes with hundreds of cameras, in the order in which someone walked; 96 is the most that ProGDF
+(AAAI 2025) edits. The first 96 would show one side. So a camera is worth what it shows of the region that no
+camera taken before shows from near the same direction: every part of the region is seen, and from all around,
+whatever the list's order. The same measure tells which views stand for the others, to be held out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.rasterize import alpha_weights
+from progdf.region import Region
+
+from .view import View, fit_size, make_view
+from .visible_area import covered_areas
+
+_SAMPLES = 256
+"""Members that stand for the region when views are compared."""
+
+_LOOK = 96
+"""Longer side in pixels at which cameras are compared."""
+
+_MOST_LOOKED_THROUGH = 4
+"""Times as many cameras as are wanted are looked through; of more, the best spread ones are taken unseen."""
+
+_LEAST_COVER = 0.25
+"""Of what the median view shows of the region; a view that shows less is left out."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The views an edit works on.
+
+    Args:
+        views: in the order of the cameras' list
+        likeness: how far view j shows what view i shows, from near the same side. [V,V] 0..1
+        offered: how many cameras there were
+        unseeing: how many of them do not see the region
+        scant: how many show less than a quarter of what the median view shows
+    """
+
+    views: tuple[View, ...]
+    likeness: Tensor
+    offered: int
+    unseeing: int
+    scant: int
+
+    def line(self) -> str:
+        """What became of the cameras, for the log."""
+        parts = [f"{len(self.views)} of {self.offered} cameras"]
+        if self.unseeing:
+            parts.append(f"{self.unseeing} do not see the region")
+        if self.scant:
+            parts.append(f"{self.scant} see too little of it")
+        spare = self.offered - len(self.views) - self.unseeing - self.scant
+        if spare:
+            parts.append(f"{spare} show what others show")
+        return "; ".join(parts)
+
+
+def choose_views(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int, background: Tensor
+) -> Choice:
+    """Up to `count` views that show all of the region from as many sides as the cameras do.
+
+    Args:
+        scene: what the cameras look at
+        region: what the views are to show
+        cameras: any number in any order; the choice hardly depends on the order
+        count: how many views at most, ≥ 1
+        background: rgb. [3]
+
+    Raises:
+        ProgdfError: no camera sees the region.
+    """
+    rows = _sampled(scene, region)
+    places = scene.means[rows]
+    framed = torch.stack([_framed(places, camera) for camera in cameras])
+    looked = framed.any(dim=1).nonzero()[:, 0].tolist()
+    most = _MOST_LOOKED_THROUGH * count
+    if len(looked) > most:
+        toward = _toward(places, [cameras[i] for i in looked])
+        looked = [looked[k] for k in _greedy(_Shown(framed[looked].float(), toward, _reach(most)), most)]
+    cover, weights = _looked_through(scene, region, rows, [cameras[i] for i in looked])
+    seeing = cover > 0
+    if not bool(seeing.any()):
+        raise ProgdfError(
+            f"none of the {len(cameras)} cameras sees the region '{region.name}'; "
+            "give cameras that look at it with --cameras"
+        )
+    enough = cover >= _LEAST_COVER * cover[seeing].median()
+    good = enough.nonzero()[:, 0].tolist()
+    toward = _toward(places, [cameras[looked[k]] for k in good])
+    shown = _Shown(_visible(weights[good]), toward, _reach(count))
+    taken = _greedy(shown, count) if len(good) > count else list(range(len(good)))
+    return Choice(
+        tuple(make_view(scene, region, cameras[looked[good[k]]], background) for k in taken),
+        _likeness(shown, taken),
+        len(cameras),
+        int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
+        int((seeing & ~enough).sum()),
+    )
+
+
+def split_views(choice: Choice, held_out: int) -> tuple[list[View], list[View]]:
+    """Views to train with, and up to `held_out` that the others resemble most, spread over all sides.
+
+    At most a third is held out; where that is none, the same views serve for both.
+    """
+    views = choice.views
+    held_out = min(held_out, len(views) // 3)
+    if held_out <= 0:
+        return list(views), list(views)
+    represented = torch.zeros(len(views))
+    chosen: list[int] = []
+    for _ in range(held_out):
+        gain = (choice.likeness - represented[:, None]).clamp_min(0.0).sum(dim=0)
+        gain[chosen] = -1.0
+        chosen.append(int(gain.argmax()))
+        represented = torch.maximum(represented, choice.likeness[:, chosen[-1]])
+    train = [view for i, view in enumerate(views) if i not in chosen]
+    return train, [views[i] for i in sorted(chosen)]
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What each of V cameras shows of S members: how well [V,S] 0..1, and from where (unit vectors from the
+    member to the eye) [V,S,3]; `reach` is the angle in radians at which another direction is another side."""
+
+    visible: Tensor
+    toward: Tensor
+    reach: float
+
+    def served_by(self, camera: int) -> Tensor:
+        """How far one camera serves what each shows of each member. [V,S] 0..1"""
+        cosine = (self.toward * self.toward[camera]).sum(dim=2)
+        near = torch.exp(-(1 - cosine) / (1 - math.cos(self.reach)))
+        return self.visible[camera] * near
+
+
+def _greedy(shown: _Shown, count: int) -> list[int]:
+    """The cameras that add most, one after the other, in the order of the list; ties by that order."""
+    served = torch.zeros_like(shown.visible)
+    left = torch.ones(len(served), dtype=torch.bool)
+    for _ in range(count):
+        gain = (shown.visible * (1 - served)).sum(dim=1)
+        best = int(torch.where(left, gain, -1.0).argmax())
+        left[best] = False
+        served = torch.maximum(served, shown.served_by(best))
+    return (~left).nonzero()[:, 0].tolist()
+
+
+def _likeness(shown: _Shown, taken: Sequence[int]) -> Tensor:
+    some = _Shown(shown.visible[taken], shown.toward[taken], shown.reach)
+    columns = [
+        (some.visible * some.served_by(k)).sum(dim=1) / some.visible.sum(dim=1).clamp_min(1e-12)
+        for k in range(len(taken))
+    ]
+    return torch.stack(columns, dim=1)
+
+
+def _reach(count: int) -> float:
+    """The mean angle between neighbours of `count` directions spread over a half sphere."""
+    return min(1.0, math.sqrt(2 * math.pi / count))
+
+
+def _sampled(scene: Gaussians, region: Region) -> Tensor:
+    """Rows that stand for the region, evenly by the area they can cover. -> [S] int64"""
+    total = covered_areas(scene[region.members]).cumsum(dim=0)
+    ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
+    picked = torch.searchsorted(total, ticks).clamp_max(len(total) - 1)
+    return region.members[torch.unique_consecutive(picked)]
+
+
+def _framed(places: Tensor, camera: Camera) -> Tensor:
+    """Which places fall into the picture or near it, whatever stands before them. [S,3] -> [S] bool
+
+    Near: within half the picture's size, as what is large reaches in.
+    """
+    seen = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = seen @ camera.K.T
+    size = torch.tensor([camera.width, camera.height])
+    aside = (pixels[:, :2] / pixels[:, 2:] / size - 0.5).abs().amax(dim=1)
+    return (aside <= 1.0) & (seen[:, 2] > 0)
+
+
+def _toward(places: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    eyes = torch.stack([camera.position for camera in cameras])
+    return torch.nn.functional.normalize(eyes[:, None] - places, dim=2)
+
+
+def _looked_through(
+    scene: Gaussians, region: Region, rows: Tensor, cameras: Sequence[Camera]
+) -> tuple[Tensor, Tensor]:
+    """The region's share of each picture [V], and each sample's blended weight in it [V,S]."""
+    cover = torch.zeros(len(cameras))
+    weights = torch.zeros(len(cameras), len(rows))
+    for i, camera in enumerate(cameras):
+        small = fit_size(camera, _LOOK)
+        found = alpha_weights(scene, small, torch.ones(small.height, small.width), near=small.near)[:, 2]
+        cover[i] = found[region.members].sum() / (small.width * small.height)
+        weights[i] = found[rows]
+    return cover, weights
+
+
+def _visible(weights: Tensor) -> Tensor:
+    """How well each sample shows, 1 where it shows as in the median view that shows it. [V,S] -> 0..1"""
+    typical = torch.where(weights > 0, weights, torch.nan).nanmedian(dim=0).values.nan_to_num(1.0)
+    return (weights / typical.clamp_min(1e-9)).clamp_max(1.0)

@@ -1,0 +1,201 @@
+"""The views an edit is trained on and judged by: where the cameras stand, where the region lies in each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.gaussians import Gaussians
+from progdf.rasterize import Crop, rasterize
+from progdf.region import Region
+from progdf.scene.bounds import near_plane, scene_sphere
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.up_axis import guess_up
+from progdf.sh import shade
+
+BACKGROUND = (1.0, 1.0, 1.0)
+
+INSIDE = (
+    "looks like a scene to stand inside, which cameras around it cannot show; give its own with --cameras "
+    "(cameras.json, transforms.json or a COLMAP folder), or make some: progdf view, look around, F4 keeps "
+    "each view"
+)
+"""What is said of such a scene without cameras, after its name."""
+
+
+_LEAST_BOX = 64  # LPIPS needs that many pixels on each side
+_SEEN = 0.05  # a pixel shows the region where the members' weight is above this
+_LONGEST_NAME = 60  # characters, of four bytes at most: file systems take 255 bytes with what comes after
+_CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's picture of the original scene, and the region in it.
+
+    Args:
+        camera: the whole view; its name is the file name of its pictures
+        image: the original. [H,W,3] 0..1
+        mask: the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
+        inside: the colour of the members alone, unmixed from what shares a pixel with them; meaningless
+            where `mask` is 0. [H,W,3]
+        box: the pixels that an edit can change, at least 64 each way where the image is that large
+    """
+
+    camera: Camera
+    image: Tensor
+    mask: Tensor
+    inside: Tensor
+    box: Crop
+
+    def blended(self, edited_inside: Tensor) -> Tensor:
+        """The view with another colour in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]
+
+        Exact at soft edges: what shines through from behind or past the region stays what it was, so a border
+        neither bleeds nor keeps a rim.
+        """
+        change = torch.where(self.mask[..., None] > 1e-4, edited_inside - self.inside, 0.0)
+        return (self.image + self.mask[..., None] * change).clamp(0.0, 1.0)
+
+    def confined(self, edited: Tensor) -> Tensor:
+        """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]
+
+        A pixel that shows the region to a fifth is taken as its editor left it: it is mixed already.
+        """
+        return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
+
+    def widened(self, edited: Sequence[Tensor]) -> View:
+        """The view with its box grown to all that these pictures of it change visibly."""
+        changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
+        return replace(self, box=region_box(torch.maximum(self.mask, (changed > _CHANGED).float())))
+
+
+def crop(image: Tensor, box: Crop) -> Tensor:
+    """The pixels of a box. [H,W,...] -> [h,w,...]"""
+    x0, y0, x1, y1 = box
+    return image[y0:y1, x0:x1]
+
+
+def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:
+    """Render the original view and the region's share of it."""
+    colors = seen_colors(scene, camera)
+    member = torch.zeros(len(scene), 1)
+    member[region.members] = 1.0
+    black = torch.zeros(3)
+    image = drawn(scene, colors, camera, background).clamp(0.0, 1.0)
+    mask = drawn(scene, member.expand(-1, 3).contiguous(), camera, black)[..., 0].clamp(0.0, 1.0)
+    inside = drawn(scene, colors * member, camera, black) / mask.clamp_min(1e-4)[..., None]
+    return View(camera, image, mask, inside.clamp(0.0, 1.0), region_box(mask))
+
+
+def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
+    """Each Gaussian's colour from where the camera stands. [N,3], not below 0"""
+    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
+    return shade(min(scene.sh_degree, 3), directions, scene.sh)
+
+
+def drawn(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
+    """The scene in these colours instead of its own, without gradients. [N,3] -> [H,W,3]"""
+    with torch.no_grad():
+        image: Tensor = rasterize(
+            scene.means,
+            scene.quats,
+            scene.scales,
+            scene.opacities,
+            colors,
+            camera.viewmat,
+            camera.K,
+            camera.width,
+            camera.height,
+            background=background,
+            near=camera.near,
+            antialiased=scene.antialiased,
+        )[0]
+    return image
+
+
+def pictured(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
+    """The scene as it is seen from there, without gradients. [H,W,3]"""
+    return drawn(scene, seen_colors(scene, camera), camera, background)
+
+
+def region_box(mask: Tensor, margin: int = 6) -> Crop:
+    """The smallest box around the pixels that show the region, with a margin, grown to 64 pixels. [H,W]"""
+    height, width = mask.shape
+    shown = mask > 0.5 * _SEEN
+    if not bool(shown.any()):
+        return (0, 0, width, height)
+    spans = []
+    for axis, side in ((0, width), (1, height)):
+        hit = shown.any(dim=axis).nonzero()[:, 0]
+        low, high = int(hit[0]) - margin, int(hit[-1]) + 1 + margin
+        missing = _LEAST_BOX - (high - low)
+        if missing > 0:
+            low, high = low - (missing + 1) // 2, high + missing // 2
+        low, high = max(0, min(low, side - _LEAST_BOX)), min(side, max(high, _LEAST_BOX))
+        spans.append((low, high))
+    (x0, x1), (y0, y1) = spans
+    return (x0, y0, x1, y1)
+
+
+def region_rig(
+    scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None
+) -> list[Camera]:
+    """The orbit rig of the scene, aimed at the region and zoomed in on it.
+
+    The cameras stand where those of the whole scene would, so nothing new comes between them and the region;
+    every other one lets the region fill about 80 % of the picture, the rest 50 %: a hand that is 3 % of the
+    scene is trained on as many pixels as the whole body.
+
+    Args:
+        scene: see `orbit_rig`
+        region: what they look at
+        count: how many, ≥ 1
+        image_size: both sides in pixels
+        up: world direction that is up, [3]; None guesses it
+    """
+    up = guess_up(scene) if up is None else up
+    centre, radius = scene_sphere(scene[region.members])
+    radius += float(scene.scales[region.members].amax(dim=1).median())
+    cameras = []
+    for i, camera in enumerate(orbit_rig(scene, count, image_size, image_size, up=up)):
+        distance = float((camera.position - centre).norm())
+        share = 0.8 if i % 2 == 0 else 0.5
+        fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
+        aimed = look_at(camera.position, centre, up)
+        cameras.append(replace(camera, viewmat=aimed, K=intrinsics(fov, image_size, image_size)))
+    return cameras
+
+
+def near_enough(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
+    """The cameras with a near plane for the size of the scene: a tiny one would vanish before a fixed one."""
+    near = near_plane(scene_sphere(scene)[1])
+    return [replace(camera, near=near) for camera in cameras]
+
+
+def fit_size(camera: Camera, image_size: int) -> Camera:
+    """The camera with its longer side at `image_size` pixels, never enlarged."""
+    scale = image_size / max(camera.width, camera.height)
+    if scale >= 1.0:
+        return camera
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def named(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras with names that are distinct and can be file names."""
+    taken: set[str] = set()
+    result = []
+    for i, camera in enumerate(cameras):
+        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name.rsplit("/", 1)[-1])
+        name = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg")) else name
+        name = name[:_LONGEST_NAME]
+        if not name.strip("._") or name in taken:
+            name = f"view_{i:03d}"
+        taken.add(name)
+        result.append(replace(camera, name=name))
+    return result

@@ -1,0 +1,186 @@
+"""The application: a window, the stage in it, its loop, and the files dropped on it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from imgui_bundle import imgui
+
+from viewer.files.document import Document
+from viewer.render.engine import Engine
+from viewer.state import workspace
+from viewer.state.snapshots import Snapshot
+from viewer.state.view_state import ViewState
+from viewer.ui.window import Window, interruptible
+
+from .actions import Desk
+from .main_view import Stage
+
+SIZE = (1280, 800)
+
+
+def run(
+    document: Document,
+    state: ViewState,
+    pictures: Path = Path(),
+    size: tuple[int, int] = SIZE,
+    session: Path | None = None,
+    snapshots: tuple[Snapshot, ...] = (),
+    draw: str = "auto",
+    edit_pass: str = "auto",
+) -> int:
+    """Open the window and stay until it is closed.
+
+    Args:
+        document: the scene and its edits
+        state: what to show first
+        pictures: folder for saved pictures
+        size: of the window, at 1×
+        session: the file it was opened from and is saved to
+        snapshots: kept states
+        draw, edit_pass: what draws and what edits, see `Engine`
+
+    Returns:
+        The exit status, 0.
+
+    Raises:
+        ProgdfError: there is no display, or no OpenGL 3.3 on it; or the GPU shall edit what the CPU draws.
+    """
+    window = Window(_window_title(document.title), size)
+    try:
+        app = App(window, document, state, pictures, session, draw=draw, edit_pass=edit_pass)
+        app.stage.restart(state, snapshots)
+        app.desk.offer_autosave()
+        try:
+            with interruptible():
+                app.loop()
+        finally:
+            app.close()
+    finally:
+        window.close()
+    return 0
+
+
+class App:
+    """One window with its stage and engine; `desk` sees to its files."""
+
+    def __init__(
+        self,
+        window: Window,
+        document: Document,
+        state: ViewState,
+        pictures: Path,
+        session: Path | None = None,
+        memory: Path | None = None,
+        draw: str = "auto",
+        edit_pass: str = "auto",
+    ) -> None:
+        self.window, self.document = window, document
+        self.context = window.context()
+        self._draw, self._edit_pass = draw, edit_pass
+        self.engine = self._engine(document)
+        self.stage = Stage(self.context, self.engine, document.facts(), state, window.ui_scale, pictures)
+        self.desk = Desk(self, session, memory)
+        self._left = False
+        self._title = ""
+        self.dropped: list[Path] = []
+        self.failure: BaseException | None = None
+        self.last = time.perf_counter()
+        window.listen(self.stage.wake, self._remember_dropped, self._redraw)
+
+    def close(self) -> None:
+        self.desk.release()
+        self.stage.ui.make_current()
+        imgui.backends.glfw_shutdown()
+        self.stage.close()
+        self.engine.release()
+
+    def loop(self) -> None:
+        """Draw while something changes, sleep while nothing does."""
+        imgui.backends.glfw_new_frame()
+        self.stage.greet(self.context.screen)
+        self.window.present()
+        while not self._left:
+            waits = [wait for wait in self._waits() if wait is not None]
+            if not self.stage.opening:  # else events wait in the window system, so that no letter is lost
+                self.window.wait(min(waits, default=None))
+            if self.failure is not None:
+                raise self.failure
+            for path in self._take_dropped():
+                self.open(path)
+            if self.window.closing and not self._left:
+                self.window.stay_open()
+                self.stage.request("quit")
+            self.draw()
+        self.desk.closed()
+
+    def draw(self) -> None:
+        """One frame of the latest state; nothing while the window is minimised."""
+        if 0 in self.window.pixels:
+            self.stage.rest()
+            return
+        arrived = time.perf_counter()
+        seconds, self.last = arrived - self.last, arrived
+        self.stage.ui.make_current()
+        self.stage.ui.set_scale(self.window.ui_scale)
+        imgui.backends.glfw_new_frame()
+        screen = self.context.screen
+        self.stage.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
+        self.window.present()
+        self._rename()
+        for request in self.stage.take_requests():
+            if request == "full_screen":
+                self.window.toggle_full_screen()
+            else:
+                self.desk.serve(request)
+
+    def _waits(self) -> tuple[float | None, ...]:
+        """How long the next look at each part may take, seconds; None is for ever."""
+        choosing = self.desk.choosing()  # first: what was chosen wakes the stage
+        return choosing, self.stage.patience(), self.desk.autosave(time.perf_counter())
+
+    def _redraw(self) -> None:
+        try:
+            self.draw()
+        except BaseException as failure:  # glfw would only print it
+            self.failure = failure
+
+    def _remember_dropped(self, paths: Sequence[Path]) -> None:
+        self.dropped += paths
+        self.stage.wake()
+
+    def _take_dropped(self) -> list[Path]:
+        paths, self.dropped = self.dropped, []
+        return paths
+
+    def open(self, path: Path) -> None:
+        """A dropped or chosen file, by what it is."""
+        self.desk.open(path)
+
+    def show(self, document: Document) -> None:
+        """Draw another document from now on; the state is the caller's to change."""
+        engine = self._engine(document)
+        self.engine.release()
+        self.document, self.engine = document, engine
+        self.stage.serve(engine, document.facts())
+
+    def _rename(self) -> None:
+        """The title bar says what is open, and with a dot that there are unsaved changes."""
+        title = _window_title(self.document.title, self.desk.unsaved)
+        if title != self._title:
+            self.window.rename(title)
+            self._title = title
+
+    def _engine(self, document: Document) -> Engine:
+        return Engine(self.context, document.scene, document.gdfs, self._draw, self._edit_pass)
+
+    def leave(self) -> None:
+        """Close the window, without a question."""
+        self.window.ask_to_close()
+        self._left = True
+
+
+def _window_title(name: str, unsaved: bool = False) -> str:
+    return f"{workspace.UNSAVED * unsaved}{name} – ProGDF Studio"

@@ -1,0 +1,237 @@
+"""Questions over the picture: where to save, what to open, what becomes of unsaved changes.
+
+All of it goes by keys too: Enter takes the marked button, Escape leaves all as it was. Where to save is asked
+until it is saved: the desk takes that question away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from imgui_bundle import imgui
+
+from viewer.state.workspace import Dialog
+from viewer.ui.context import PALETTE, SMALL_PX, Rgba, UiContext
+from viewer.ui.overlay import Area
+from viewer.ui.widgets import elided, section, small, tip
+
+WIDTH_PX = 520.0  # at 1×
+_POPUP = "##dialog"
+TITLES = {
+    "save": "Save the session",
+    "open": "Open",
+    "replace": "Replace the layer's edit",
+    "leave": "There are unsaved changes",
+    "overwrite": "This file already exists",
+    "restore": "Unsaved work was found",
+}
+_HINTS = {
+    "save": "A .session.json file; the scene and its edits stay where they are.",
+    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a session or cameras, told apart by content.",
+    "replace": "An edit (.gdf) of this scene; the layer keeps its place, strength and gains.",
+    "leave": "Save them in {} first?",
+    "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
+    "restore": "The last session was not closed properly. Its unsaved work is in {}.",
+}
+_SUBMIT = {"save": "Save", "open": "Open", "replace": "Replace"}
+"""The button of each question that has a path field."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A button of a question without a path field; `keys` press it too."""
+
+    name: str
+    keys: tuple[str, ...] = ()
+
+
+_CHOICES = {
+    "leave": (_Choice("Save", ("Enter", "S")), _Choice("Discard", ("D",)), _Choice("Cancel")),
+    "overwrite": (_Choice("Rename…", ("Enter", "R")), _Choice("Replace"), _Choice("Cancel")),
+    "restore": (_Choice("Restore", ("Enter", "R")), _Choice("Discard", ("D",)), _Choice("Later")),
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The dialog as it is now, None once it is over, and the requests that come of it."""
+
+    dialog: Dialog | None
+    requests: tuple[str, ...] = ()
+
+
+def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, area: Area) -> Answer:
+    """Draw the question and take its answer.
+
+    Args:
+        recent: files opened before, the last one first
+        pressed: chords that went down in this frame
+        area: the picture; the question stands in its upper part
+    """
+    if not imgui.is_popup_open(_POPUP):
+        imgui.open_popup(_POPUP)
+    margin = 8.0 * ui.scale
+    top = max(margin, 0.25 * area.height - 90.0 * ui.scale)
+    imgui.set_next_window_pos(imgui.ImVec2(area.width / 2, top), 0, imgui.ImVec2(0.5, 0.0))
+    imgui.set_next_window_size(imgui.ImVec2(min(WIDTH_PX * ui.scale, area.width - 2 * margin), 0.0))
+    flags = imgui.WindowFlags_
+    fixed = flags.no_move.value | flags.no_nav.value
+    shown = flags.no_decoration.value | flags.no_saved_settings.value | fixed
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(16.0 * ui.scale, 14.0 * ui.scale))
+    imgui.push_style_color(imgui.Col_.modal_window_dim_bg, imgui.ImVec4(0.0, 0.0, 0.0, 0.45))
+    answer = Answer(dialog)
+    if imgui.begin_popup_modal(_POPUP, None, shown)[0]:
+        answer = _content(dialog, recent, pressed, ui, area.height - margin)
+        if answer.dialog is None:
+            imgui.close_current_popup()
+        imgui.end_popup()
+    imgui.pop_style_color()
+    imgui.pop_style_var(2)
+    return answer
+
+
+def _content(
+    dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, bottom: float
+) -> Answer:
+    """`bottom`: where the question has to end, window pixels"""
+    imgui.push_font(ui.fonts.bold, 0.0)
+    imgui.text(TITLES[dialog.kind])
+    imgui.pop_font()
+    _wrapped(_HINTS[dialog.kind].format(Path(dialog.text).name), PALETTE.dim)
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    if "Escape" in pressed:
+        return Answer(None)
+    if dialog.chosen:
+        return _given(dialog, dialog.chosen)
+    if dialog.kind in _CHOICES:
+        _is_new(dialog.kind)
+        return _chosen(dialog, _pressed(_CHOICES[dialog.kind], pressed, ui))
+    if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
+        imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
+    more, gap = 36.0 * ui.scale, 6.0 * ui.scale
+    imgui.set_next_item_width(-more - gap)
+    flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
+    _, text = imgui.input_text("##path", dialog.text, flags)
+    dialog = replace(dialog, text=text)
+    imgui.same_line(0.0, gap)
+    imgui.begin_disabled(dialog.choosing)
+    browse = imgui.button("…", imgui.ImVec2(more, 0.0))
+    imgui.end_disabled()
+    tip("Choose in the desktop's own dialog (Ctrl+B)")
+    if browse or ("Ctrl+B" in pressed and not dialog.choosing):
+        return Answer(dialog, ("browse",))
+    if dialog.notice:
+        small(dialog.notice, PALETTE.warning)
+    if dialog.error:
+        _wrapped(dialog.error, PALETTE.error)
+    if dialog.kind != "save":
+        fitting = [path for path in recent if dialog.kind == "open" or path.suffix == ".gdf"]
+        chosen = _recent(fitting, bottom, ui)
+        if chosen is not None:
+            return _given(dialog, str(chosen))
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    name = _SUBMIT[dialog.kind]
+    button = _buttons((name, "Cancel"), ui)
+    if button == "Cancel":
+        return Answer(None)
+    path = text.strip().strip("\"'")
+    if path and (button == name or "Enter" in pressed):
+        return _given(dialog, path)
+    return Answer(dialog)
+
+
+def _is_new(kind: str) -> bool:
+    """Whether this question was not asked in the last frame; another one may have been, in the same popup."""
+    storage, slot, number = imgui.get_state_storage(), int(imgui.get_id("kind")), 1 + [*TITLES].index(kind)
+    changed = storage.get_int(slot) != number
+    storage.set_int(slot, number)
+    return bool(changed or imgui.is_window_appearing())
+
+
+def _given(dialog: Dialog, path: str) -> Answer:
+    """The file that was asked for."""
+    if dialog.kind == "save":
+        return Answer(replace(dialog, text=path, chosen=""), (f"save_to:{path}",))
+    if dialog.kind == "replace":
+        return Answer(None, (f"replace_by:{dialog.then}:{path}",))
+    return Answer(None, (f"open_file:{path}",))
+
+
+def _wrapped(text: str, colour: Rgba) -> None:
+    """Small text in as many lines as it takes."""
+    imgui.push_font(None, SMALL_PX)
+    imgui.push_text_wrap_pos(0.0)
+    imgui.text_colored(imgui.ImVec4(*colour), text)
+    imgui.pop_text_wrap_pos()
+    imgui.pop_font()
+
+
+def _pressed(choices: Sequence[_Choice], pressed: Sequence[str], ui: UiContext) -> str:
+    """The name of the button that was pressed, by the mouse or a key; "" for none."""
+    button = _buttons([choice.name for choice in choices], ui)
+    by_key = (choice.name for choice in choices if any(key in pressed for key in choice.keys))
+    return button or next(by_key, "")
+
+
+def _chosen(dialog: Dialog, button: str) -> Answer:
+    """What follows from a button of a question without a path field."""
+    path = dialog.text
+    match dialog.kind, button:
+        case _, "":
+            return Answer(dialog)
+        case "leave", "Save":
+            return Answer(None, (f"save:{dialog.then}",))
+        case "leave", "Discard":
+            return Answer(None, ("discard", dialog.then))
+        case "overwrite", "Replace":
+            return Answer(dialog, (f"overwrite:{path}",))
+        case "overwrite", "Rename…":
+            return Answer(Dialog("save", path, dialog.then))
+        case "restore", "Restore":
+            return Answer(None, (f"restore_autosave:{path}",))
+        case "restore", "Discard":
+            return Answer(None, (f"discard_autosave:{path}",))
+    return Answer(None)  # Cancel, Later
+
+
+def _recent(recent: Sequence[Path], bottom: float, ui: UiContext) -> Path | None:
+    """The list of files opened before, scrolled where it would reach beyond `bottom`; the one clicked."""
+    if not recent:
+        return None
+    section("Recent", ui)
+    style = imgui.get_style()
+    row = imgui.get_text_line_height_with_spacing()
+    below = imgui.get_frame_height() + 3 * style.item_spacing.y + style.window_padding.y
+    space = max(bottom - imgui.get_cursor_screen_pos().y - below, 2 * row)
+    chosen = None
+    imgui.begin_child("recent", imgui.ImVec2(0.0, min(len(recent) * row, space)))
+    for i, path in enumerate(recent):
+        room = imgui.get_content_region_avail().x
+        if imgui.selectable(f"{elided(path.name, 0.4 * room)}##{i}", False)[0]:
+            chosen = path
+        imgui.same_line(0.42 * room)
+        imgui.push_font(None, SMALL_PX)
+        imgui.text_disabled(elided(str(path.parent), 0.56 * room))
+        imgui.pop_font()
+    imgui.end_child()
+    return chosen
+
+
+def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
+    """Buttons at the right, the first one marked; the name of the pressed one."""
+    wide, gap = 92.0 * ui.scale, 8.0 * ui.scale
+    start = imgui.get_content_region_avail().x - len(names) * wide - (len(names) - 1) * gap
+    imgui.set_cursor_pos_x(imgui.get_cursor_pos_x() + max(start, 0.0))
+    pressed = None
+    for i, name in enumerate(names):
+        if i:
+            imgui.same_line(0.0, gap)
+        colour = PALETTE.field if i else PALETTE.accent_dark
+        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*colour))
+        if imgui.button(name, imgui.ImVec2(wide, 0.0)):
+            pressed = name
+        imgui.pop_style_color()
+    return pressed

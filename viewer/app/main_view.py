@@ -1,0 +1,327 @@
+"""One window's content: input → workspace → picture → screen. Knows imgui and GL, but no windowing system.
+
+The window (app.py) and the tests feed imgui's io and call `frame`: a scripted mouse goes a real one's way.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+
+import moderngl
+from imgui_bundle import imgui
+
+from progdf.errors import ProgdfError
+from viewer.camera import inputs
+from viewer.camera.inputs import NO_KEYS, Keys, Press
+from viewer.files import exports as saved_files
+from viewer.gl.screen import read_rgb
+from viewer.panel import panel
+from viewer.pictures.compare_labels import labelled
+from viewer.render.engine import Engine, FrameTimings, drawn_size
+from viewer.state import playback, workspace
+from viewer.state.snapshots import Snapshot
+from viewer.state.view_state import ViewState
+from viewer.state.workspace import Dialog, SceneFacts
+from viewer.ui import overlay
+from viewer.ui.context import UiContext
+from viewer.ui.frame_pacer import Pace
+
+from . import interface
+from . import mouse as hand
+from .canvas import Canvas
+from .mouse import Hand, Sight
+
+FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
+OPENING_FRAMES = 4
+"""From the wish for a text field until imgui gives it the keyboard."""
+
+
+class Stage:
+    """Draws frames of one engine into the framebuffer it is given.
+
+    Args:
+        context: the GL context of the engine
+        engine: draws the picture
+        facts: of the open scene
+        view: what to show first
+        scale: window pixels per design pixel (see UiContext)
+        pictures: folder into which saved pictures go
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        engine: Engine,
+        facts: SceneFacts,
+        view: ViewState,
+        scale: float = 1.0,
+        pictures: Path = Path(),
+    ) -> None:
+        self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
+        self.canvas = Canvas(context, engine, facts.recordings)
+        self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
+        self.ui = UiContext(scale)
+        imgui.backends.opengl3_init("#version 330")
+        self.work = workspace.opened(view)
+        self.frames = 0  # all that were drawn
+        self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
+        self._hand = Hand()
+        self._revealed = self.work.focus  # the layer that the panel was last scrolled to
+        self._keys = NO_KEYS  # of the present frame
+        self._clock = 0.0
+        self._waiting: tuple[Press, ...] = ()  # keys that imgui has not come to yet
+        self._asked_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
+        self._resting = False
+        self._pace = Pace()
+        self.wake = self._pace.wake
+
+    def rest(self) -> None:
+        """Nothing can be drawn until the next frame, as the window is minimised."""
+        self._pace.rest()
+        self._resting = True
+
+    def close(self) -> None:
+        """Free what the stage made; the engine and the context are the caller's."""
+        self.ui.make_current()
+        imgui.backends.opengl3_shutdown()
+        self.ui.close()
+        self.canvas.release()
+
+    def serve(self, engine: Engine, facts: SceneFacts) -> None:
+        """Draw with another engine from now on (the scene or its edits have changed)."""
+        self.canvas.release()
+        self.engine, self.facts = engine, facts
+        self.canvas = Canvas(self.context, engine, facts.recordings)
+        self.wake()
+
+    def change(self, view: ViewState) -> None:
+        """A new state from outside the window; what it edits can be undone."""
+        self.work = workspace.settled(replace(self.work, view=view))
+        self.wake()
+
+    def restart(self, view: ViewState, kept: tuple[Snapshot, ...] = ()) -> None:
+        """A new state and snapshots, with nothing to undo."""
+        self.work = workspace.opened(view, kept)
+        self.wake()
+
+    def patience(self) -> float | None:
+        """Seconds the window may wait for an event before the next `frame`; None: for ever."""
+        self.ui.make_current()
+        if not self._resting and (inputs.waiting() or self.opening):
+            return 0.0
+        waits = [FLIGHT_S] if inputs.flying(self._keys) else []
+        if imgui.get_io().want_text_input:
+            waits.append(BLINK_S)
+        if self.work.message is not None:
+            waits.append(max(self.work.message.until - self._clock, 0.0))
+        sharpens = self.canvas.patience(self._clock)
+        waits += [] if sharpens is None else [sharpens]
+        film = playback.patience(self.work.player, self.work.view.timeline)
+        return self._pace.patience(waits if film is None else [*waits, film])
+
+    def tell(self, text: str, error: bool = False) -> None:
+        """Show one line at the bottom of the picture for a while."""
+        self.work = workspace.told(self.work, text, self._clock, error)
+        self.wake()
+
+    def greet(self, screen: moderngl.Framebuffer) -> None:
+        """A word while the first picture is made: that may take seconds, and the window is already there."""
+        self.ui.make_current()
+        imgui.backends.opengl3_new_frame()
+        imgui.new_frame()
+        overlay.banner(f"Opening {self.facts.title} …", self._area(), self.ui)
+        imgui.render()
+        screen.use()
+        screen.clear(*self.work.view.background)
+        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
+
+    def frame(
+        self,
+        screen: moderngl.Framebuffer,
+        size: tuple[int, int],
+        seconds: float,
+        keys: Keys = NO_KEYS,
+        arrived: float | None = None,
+    ) -> None:
+        """Handle the input that imgui's io holds, and draw.
+
+        Args:
+            screen: where to draw
+            size: its width and height in pixels: io.display_size times io.display_framebuffer_scale
+            seconds: since the last frame
+            keys: what the keyboard did
+            arrived: time.perf_counter() when the input came; now if None
+        """
+        arrived = time.perf_counter() if arrived is None else arrived
+        self.ui.make_current()
+        imgui.get_io().delta_time = max(seconds, 1e-5)
+        self._clock += max(seconds, 0.0)
+        self._pace.step(seconds)
+        self._resting = False
+        self.work = workspace.played(self.work, seconds)
+        before = self.work
+        imgui.backends.opengl3_new_frame()
+        imgui.new_frame()
+        self._keys = self._heard(keys)
+        self._handle_input(seconds)
+        if not imgui.is_any_item_active() and self._hand.drag is None and not inputs.repeating(keys):
+            self.work = workspace.settled(self.work)
+        if self.work != before:
+            self.wake()
+        shown, area = self._shown(), self._sight().size
+        focus, overlap = self.work.focus, self.work.overlap if shown.panel else None
+        self.canvas.draw(shown, screen, area, self._held(), self._clock, focus, overlap)
+        self._draw_overlays()
+        imgui.render()
+        screen.use()
+        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
+        self.frames += 1
+        if _strengths(self.work.view) != _strengths(before.view):
+            self.context.finish()
+            self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
+        self._save_files(screen, size)
+
+    def _heard(self, keys: Keys) -> Keys:
+        """The keys that imgui has come to by now; while a text field opens they wait for it."""
+        pressed = (*self._waiting, *keys.pressed)
+        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(inputs.heard, pressed))
+        opener = next((i for i, press in enumerate(pressed[:count]) if inputs.opens_text(press)), None)
+        if opener is not None:
+            count, self._asked_at = opener + 1, self.frames + 1
+        self._waiting = pressed[count:]
+        return replace(keys, pressed=pressed[:count])
+
+    @property
+    def opening(self) -> bool:
+        """Whether a text field was asked for and has no keyboard yet: what is typed now would be lost."""
+        lately = self.frames - self._asked_at < OPENING_FRAMES and not self._resting
+        return lately and not imgui.get_io().want_text_input
+
+    def _area(self) -> overlay.Area:
+        """The part of the window that shows the picture."""
+        display = imgui.get_io().display_size
+        wide = panel.width(self.ui) if self.work.view.panel else 0.0
+        return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
+
+    def _handle_input(self, seconds: float) -> None:
+        off = inputs.calls_off(self._keys, self._hand.drag)
+        if off:
+            self._call_off()
+        asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+        for action in inputs.actions_pressed(self._keys):
+            if not asks or action in ("picture", "window_picture"):
+                self._perform(action)
+        if inputs.flying(self._keys):
+            flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
+            self.work = workspace.with_camera(self.work, flown)
+        if self.work.view.panel:
+            reveal = self.work.focus != self._revealed
+            cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
+            if missing:
+                self.wake()
+            self.work = interface.panels(self.work, self._sight(), cards, reveal)
+            self._revealed = self.work.focus
+        if not off:  # else the right button has said all it was pressed for
+            self._hand, self.work = hand.moved(self._hand, self.work, self._sight())
+
+    def _call_off(self) -> None:
+        """What is dragged goes back to where it was, and nothing is held any more."""
+        self.work, self._hand = hand.called_off(self._hand, self.work), Hand()
+        imgui.internal.clear_active_id()
+        self._keys = replace(self._keys, pressed=())
+
+    def _perform(self, action: str) -> None:
+        area = self._area()
+        self.work = workspace.perform(self.work, action, self.facts, area.width / area.height)
+
+    def _sight(self) -> Sight:
+        """What lies under the hand."""
+        return Sight(self.engine, self.facts, self._shown(), self._area(), self.ui, self._clock)
+
+    def _shown(self) -> ViewState:
+        return workspace.original(self.work.view) if inputs.holds_original(self._keys) else self.work.view
+
+    def _held(self) -> bool:
+        """Whether a hand is on something that moves the picture, or a film plays."""
+        if self._hand.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
+            return True
+        return inputs.flying(self._keys) or inputs.repeating(self._keys) or self.work.player.playing
+
+    def _draw_overlays(self) -> None:
+        """What stands over the picture; where some of it goes away, another frame follows."""
+        sight, before = self._sight(), self.work
+        pressed = [press.chord for press in self._keys.pressed]
+        self.work = interface.asked(self.work, sight, self.recent, pressed)
+        original = inputs.holds_original(self._keys)
+        said = self.canvas.comparer.labels(self.work.view)
+        figures = self.figures() if self.work.view.overlay else []
+        self.work = interface.over_picture(self.work, sight, self._hand, said, figures, original)
+        gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
+        if any(was is not None and now is None for was, now in gone):
+            self.wake()
+
+    def figures(self) -> list[tuple[str, str]]:
+        """What the overlay shows of the picture on screen."""
+        pixels, count, by = self.canvas.pixels, self.facts.count, self.engine.draws_with
+        drawn = drawn_size(self._sight().size, pixels)
+        edits = self.engine.edits()
+        return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels, edits)
+
+    @property
+    def drawn(self) -> int:
+        """How many frames had a new picture of the splats."""
+        return self.canvas.drawn
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height in pixels of the picture on screen."""
+        return self._sight().size
+
+    @property
+    def timings(self) -> FrameTimings:
+        """Of the picture on screen."""
+        return self.canvas.timings
+
+    def ask(self, dialog: Dialog) -> None:
+        """Open a question over the picture."""
+        self.work = replace(self.work, dialog=dialog)
+        self.wake()
+
+    def request(self, request: str) -> None:
+        """One more thing for the window to do, after the next frame."""
+        self.work = replace(self.work, requests=(*self.work.requests, request))
+        self.wake()
+
+    def take_requests(self) -> tuple[str, ...]:
+        """What the window shall do now; asked for once each."""
+        requests, self.work = self.work.requests, replace(self.work, requests=())
+        return requests
+
+    def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
+        """Serve the requests for files that the stage can make by itself."""
+        served = [request for request in self.work.requests if request in saved_files.REQUESTS]
+        left = tuple(request for request in self.work.requests if request not in served)
+        self.work = replace(self.work, requests=left)
+        for request in served:
+            try:
+                self.tell(self._saved(request, screen, size))
+            except ProgdfError as error:
+                self.tell(str(error), error=True)
+
+    def _saved(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
+        title, view = self.facts.title, self._shown()
+        if request == "timeline_file":
+            return saved_files.timeline(self.pictures, title, view)
+        if request == "window_picture":
+            return saved_files.picture(self.pictures, title, read_rgb(screen, size))
+        image = self.canvas.image(view, self._sight().size)
+        pixels = labelled(image, view.compare, self.canvas.comparer.labels(view))
+        return saved_files.picture(self.pictures, title, pixels)
+
+
+def _strengths(view: ViewState) -> list[float]:
+    return [layer.strength for layer in view.layers]

@@ -1,0 +1,249 @@
+"""What the hand does to the camera, as pure functions, and the table of bindings, as data.
+
+Pixels are window coordinates at 1× (the caller divides by the UI scale), angles degrees, lengths world units.
+No function ever returns a camera that is not finite: a move that would leave the numbers is not made.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from .up_axis import Vec3
+from .view_camera import FARTHEST, ViewCamera, along, axes, eye, look_from, unit
+
+DEGREES_PER_PIXEL = 0.3
+ZOOM_PER_STEP = 0.12  # of the distance, per wheel step
+DOLLY_PER_PIXEL = 0.005
+FLY_RADII_PER_SECOND = 0.6
+CLOSEST, WIDEST = 1e-4, 1e4  # of the scene's radius: how near to and far from the pivot the eye goes
+
+
+def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
+    """Turn around the pivot so that the scene follows the hand; stops at the poles."""
+    elevation = max(-90.0, min(90.0, camera.elevation + DEGREES_PER_PIXEL * dy))
+    azimuth = _wrapped(camera.azimuth - DEGREES_PER_PIXEL * dx)
+    return _checked(replace(camera, azimuth=azimuth, elevation=elevation), camera)
+
+
+def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
+    """Turn the head where the eye stands (fly mode): right looks right, down looks down."""
+    turned = orbit(camera, dx, dy)
+    position = eye(camera)
+    return _checked(replace(turned, pivot=along(position, (-camera.distance, axes(turned).back))), camera)
+
+
+def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
+    """Slide the view so that what lies at the pivot's depth stays under the cursor.
+
+    Args:
+        height: of the picture in the same pixels as dx and dy
+    """
+    per_pixel = 2.0 * camera.distance * math.tan(math.radians(camera.fov_y) / 2) / max(height, 1.0)
+    picture = axes(camera)
+    pivot = along(camera.pivot, (-dx * per_pixel, picture.right), (dy * per_pixel, picture.up))
+    return _checked(replace(camera, pivot=pivot), camera)
+
+
+def zoom(camera: ViewCamera, steps: float, radius: float) -> ViewCamera:
+    """Wheel: steps > 0 goes nearer, in proportion to the distance.
+
+    Args:
+        radius: of the scene, world units; bounds the distance
+    """
+    factor = math.exp(max(-50.0, min(50.0, -ZOOM_PER_STEP * steps))) if math.isfinite(steps) else 1.0
+    return _checked(replace(camera, distance=_within(camera.distance * factor, radius)), camera)
+
+
+def dolly(camera: ViewCamera, dy: float, radius: float) -> ViewCamera:
+    """Drag: down goes away, up goes nearer, in proportion to the distance."""
+    return zoom(camera, -dy * DOLLY_PER_PIXEL / ZOOM_PER_STEP, radius)
+
+
+def drag(camera: ViewCamera, does: str, dx: float, dy: float, height: float, radius: float) -> ViewCamera:
+    """One step of a drag of `DRAGS`; see the function that it names."""
+    match does:
+        case "orbit":
+            return orbit(camera, dx, dy)
+        case "look":
+            return look(camera, dx, dy)
+        case "pan":
+            return pan(camera, dx, dy, height)
+        case "dolly":
+            return dolly(camera, dy, radius)
+    raise KeyError(does)
+
+
+def fly(
+    camera: ViewCamera,
+    right: float,
+    up: float,
+    ahead: float,
+    seconds: float,
+    radius: float,
+    pace: float = 1.0,
+) -> ViewCamera:
+    """Move eye and pivot together, at a speed in proportion to the scene.
+
+    Args:
+        right, up, ahead: −1, 0 or 1 from the keys; up is the scene's up, ahead is where one looks
+        seconds: since the last step; a stall counts as a tenth of a second at most
+        radius: of the scene, world units
+        pace: 10 with Shift, 0.1 with Alt
+    """
+    wish = unit((right, up, ahead), (0.0, 0.0, 0.0))
+    length = FLY_RADII_PER_SECOND * radius * pace * max(0.0, min(seconds, 0.1))
+    picture = axes(camera)
+    steps = (
+        (length * wish[0], picture.right),
+        (length * wish[1], unit(camera.up, (0.0, 1.0, 0.0))),
+        (-length * wish[2], picture.back),
+    )
+    return _checked(replace(camera, pivot=along(camera.pivot, *steps)), camera)
+
+
+def pivot_on(camera: ViewCamera, point: Vec3, radius: float) -> ViewCamera:
+    """Double click: the eye stays, the view turns to `point`, which becomes the pivot."""
+    turned = look_from(camera, eye(camera), point)
+    return _checked(replace(turned, distance=_within(turned.distance, radius)), camera)
+
+
+def toggle_fly(camera: ViewCamera) -> ViewCamera:
+    """Orbit ↔ fly; the picture does not move."""
+    return replace(camera, mode="orbit" if camera.mode == "fly" else "fly")
+
+
+def _within(distance: float, radius: float) -> float:
+    return max(CLOSEST * radius, min(WIDEST * radius, distance))
+
+
+def _wrapped(degrees: float) -> float:
+    return (degrees + 180.0) % 360.0 - 180.0 if math.isfinite(degrees) else degrees
+
+
+def _checked(new: ViewCamera, old: ViewCamera) -> ViewCamera:
+    numbers = (*new.pivot, new.distance, new.azimuth, new.elevation)
+    fits = all(math.isfinite(v) and abs(v) <= FARTHEST for v in numbers) and new.distance > 0.0
+    return new if fits else old
+
+
+@dataclass(frozen=True)
+class Drag:
+    """A mouse drag on the picture. `mode`: only in this camera mode; empty is both."""
+
+    button: str
+    modifier: str
+    does: str
+    mode: str = ""
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key: modifiers in the order Ctrl, Shift, Alt, then the key's name. `repeats` while held."""
+
+    chord: str
+    action: str
+    help: str
+    repeats: bool = False
+
+
+DRAGS = (
+    Drag("left", "", "orbit"),
+    Drag("middle", "", "orbit"),
+    Drag("middle", "Shift", "pan"),
+    Drag("middle", "Ctrl", "dolly"),
+    Drag("right", "", "look", mode="fly"),
+    Drag("right", "", "pan"),
+)
+
+FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
+"""Physical keys (their places on a US keyboard) → right, up, ahead."""
+
+HELD_ORIGINAL = "\\"
+NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
+
+KEYS = (
+    *(Key(str(i), f"focus:{i}", "focus layer 1–9" if i == 1 else "") for i in range(1, 10)),
+    *(Key(f"Shift+{i}", f"toggle:{i}", "show or hide layer 1–9" if i == 1 else "") for i in range(1, 10)),
+    *(
+        Key(f"{held}{arrow}", f"nudge:{sign * step:g}", help_, repeats=True)
+        for held, step in NUDGES
+        for arrow, sign, help_ in (
+            ("Left", -1, ""),
+            ("Right", 1, f"strength or gain ±{100 * step:g} %"),
+            ("Down", -1, ""),
+            ("Up", 1, ""),
+        )
+    ),
+    Key("Tab", "dial:1", "arrows move the next gain, or the strength"),
+    Key("Shift+Tab", "dial:-1", ""),
+    Key("H", "hide", "show or hide the focused layer"),
+    Key("Shift+H", "solo", "show it alone (Alt+click the eye)"),
+    Key("Alt+H", "show_all", "show all layers"),
+    Key("L", "lock", "lock its strength and gains"),
+    Key("G", "fold", "its gains and curve"),
+    Key("Enter", "rename", "rename it (double click its name)"),
+    Key("Ctrl+D", "duplicate", "duplicate it"),
+    Key("Ctrl+Delete", "remove", "delete it"),
+    Key("Alt+Up", "move:-1", ""),
+    Key("Alt+Down", "move:1", "move it up or down (drag its name)"),
+    Key("B", "brush", "paint its strength (left drag)"),
+    Key("X", "brush_mode", "brush: erase, smooth, add"),
+    Key("Shift+B", "brush_through", "brush: front surface or through"),
+    Key("C", "brush_weights", "brush: show weights as colours"),
+    Key("[", f"brush_radius:{1 / 1.25:g}", "", repeats=True),
+    Key("]", "brush_radius:1.25", "brush size; with Shift softness", repeats=True),
+    Key("Shift+[", "brush_softness:-0.1", "", repeats=True),
+    Key("Shift+]", "brush_softness:0.1", "", repeats=True),
+    Key("Backspace", "paint_clear", "paint none of it; with Shift all"),
+    Key("Shift+Backspace", "paint_fill", ""),
+    Key("Shift+X", "paint_feather", "feather all its paint"),
+    Key("M", "blend", "next blend rule"),
+    Key("O", "overshoot", "sliders to 1.2: extrapolates"),
+    Key("Escape", "unfocus", "close this list; focus no layer"),
+    Key("Ctrl+Z", "undo", "undo", repeats=True),
+    Key("Ctrl+Shift+Z", "redo", "redo", repeats=True),
+    Key("Ctrl+Y", "redo", "", repeats=True),
+    Key("V", "fly", "orbit or fly"),
+    Key("F", "frame", "frame the focused layer, or the scene"),
+    Key("Shift+F", "home", "home"),
+    Key("Y", "split", "original and edited side by side"),
+    Key("Shift+Y", "difference", "difference from the original"),
+    Key("Alt+Y", "against", "compare with what was recorded"),
+    Key("Space", "play", "play or pause"),
+    Key("K", "key", "set a key: camera and strengths"),
+    Key("Delete", "drop_key", "delete the key at the playhead"),
+    Key(",", "step:-1", "", repeats=True),
+    Key(".", "step:1", "one frame back or on", repeats=True),
+    Key("Shift+,", "jump:-1", ""),
+    Key("Shift+.", "jump:1", "to the key before or after"),
+    Key("Shift+K", "easing", "its easing: smooth, linear, hold"),
+    Key("Alt+K", "ping_pong", "play there and back"),
+    Key("Ctrl+K", "timeline_file", "save the timeline as a file"),
+    Key("T", "timeline", "show or hide the timeline"),
+    Key("F1", "help", "this list"),
+    Key("F2", "picture", "save the picture as PNG"),
+    Key("Shift+F2", "window_picture", "save the whole window as PNG"),
+    Key("F3", "snapshot", "take a snapshot of the sliders"),
+    Key("F4", "camera", "keep this view as a camera"),
+    Key("Ctrl+S", "save", "save the session"),
+    Key("Ctrl+Shift+S", "save_as", "save it under another name"),
+    Key("Ctrl+O", "open", "open a session, scene or edit"),
+    Key("F10", "overlay", "timings"),
+    Key("Shift+F10", "draft", "coarse while it moves: auto, on, off"),
+    Key("F11", "full_screen", "full screen"),
+    Key("F12", "panel", "hide the panel"),
+    Key("Ctrl+Q", "quit", "quit"),
+)
+
+
+OPENS_TEXT = ("rename", "save", "save_as", "open")
+"""Actions after which one types."""
+
+
+def drag_for(button: str, modifier: str, mode: str) -> str | None:
+    """What a drag does, or None where nothing is bound. `modifier`: "", "Shift", "Ctrl" or "Alt"."""
+    for drag in DRAGS:
+        if drag.button == button and drag.modifier == modifier and drag.mode in ("", mode):
+            return drag.does
+    return None

@@ -1,0 +1,292 @@
+"""The geometry of a `ViewCamera`: where the eye is, where right and up are, what frames a scene.
+
+Plain float64 arithmetic on tuples, exact at the poles: the right axis of the picture comes from the azimuth,
+not from a cross product with the view direction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from progdf.camera import Camera, intrinsics
+from progdf.gaussians import Gaussians
+from progdf.scene.bounds import scene_sphere
+from progdf.scene.subject import fitted_eye, is_room, standpoint, subject_rows
+
+from .up_axis import Vec3, up_of
+
+
+@dataclass(frozen=True)
+class ViewCamera:
+    """Where one looks from: a turntable around `pivot`, or a free flight with the same numbers.
+
+    Args:
+        pivot: what the camera turns around, world units
+        distance: from the pivot to the eye, world units, > 0
+        azimuth: degrees around `up`
+        elevation: degrees above the plane normal to `up`, −90..90
+        fov_y: vertical field of view, degrees
+        up: unit vector that is up in the picture
+        mode: "orbit" or "fly"
+    """
+
+    pivot: Vec3 = (0.0, 0.0, 0.0)
+    distance: float = 5.0
+    azimuth: float = 0.0
+    elevation: float = 15.0
+    fov_y: float = 45.0
+    up: Vec3 = (0.0, 1.0, 0.0)
+    mode: str = "orbit"
+
+
+FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
+
+FILL = 0.72
+"""Share of the picture's tighter side that what one looks at takes at first."""
+
+INSIDE_FOV = 60.0
+"""Degrees: as much as one has to see of a room to know where one stands."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the camera frames: a centre and the radius of the bulk around it, world units, radius > 0."""
+
+    centre: Vec3 = (0.0, 0.0, 0.0)
+    radius: float = 1.0
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Unit vectors of the picture in the world: right, up, and back (from the pivot to the eye)."""
+
+    right: Vec3
+    up: Vec3
+    back: Vec3
+
+
+class Fit(Protocol):
+    """Gives the camera of the same direction whose picture something fills."""
+
+    def __call__(self, camera: ViewCamera, aspect: float) -> ViewCamera:
+        """`aspect`: width / height of the picture"""
+
+
+def unmoved(camera: ViewCamera, aspect: float) -> ViewCamera:
+    """The fit of something of which nothing is known."""
+    return camera
+
+
+def dot(a: Vec3, b: Vec3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def along(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
+    """origin + Σ length · direction"""
+    x, y, z = origin
+    for length, direction in steps:
+        x, y, z = x + length * direction[0], y + length * direction[1], z + length * direction[2]
+    return x, y, z
+
+
+def unit(v: Vec3, otherwise: Vec3) -> Vec3:
+    """`v` made one long; `otherwise` where it has no direction."""
+    largest = max(abs(c) for c in v)
+    if not (0.0 < largest < math.inf) or any(math.isnan(c) for c in v):
+        return otherwise
+    x, y, z = (c / largest for c in v)
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def front(up: Vec3) -> Vec3:
+    """Where the eye stands at azimuth 0, elevation 0: +Z for y-up, −Z for y-down, −Y for z-up, +Y for z-down.
+
+    So a y-down scene (COLMAP, most trained splats) is met from the side its cameras looked from.
+    """
+    largest = max(range(3), key=lambda i: abs(up[i]))
+    sign = math.copysign(1.0, up[largest])
+    facing: Vec3 = ((0.0, 0.0, sign), (0.0, 0.0, sign), (0.0, -sign, 0.0))[largest]
+    return unit(along(facing, (-dot(facing, up), up)), (1.0, 0.0, 0.0))
+
+
+def axes(camera: ViewCamera) -> Axes:
+    """The picture's axes; an unusable `up` counts as +Y."""
+    up = unit(camera.up, (0.0, 1.0, 0.0))
+    ahead = front(up)
+    side = cross(up, ahead)
+    azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
+    cos_a, sin_a, cos_e, sin_e = (
+        math.cos(azimuth),
+        math.sin(azimuth),
+        math.cos(elevation),
+        math.sin(elevation),
+    )
+    level = along((0.0, 0.0, 0.0), (cos_a, ahead), (sin_a, side))
+    zero = (0.0, 0.0, 0.0)
+    return Axes(
+        right=along(zero, (cos_a, side), (-sin_a, ahead)),
+        up=along(zero, (cos_e, up), (-sin_e, level)),
+        back=along(zero, (sin_e, up), (cos_e, level)),
+    )
+
+
+def eye(camera: ViewCamera) -> Vec3:
+    """The eye's position in world units."""
+    return along(camera.pivot, (camera.distance, axes(camera).back))
+
+
+def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
+    """The pinhole camera of a picture of this size in pixels (a zero-sized window counts as one pixel)."""
+    width, height = max(width, 1), max(height, 1)
+    picture, position = axes(camera), eye(camera)
+    rows = np.array([picture.right, picture.up, picture.back], dtype=np.float64)
+    rows[1:] *= -1.0  # OpenCV axes: y down, z forward
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rows
+    viewmat[:3, 3] = -rows @ np.array(position)
+    return Camera(
+        torch.from_numpy(viewmat).float(),
+        intrinsics(math.radians(camera.fov_y), width, height),
+        width,
+        height,
+    )
+
+
+def facing(camera: ViewCamera, back: Vec3) -> ViewCamera:
+    """The same pivot and distance, seen along −`back` (any length): azimuth and elevation that give it."""
+    up = unit(camera.up, (0.0, 1.0, 0.0))
+    direction = unit(back, axes(camera).back)
+    ahead = front(up)
+    height = max(-1.0, min(1.0, dot(direction, up)))
+    level = along(direction, (-height, up))
+    azimuth = camera.azimuth  # straight up or down: the azimuth is free, so it stays
+    if dot(level, level) > 1e-18:
+        azimuth = math.degrees(math.atan2(dot(level, cross(up, ahead)), dot(level, ahead)))
+    # atan2 keeps the accuracy near the poles that asin would lose
+    elevation = math.degrees(math.atan2(height, math.sqrt(dot(level, level))))
+    return replace(camera, azimuth=azimuth, elevation=elevation)
+
+
+def with_up(camera: ViewCamera, up: Vec3) -> ViewCamera:
+    """Another up axis, the eye and the pivot where they are (the picture only rolls upright)."""
+    back = axes(camera).back
+    return facing(replace(camera, up=unit(up, camera.up)), back)
+
+
+def look_from(camera: ViewCamera, position: Vec3, pivot: Vec3) -> ViewCamera:
+    """The eye at `position`, looking at `pivot`; the direction stays where the two coincide."""
+    back = (position[0] - pivot[0], position[1] - pivot[1], position[2] - pivot[2])
+    turned = facing(replace(camera, pivot=pivot), back)
+    return replace(turned, distance=max(math.dist(position, pivot), 1e-9))
+
+
+def bounds_of(scene: Gaussians) -> Bounds:
+    """What frames the bulk of a scene, or of one layer's members; far strays do not count."""
+    if not len(scene):
+        return Bounds()
+    centre, radius = scene_sphere(scene)
+    x, y, z = (float(c) for c in centre)
+    return Bounds((x, y, z), radius) if math.isfinite(x + y + z + radius) else Bounds()
+
+
+def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, with the sphere `bounds` filling the smaller side of the picture.
+
+    Args:
+        aspect: width / height of the picture
+    """
+    half = math.radians(camera.fov_y) / 2
+    if 0.0 < aspect < 1.0:
+        half = math.atan(math.tan(half) * aspect)
+    return replace(camera, pivot=bounds.centre, distance=1.05 * bounds.radius / math.sin(half))
+
+
+def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, with these Gaussians filling `FILL` of the tighter side of the picture.
+
+    Args:
+        shown: of none at all, the surroundings of the origin are framed
+        aspect: width / height of the picture
+    """
+    if not len(shown):
+        return frame(camera, bounds_of(shown), aspect)
+    picture = axes(camera)
+    tangent = math.tan(math.radians(camera.fov_y) / 2)
+    frame_axes = torch.tensor([picture.right, picture.up, picture.back], dtype=torch.float64)
+    radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
+    found = fitted_eye(shown.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
+    x, y, z = (float(c) for c in found)
+    depth = dot((x, y, z), picture.back) - float((shown.means.double() @ frame_axes[2]).median())
+    if not (math.isfinite(x + y + z) and 0.0 < depth < FARTHEST):
+        return frame(camera, bounds_of(shown), aspect)
+    return replace(camera, pivot=along((x, y, z), (-depth, picture.back)), distance=depth)
+
+
+def fit_subject(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, filled by what the scene is about (`subject_rows`); in a room the same view."""
+    up = torch.tensor(camera.up)
+    return camera if is_room(scene, up) else fit(camera, scene[subject_rows(scene, up)], aspect)
+
+
+def fit_all(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
+    """The same direction, filled by what the scene is about; a room is seen from outside, all of it."""
+    up = torch.tensor(camera.up)
+    if not len(scene) or is_room(scene, up):
+        return frame(camera, bounds_of(scene), aspect)
+    return fit(camera, scene[subject_rows(scene, up)], aspect)
+
+
+def first_camera(
+    scene: Gaussians,
+    cameras: Sequence[Camera] = (),
+    aspect: float = 1.5,
+    fov_y: float = 45.0,
+    up: Vec3 | None = None,
+) -> ViewCamera:
+    """What one sees first: what the scene is about, upright, from the front and a little above.
+
+    A room is met inside, from a wall or a corner, with at least `INSIDE_FOV` degrees.
+
+    Args:
+        scene: the original
+        cameras: given with it
+        aspect: width / height of the picture
+        fov_y: vertical field of view, degrees
+        up: unit vector; None asks the cameras and the scene
+    """
+    up = up_of(scene, cameras=cameras) if up is None else up
+    camera, axis = ViewCamera(up=up, azimuth=20.0, fov_y=fov_y), torch.tensor(up)
+    if not len(scene):
+        return frame(camera, Bounds(), aspect)
+    if is_room(scene, axis):
+        eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, axis))
+        return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
+    return fit_subject(camera, scene, aspect)
+
+
+def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:
+    """Where a pinhole camera stands and looks, upright, with its field of view; the pivot is in front of it.
+
+    Args:
+        camera: gives the up axis and the mode
+        seen: the pinhole camera
+        bounds: of the scene; the pivot is at the depth of its centre, where that is in front
+    """
+    world = torch.linalg.inv(seen.viewmat.double()).tolist()
+    position: Vec3 = (world[0][3], world[1][3], world[2][3])
+    ahead: Vec3 = (world[0][2], world[1][2], world[2][2])
+    depth = dot(along(bounds.centre, (-1.0, position)), ahead)
+    depth = depth if depth > 1e-3 * bounds.radius else bounds.radius
+    fov_y = math.degrees(2.0 * math.atan(seen.height / (2.0 * float(seen.K[1, 1]))))
+    return look_from(replace(camera, fov_y=fov_y), position, along(position, (depth, ahead)))

@@ -1,0 +1,1 @@
+"""`progdf view`, `render` and `export`."""

@@ -1,0 +1,91 @@
+"""The commands `progdf view` and `progdf export`; `progdf render` is in render.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData
+
+from progdf.cli.options import parsed
+from progdf.compose.reference import compose
+from progdf.errors import ProgdfError
+from progdf.formats.load_report import counted
+from progdf.formats.ply import GEOMETRY, load_ply, save_ply
+from progdf.formats.scene_file import scene_format
+from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
+from progdf.io.atomic import written_whole
+from progdf.terminal import say
+from viewer.camera.view_camera import first_camera
+from viewer.render.threads import one_thread
+from viewer.state.layers import shown
+from viewer.state.paint import layer_of
+
+from . import arguments, opening
+from .options import ExportOptions, ViewOptions
+
+
+@one_thread()
+def view(argv: Sequence[str]) -> int:
+    """`progdf view`: open the window and stay until it is closed."""
+    options = parsed(ViewOptions, arguments.joined(opening.without_name(argv)), "progdf view")
+    found = opening.opened(options)
+    from viewer.app.app import run  # imgui and glfw, which render and export do without
+
+    state = found.view
+    if found.session is None:
+        state = replace(state, camera=first_camera(found.document.scene, up=found.up))
+    return run(
+        found.document,
+        state,
+        session=found.session,
+        snapshots=found.snapshots,
+        draw=options.engine,
+        edit_pass=options.edit_pass,
+    )
+
+
+def export(argv: Sequence[str]) -> int:
+    """`progdf export`: the edited scene as a .ply that any viewer opens."""
+    options = parsed(ExportOptions, arguments.joined(opening.without_name(argv)), "progdf export")
+    if options.out.suffix.lower() != ".ply":
+        raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
+    found = opening.opened(options, unset=1.0)
+    arguments.check_not_an_input(options.out, found.files)
+    gdfs, states = found.document.gdfs, shown(found.view)
+    layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
+    edited = compose(found.document.scene, layers, found.view.blend)
+    with written_whole(options.out) as beside:
+        save_ply(beside, edited)
+        _check_reloaded(edited, load_ply(beside))
+        _check_by_plyfile(edited, beside)
+    told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
+    say(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
+    source = found.document.path
+    if source is not None and (kind := scene_format(source)) != "ply":
+        say(f"{found.document.title} is a .{kind}, this is a plain .ply")
+    return 0
+
+
+def _check_reloaded(written: Gaussians, read: Gaussians) -> None:
+    """Raises ProgdfError where the file gives back anything but what was written into it."""
+    for name in ATTRIBUTES:
+        expected, found = getattr(written, name), getattr(read, name)
+        if name == "quats":
+            same = torch.allclose(normalize_quats(expected), found, rtol=0.0, atol=1e-6)
+        else:
+            same = torch.equal(expected, found)
+        if not same:
+            raise ProgdfError(f"the written file does not give back its {name}; check the disk and try again")
+
+
+def _check_by_plyfile(written: Gaussians, path: Path) -> None:
+    """The same by a reader that is not ours, as other programs will read the file."""
+    vertex = PlyData.read(path)["vertex"]
+    for name, columns in GEOMETRY.items():
+        found = np.stack([vertex[column] for column in columns], axis=1)
+        if not np.array_equal(found, getattr(written, name).reshape(len(written), -1).numpy()):
+            raise ProgdfError(f"plyfile reads other {name} than were written; check the disk and try again")

@@ -1,0 +1,207 @@
+"""The command `progdf render`: pictures, comparisons, contact sheets and films without a window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+from PIL import Image
+
+from progdf.camera import Camera
+from progdf.cli.options import parsed
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.io.atomic import written_whole
+from progdf.terminal import say
+from viewer.files import timeline_file
+from viewer.pictures import film, timeline_film
+from viewer.pictures.compare_labels import labelled
+from viewer.pictures.compare_view import Comparer
+from viewer.render.engine import Engine
+from viewer.render.headless import headless_context
+from viewer.render.threads import one_thread
+from viewer.state import recordings, timeline
+from viewer.state.view_state import Comparison, Timeline, ViewState
+
+from . import arguments, opening
+from .camera_arguments import asked_camera
+from .opening import Opened
+from .options import RenderOptions
+
+ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
+"""Options that each say what the picture is; only a timeline goes with a sheet."""
+
+
+@one_thread()
+def render(argv: Sequence[str]) -> int:
+    """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
+    options = parsed(RenderOptions, arguments.joined(opening.without_name(argv)), "progdf render")
+    _check_output(options)
+    size = None if options.size is None else arguments.parse_size(options.size)
+    one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
+    found = opening.opened(options, unset=0.0 if one_moves else 1.0)
+    arguments.check_not_an_input(options.out, found.files)
+    scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
+    view = replace(view, compare=_comparison(options, view.compare))
+    saved = None if found.session is None else view.camera
+    camera = asked_camera(options, scene, gdfs, size, saved, found.up)
+    if options.timeline is not None:
+        keys, count = _keys(options, found), _count(options.sheet)
+        with _engine(scene, gdfs, options) as engine:
+            say(timeline_film.write(options.out, keys, view, camera, engine, count))
+        return 0
+    swept = _swept(options, found)
+    with _engine(scene, gdfs, options) as engine:
+        if swept:
+            _moving(options, swept, view, camera, engine)
+            told = ""
+        else:
+            told = _still(options, found, view, camera, engine)
+        drawn_by = _drawn_by(engine)
+    each = "each " if options.sheet is not None else ""
+    say(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
+    if told:
+        say(told)
+    if view.layers and not swept and not any(layer.strength for layer in view.layers):
+        say(f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit")
+    return 0
+
+
+def _moving(
+    options: RenderOptions, swept: Sequence[str], view: ViewState, camera: Camera, engine: Engine
+) -> None:
+    """An animation of one slider, or a contact sheet of one or two."""
+
+    def picture(wanted: ViewState) -> film.Pixels:
+        return film.to_pixels(engine.image(wanted, camera=camera))
+
+    with written_whole(options.out) as beside:
+        if options.sweep is not None:
+            frames = (picture(moved) for moved in film.sweep(view, swept[0]))
+            write = film.write_gif if options.out.suffix.lower() == ".gif" else film.write_mp4
+            write(beside, frames)
+        elif len(swept) == 2:
+            Image.fromarray(film.grid(swept[0], swept[1], picture, view)).save(beside)
+        else:
+            Image.fromarray(film.contact_sheet(swept[0], picture, view)).save(beside)
+
+
+def _still(options: RenderOptions, found: Opened, view: ViewState, camera: Camera, engine: Engine) -> str:
+    """One picture, compared as `view` asks; gives what to say about the comparison."""
+    where = found.document.recordings()
+    missing = recordings.obstacle(where)
+    if view.compare.mode != "off" and view.compare.against == "recorded" and missing:
+        raise ProgdfError(f"nothing recorded to compare with: {missing}; give the .gdf in its run folder")
+    comparer = Comparer(engine, engine.ctx, where)
+    try:
+        image = comparer.image(view, camera=camera)
+        with written_whole(options.out) as beside:
+            Image.fromarray(labelled(image, view.compare, comparer.labels(view))).save(beside)
+        if view.compare.mode == "off":
+            return ""
+        if comparer.against(view) == "original":
+            return f"PSNR of edited against original {comparer.psnr:.2f} dB"
+        recorded = recordings.told(view, engine.gdfs, comparer.recordings)
+        return f"PSNR of the field against what was recorded {comparer.psnr:.2f} dB ({recorded})"
+    finally:
+        comparer.release()
+
+
+def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
+    """What was asked for; else what the session shows."""
+    asked = arguments.parse_comparison(options.split, options.difference)
+    asked = saved if asked.mode == "off" else asked
+    if options.against is None:
+        return asked
+    if asked.mode == "off":
+        raise ProgdfError(f"--against {options.against} alone compares nothing; add --split or --difference")
+    return replace(asked, against=options.against)
+
+
+def _keys(options: RenderOptions, found: Opened) -> Timeline:
+    """The timeline that was asked for: of a file of its own, or of the session."""
+    assert options.timeline is not None
+    own = found.session is not None and options.timeline.exists() and options.timeline.samefile(found.session)
+    keys = found.view.timeline if own else timeline_file.load(options.timeline, found.view.layers)
+    if own and not keys.keys:
+        raise ProgdfError(f"{options.timeline} has no keys on its timeline; set some with K in the window")
+    if timeline.camera_at(keys, 0) is not None and (options.camera or options.orbit or options.frame):
+        raise ProgdfError(f"{options.timeline} moves the camera; leave out --camera, --orbit and --frame")
+    return keys
+
+
+def _count(sheet: str | None) -> int:
+    """How many pictures of a film a contact sheet shall show; 0 where none was asked for."""
+    if sheet is None:
+        return 0
+    if not (sheet.isdecimal() and len(sheet) < 9) or not 1 <= int(sheet) <= timeline_film.MOST_SHOWN:
+        most = timeline_film.MOST_SHOWN
+        raise ProgdfError(f"--sheet {sheet} is no number of a film's pictures; give one from 1 to {most}")
+    return int(sheet)
+
+
+def _swept(options: RenderOptions, found: Opened) -> list[str]:
+    """Names of the layers whose sliders move in the picture: none, one or two."""
+    if options.sweep is not None:
+        return [_showing(found.layer(options.sweep), found.view, "--sweep")]
+    if options.sheet is None:
+        return []
+    names = [_showing(found.layer(name), found.view, "--sheet") for name in options.sheet.split(",")]
+    if len(names) > 2 or len(set(names)) < len(names):
+        raise ProgdfError(f"--sheet {options.sheet} does not name one or two different edits; name those")
+    return names
+
+
+def _showing(name: str, view: ViewState, option: str) -> str:
+    """`name`, when there is such an edit and no other that is alone hides it."""
+    arguments.known_edit(name, view.layers, option)
+    alone = [layer.name for layer in view.layers if layer.solo]
+    if alone and name not in alone:
+        raise ProgdfError(f"{option} {name}: {alone[0]} is shown alone and hides it; show {name} alone too")
+    return name
+
+
+@contextmanager
+def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> Iterator[Engine]:
+    """An engine for pictures without a window; "auto" does without OpenGL where there is none."""
+    ctx = None
+    if options.engine != "cpu":
+        try:
+            ctx = headless_context()
+        except ProgdfError:
+            if options.engine == "gl":
+                raise
+    engine = Engine(ctx, scene, gdfs, options.engine, options.edit_pass)
+    try:
+        yield engine
+    finally:
+        engine.release()
+        if ctx is not None:
+            ctx.release()
+
+
+def _drawn_by(engine: Engine) -> str:
+    """The engine in words, with its edit pass if that had a part in the picture, or why it had none."""
+    edits = engine.edits()
+    return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.told}"
+
+
+def _check_output(options: RenderOptions) -> None:
+    """Whether the file's name fits what goes into it."""
+    suffix = options.out.suffix.lower()
+    given = [name for name in ONE_OF if getattr(options, name) is not None]
+    if len(given) > 1 and given != ["sheet", "timeline"]:
+        raise ProgdfError(f"--{given[0]} and --{given[1]} were both given; give one of them")
+    films = options.timeline is not None and options.sheet is None
+    if films:
+        timeline_film.check_output(options.out)
+    if options.sweep is not None and suffix not in (".gif", ".mp4"):
+        raise ProgdfError(f"{options.out} cannot hold an animation; --sweep writes a .gif or an .mp4")
+    moves = options.sweep is not None or films
+    if not moves and suffix in (".gif", ".mp4"):
+        raise ProgdfError(f"{options.out} holds an animation; say which slider moves with --sweep NAME")
+    if not moves and suffix != ".png":
+        raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
+    film.check_encoder(options.out)

@@ -1,0 +1,92 @@
+"""What is open: a scene and its edits, with the files they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from progdf.formats.scene_file import load_scene, scene_file, scene_name
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, load_gdf
+from viewer.camera.view_camera import bounds_of, first_camera, fit_all
+from viewer.render.threads import all_threads
+from viewer.state.layer_facts import layer_rows
+from viewer.state.recordings import Recording, found
+from viewer.state.workspace import SceneFacts
+
+
+@dataclass(frozen=True)
+class Document:
+    """The scene and its edits, in the order of `LayerState.gdf`.
+
+    Args:
+        title: the scene's name
+        scene: the original
+        gdfs: its edits
+        path: the scene's file; None where there is none, and so no session can be saved
+        gdf_paths: the edits' files, one for each where there are any
+    """
+
+    title: str
+    scene: Gaussians
+    gdfs: tuple[Gdf, ...] = ()
+    path: Path | None = None
+    gdf_paths: tuple[Path, ...] = ()
+
+    def facts(self) -> SceneFacts:
+        """What the panel and the camera need to know of it."""
+        scene, rows = self.scene, layer_rows(self.scene, self.gdfs)
+        return SceneFacts(
+            title=self.title,
+            count=len(scene),
+            bounds=bounds_of(scene),
+            rows=rows,
+            recordings=self.recordings(),
+            fit=lambda camera, aspect: fit_all(camera, scene, aspect),
+            home=lambda camera, aspect: replace(
+                first_camera(scene, (), aspect, camera.fov_y, camera.up), mode=camera.mode
+            ),
+        )
+
+    def recordings(self) -> tuple[Recording, ...]:
+        """Where each edit was recorded."""
+        if len(self.gdf_paths) != len(self.gdfs):
+            return (Recording(),) * len(self.gdfs)
+        return tuple(found(gdf, path) for gdf, path in zip(self.gdfs, self.gdf_paths, strict=True))
+
+    def free_name(self, name: str) -> str:
+        """An edit's name, with a number where another edit has it."""
+        taken, free, number = {gdf.name for gdf in self.gdfs}, name, 2
+        while free in taken:
+            free, number = f"{name}-{number}", number + 1
+        return free
+
+
+def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
+    """Read a scene and its edits.
+
+    Raises:
+        ProgdfError: a file is missing or broken, or an edit was made for another scene.
+    """
+    scene = scene_file(scene)
+    gaussians = load_scene(scene)
+    return Document(scene_name(scene), gaussians, load_edits(gdfs, gaussians, scene), scene, tuple(gdfs))
+
+
+def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tuple[Gdf, ...]:
+    """The edits of a scene; a second one of the same name becomes NAME-2, so that --set can tell them apart.
+
+    Raises:
+        ProgdfError: a file is missing, broken, or was made for another scene.
+    """
+    gdfs: list[Gdf] = []
+    for path in paths:
+        with all_threads():
+            gdf = load_gdf(path, scene, scene_path.name)
+        taken = {other.name for other in gdfs}
+        name, number = gdf.name, 2
+        while name in taken:
+            name, number = f"{gdf.name}-{number}", number + 1
+        gdfs.append(replace(gdf, name=name))
+    return tuple(gdfs)

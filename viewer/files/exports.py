@@ -1,0 +1,76 @@
+"""Files that the window makes by itself: picture, window, timeline, cameras; and where they went."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
+from progdf.io.session import SUFFIX
+from viewer.state.view_state import ViewState
+
+from . import timeline_file
+from .images import free_path, save_picture
+
+CAMERAS = ".cameras.json"
+
+REQUESTS = ("picture", "window_picture", "timeline_file")
+"""Those of `workspace.REQUESTS` that end here."""
+
+
+def picture(folder: Path, title: str, image: NDArray[np.uint8]) -> str:
+    """Save `image` [H,W,3] under the scene's name; the line that says where.
+
+    Raises:
+        ProgdfError: it cannot be written.
+    """
+
+    def save() -> str:
+        return f"Saved {save_picture(folder, Path(title).stem, image).resolve()}"
+
+    return _saved("picture", folder, save)
+
+
+def timeline(folder: Path, title: str, view: ViewState) -> str:
+    """Save the keys of `view` under the scene's name; the line that says where, and what for.
+
+    Raises:
+        ProgdfError: it cannot be written.
+    """
+    path = free_path(folder, f"{Path(title).stem}_timeline", ".json")
+
+    def save() -> str:
+        timeline_file.save(path, view.timeline, view.layers)
+        return f"Saved {path.resolve()}; progdf render … --timeline {path.name} makes a film of it"
+
+    return _saved("timeline", folder, save)
+
+
+def camera(place: Path, seen: Camera) -> tuple[Path, int]:
+    """Add a camera to NAME.cameras.json beside a scene or session NAME; where that is, and how many it holds.
+
+    Raises:
+        ProgdfError: it cannot be written, or holds something else.
+    """
+    name = place.name.removesuffix(SUFFIX) if place.name.endswith(SUFFIX) else place.stem
+    path = place.with_name(f"{name}{CAMERAS}")
+    if path.exists() and kind_of_cameras(path) != "own":
+        raise ProgdfError(f"{path} was not made with F4; move it elsewhere, as it would be written anew")
+    kept = load_cameras(path) if path.exists() else []
+    number = 1 + max((int(c.name[5:]) for c in kept if re.fullmatch(r"view_\d{1,9}", c.name)), default=-1)
+    save_cameras(path, [*kept, replace(seen, name=f"view_{number:03d}")])
+    return path, len(kept) + 1
+
+
+def _saved(what: str, folder: Path, save: Callable[[], str]) -> str:
+    try:
+        return save()
+    except OSError as error:
+        raise ProgdfError(f"no {what} was saved in {folder.resolve()}: {error.strerror}") from None

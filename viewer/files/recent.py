@@ -1,0 +1,34 @@
+"""Files opened before, the last one first: one path a line in the user's folder of program state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from progdf.io.atomic import written_whole
+from progdf.io.user_folders import state_folder
+
+MOST = 8
+
+
+def read(folder: Path | None = None) -> tuple[Path, ...]:
+    """Those that are still there; none where nothing can be read."""
+    try:
+        lines = ((folder or state_folder()) / "recent.txt").read_text(encoding="utf-8").splitlines()
+        return tuple(path for path in map(Path, lines) if path.is_file())[:MOST]
+    except (OSError, ValueError):
+        return ()
+
+
+def remember(paths: Sequence[Path], folder: Path | None = None) -> tuple[Path, ...]:
+    """Put files in front, the last one first; what cannot be written is not remembered."""
+    folder = folder or state_folder()
+    kept = dict.fromkeys([*(path.resolve() for path in reversed(paths)), *read(folder)])
+    files = tuple(path for path in kept if "\n" not in str(path))[:MOST]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with written_whole(folder / "recent.txt") as beside:
+            beside.write_text("".join(f"{path}\n" for path in files), encoding="utf-8")
+    except OSError:
+        pass
+    return files

@@ -1,0 +1,1 @@
+"""The panel: layers, sliders, snapshots, timeline."""

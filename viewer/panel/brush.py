@@ -1,0 +1,120 @@
+"""The brush in the window: its controls in the panel, its ring at the cursor, what keeps it from painting."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+from imgui_bundle import imgui
+
+from viewer.render import highlight as tint
+from viewer.state import layers as stack
+from viewer.state import paint
+from viewer.state.view_state import Brush, ViewState
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.widgets import choice, icon_button, label, tip, value_slider
+from viewer.ui.widgets import section as heading
+
+DRAG = "brush"
+"""What a left drag does while the brush is active, beside those of `controls.DRAGS`."""
+
+NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
+WHOLE = (
+    ("None", "paint_clear", "Paint none of it (Backspace)"),
+    ("Full", "paint_fill", "Paint all of it (Shift+Backspace)"),
+    ("Feather", "paint_feather", "Soften the edges of its paint; again, more (Shift+X)"),
+)
+"""Buttons for all of a layer's paint: name, action of `controls.KEYS`, tip."""
+
+
+def obstacle(view: ViewState, focus: int | None) -> str:
+    """Why the brush cannot paint now, one line; empty where it can."""
+    if focus is None or focus >= len(view.layers):
+        return "no layer is focused; click the one to paint, or press 1–9"
+    layer = view.layers[focus]
+    if layer.locked:
+        return f"{layer.name} is locked; L unlocks it"
+    if layer not in stack.shown(view):
+        return f"{layer.name} is hidden; H shows it"
+    return ""
+
+
+def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewState, str]:
+    """The brush's controls; the changed state and an action of `controls.KEYS` asked for, or ""."""
+    column, brush, action = 82.0 * ui.scale, view.brush, ""
+    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
+    heading("Paint", ui)
+    label("Brush", column)
+    mode = choice("brush mode", tuple(NAMES[m] for m in paint.MODES), paint.MODES.index(brush.mode), ui)
+    tip("X; while painting, Ctrl does the opposite and Shift smooths")
+    if mode is not None:
+        brush = replace(brush, mode=paint.MODES[mode])
+    label("Radius", column)
+    radius = value_slider(
+        "##radius", brush.radius, (paint.SMALLEST_PX, paint.LARGEST_PX), "%.0f px", Brush.radius, ui
+    )
+    tip("[ ]")
+    label("Softness", column)
+    softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", Brush.softness, ui)
+    tip("Shift+[ ]")
+    brush = replace(brush, radius=radius, softness=softness)
+    label("Acts on", column)
+    depth = choice("depth", ("Front", "Through"), int(brush.through), ui)
+    tip("The front surface only, or all that lies under the brush (Shift+B)")
+    if depth is not None:
+        brush = replace(brush, through=bool(depth))
+    label("Weights", column)
+    colours = choice("weights", ("Colours", "Hidden"), int(not brush.weights), ui)
+    tip("The weights as colours on the layer's splats, blue for none of the edit, yellow for all of it (C)")
+    if colours is not None:
+        brush = replace(brush, weights=not colours)
+    if brush.weights:
+        _legend(column, ui)
+    label("All of it", column)
+    imgui.begin_disabled(focus is None or view.layers[focus].locked)
+    each = (imgui.get_content_region_avail().x - 12.0 * ui.scale) / 3
+    for text, asks, keys in WHOLE:
+        if imgui.button(f"{text}##{asks}", imgui.ImVec2(each, 0.0)):
+            action = asks
+        tip(keys)
+        imgui.same_line(0.0, 6.0 * ui.scale)
+    imgui.end_disabled()
+    imgui.new_line()
+    return replace(view, brush=brush), action
+
+
+def _legend(column: float, ui: UiContext) -> None:
+    """The ramp of the weights with its ends named."""
+    imgui.set_cursor_pos_x(column)
+    left, top = imgui.get_cursor_screen_pos()
+    width, height, size = imgui.get_content_region_avail().x, 10.0 * ui.scale, SMALL_PX * ui.scale
+    canvas = imgui.get_window_draw_list()
+    for (start, a), (end, b) in pairwise(tint.RAMP):
+        low, high = (u32(tint.rgba(colour)) for colour in (a, b))
+        corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
+        canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
+    imgui.push_font(None, SMALL_PX)
+    wide = imgui.calc_text_size("all").x
+    imgui.pop_font()
+    for x, text in ((left, "none"), (left + width - wide, "all")):
+        at = imgui.ImVec2(round(x), round(top + height + 2.0 * ui.scale))
+        canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.dim), text)
+    imgui.dummy(imgui.ImVec2(width, height + size + 2.0 * ui.scale))
+
+
+def toggle(view: ViewState, ui: UiContext) -> bool:
+    """The button that takes the brush up and puts it down; True when pressed."""
+    pressed = icon_button("brush", Icon.BRUSH, ui, dim=not view.brush.active)
+    tip("Paint the strength of the focused layer (B)")
+    return pressed
+
+
+def ring(view: ViewState, ui: UiContext) -> None:
+    """The brush at the cursor: its edge, and inside which its touch is full."""
+    brush, mouse = view.brush, imgui.get_mouse_pos()
+    canvas, radius = imgui.get_background_draw_list(), brush.radius * ui.scale
+    inner = radius * (1.0 - brush.softness)
+    for size, alpha in ((radius, 1.0), (inner, 0.45)):
+        if size > 2.0 * ui.scale:
+            canvas.add_circle(mouse, size, u32((0.0, 0.0, 0.0, 0.5 * alpha)), 0, 3.0 * ui.scale)
+            canvas.add_circle(mouse, size, u32((*PALETTE.handle[:3], alpha)), 0, 1.25 * ui.scale)

@@ -1,0 +1,265 @@
+"""The panel: draws a state, returns the changed state. imgui only: no scene, no GL, no files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from imgui_bundle import imgui
+
+from viewer.camera import view_camera as turntable
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import ViewCamera
+from viewer.state import comparison as compare
+from viewer.state.layer_facts import LayerRow
+from viewer.state.view_state import Comparison, ViewState
+from viewer.ui.context import PALETTE, Icon, UiContext
+from viewer.ui.widgets import (
+    choice,
+    double_clicked,
+    elided,
+    grouped,
+    icon_button,
+    label,
+    right_edge,
+    section,
+    small,
+    tip,
+)
+
+from . import brush, layer_cards, snapshot_cards
+from .snapshot_cards import SnapshotCard
+
+WIDTH_PX = 300.0  # at 1×
+
+UPS: tuple[tuple[str, Vec3], ...] = (
+    ("+Y", (0.0, 1.0, 0.0)),
+    ("−Y", (0.0, -1.0, 0.0)),
+    ("+Z", (0.0, 0.0, 1.0)),
+    ("−Z", (0.0, 0.0, -1.0)),
+)
+
+
+@dataclass(frozen=True)
+class PanelInput:
+    """What the panel shows besides the state.
+
+    Args:
+        title: the scene's name, after a dot where there are unsaved changes
+        count: Gaussians in the scene
+        rows: one per .gdf, indexed by `LayerState.gdf`
+        focus: the focused layer, an index into `state.layers`, or None
+        undos, redos: how many entries there are either way
+        reveal: scroll to the focused layer
+        snapshots: the original and what was kept
+        dial: which of `stack.DIALS` of the focused layer the arrow keys move
+        renaming: the layer whose name is being typed, or None
+        unrecorded: why there is nothing recorded to compare with, "" where there is
+    """
+
+    title: str
+    count: int
+    rows: Sequence[LayerRow]
+    focus: int | None = None
+    undos: int = 0
+    redos: int = 0
+    reveal: bool = False
+    dial: str = "strength"
+    renaming: int | None = None
+    snapshots: tuple[SnapshotCard, ...] = ()
+    unrecorded: str = ""
+
+
+@dataclass(frozen=True)
+class PanelResult:
+    """The changed state, the focused layer, the one being renamed, and the actions asked for.
+
+    `overlap`: the layer of which to show what it shares with the others, while the mouse rests on that line.
+    Actions are named as in `controls.KEYS`.
+    """
+
+    state: ViewState
+    focus: int | None
+    actions: tuple[str, ...] = ()
+    renaming: int | None = None
+    overlap: int | None = None
+
+
+def width(ui: UiContext) -> float:
+    """The panel's width in window pixels."""
+    return WIDTH_PX * ui.scale
+
+
+def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
+    """Draw the panel along the right edge of the display, between `imgui.new_frame` and `imgui.render`."""
+    display = imgui.get_io().display_size
+    imgui.set_next_window_pos(imgui.ImVec2(display.x - width(ui), 0.0))
+    imgui.set_next_window_size(imgui.ImVec2(width(ui), display.y))
+    flags = imgui.WindowFlags_
+    imgui.begin(
+        "panel",
+        None,
+        flags.no_decoration.value
+        | flags.no_move.value
+        | flags.no_saved_settings.value
+        | flags.no_bring_to_front_on_focus.value
+        | flags.no_nav.value
+        | flags.no_scroll_with_mouse.value,
+    )
+    actions: list[str] = []
+    _title(shown, ui)
+    footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
+    _begin_body(footer)
+    state = layer_cards.heading(state, ui)
+    cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
+    drawn = layer_cards.draw(state, cards, ui)
+    state, focus = drawn.state, drawn.focus
+    actions += drawn.actions
+    if state.brush.active:
+        state, asked = brush.section(state, focus, ui)
+        actions += [asked] if asked else []
+    state = _view(state, shown.unrecorded, ui, actions)
+    snapshot_cards.draw(shown.snapshots, ui, actions)
+    _end_body()
+    _footer(state, shown, ui, actions)
+    imgui.end()
+    return PanelResult(state, focus, tuple(actions), drawn.renaming, drawn.overlap)
+
+
+def _begin_body(footer: float) -> None:
+    """What scrolls; its scrollbar stands in the panel's margin, so that nothing moves when one is needed."""
+    overflows = imgui.get_state_storage().get_bool(imgui.get_id("overflows"))
+    clear = imgui.ImVec4(0.0, 0.0, 0.0, 0.0)
+    slots = (imgui.Col_.scrollbar_grab, imgui.Col_.scrollbar_grab_hovered, imgui.Col_.scrollbar_grab_active)
+    for slot in () if overflows else slots:
+        imgui.push_style_color(slot, clear)
+    flags = imgui.WindowFlags_
+    wide = imgui.get_content_region_avail().x + imgui.get_style().scrollbar_size
+    imgui.begin_child(
+        "body",
+        imgui.ImVec2(wide, -footer),
+        0,
+        flags.no_nav.value | flags.always_vertical_scrollbar.value,
+    )
+    if not overflows:
+        imgui.pop_style_color(len(slots))
+
+
+def _end_body() -> None:
+    # the content's own height: imgui's scroll range is a frame behind it
+    overflows = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y > imgui.get_window_height()
+    imgui.end_child()
+    imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
+
+
+def _title(shown: PanelInput, ui: UiContext) -> None:
+    imgui.push_font(ui.fonts.bold, 0.0)
+    room = imgui.get_content_region_avail().x
+    imgui.text(elided(shown.title, room))
+    imgui.pop_font()
+    small(f"{grouped(shown.count)} splats", PALETTE.dim)
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+
+
+def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) -> ViewState:
+    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
+    section("View", ui)
+    column = 82.0 * ui.scale
+    camera = state.camera
+    label("Move", column)
+    mode = choice("mode", ("Orbit", "Fly"), ("orbit", "fly").index(camera.mode), ui)
+    tip("V")
+    if mode is not None:
+        camera = replace(camera, mode=("orbit", "fly")[mode])
+    label("Up axis", column)
+    ups = (*UPS, ("View", turntable.axes(camera).up))
+    current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
+    chosen = choice("up", tuple(name for name, _ in ups), current, ui)
+    tip("The axis of the scene that is up; View takes what is up in the picture now")
+    if chosen is not None:
+        camera = turntable.with_up(camera, ups[chosen][1])
+    label("Lens", column)
+    imgui.set_next_item_width(-1.0)
+    changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
+    if double_clicked():
+        changed, fov_y = True, ViewCamera.fov_y
+    camera = replace(camera, fov_y=fov_y) if changed else camera  # unchanged, imgui still rounds to float32
+    tip(f"Vertical field of view. Double click: back to {ViewCamera.fov_y:g}°")
+    label("Background", column)
+    picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
+    changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
+    background = (red, green, blue) if changed else state.background
+    comparison = _comparison(state.compare, unrecorded, column, ui)
+    label("Show", column)
+    half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
+    if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
+        actions.append("frame")
+    tip("Frame the focused layer, or the scene (F)")
+    imgui.same_line(0.0, 6.0 * ui.scale)
+    if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
+        actions.append("home")
+    tip("Back to the first view (Shift+F)")
+    return replace(state, camera=camera, background=background, compare=comparison)
+
+
+def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext) -> Comparison:
+    """Off, beside each other or subtracted; with the original, or with what was recorded."""
+    label("Compare", column)
+    chosen = choice("compare", ("Off", "Split", "Diff"), compare.MODES.index(shown.mode), ui)
+    tip("Beside each other (Y), or what differs (Shift+Y)")
+    if chosen is not None:
+        shown = replace(shown, mode=compare.MODES[chosen])
+    if shown.mode == "off":
+        return shown
+    label("With", column)
+    against = 0 if unrecorded else compare.AGAINST.index(shown.against)
+    chosen = choice("against", ("Original", "Recorded"), against, ui, usable=1 if unrecorded else 2)
+    told = f"\nNothing was recorded: {unrecorded}" if unrecorded else ""
+    tip(f"The original, or the same strengths as training recorded them (Alt+Y){told}")
+    if chosen is not None:
+        shown = replace(shown, against=compare.AGAINST[chosen])
+    if shown.mode == "difference":
+        label("Amplify", column)
+        imgui.set_next_item_width(-1.0)
+        changed, times = imgui.slider_float(
+            "##amplify", shown.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
+        )
+        if double_clicked():
+            changed, times = True, Comparison.amplify
+        shown = replace(shown, amplify=float(round(times))) if changed else shown
+        tip(f"What the difference is multiplied by. Double click: back to × {Comparison.amplify:g}")
+    return shown
+
+
+_ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
+_LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
+
+
+def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[str]) -> None:
+    imgui.separator()
+    right = right_edge()
+    for action, icon, help_, usable in (
+        ("undo", Icon.UNDO, f"Undo (Ctrl+Z), {shown.undos} to go", shown.undos > 0),
+        ("redo", Icon.REDO, f"Redo (Ctrl+Shift+Z), {shown.redos} to go", shown.redos > 0),
+    ):
+        imgui.begin_disabled(not usable)
+        if icon_button(action, icon, ui):
+            actions.append(action)
+        imgui.end_disabled()
+        tip(help_)
+        imgui.same_line()
+    if state.layers and brush.toggle(state, ui):
+        actions.append("brush")
+    side = imgui.get_frame_height()
+    imgui.same_line(right - 3 * side - 12.0 * ui.scale)
+    if icon_button("timeline", Icon.FILM, ui):
+        actions.append("timeline")
+    tip("The timeline: keys of camera and strengths, played and filmed (T)")
+    imgui.same_line(0.0, 6.0 * ui.scale)
+    if icon_button("picture", Icon.PICTURE, ui):
+        actions.append("picture")
+    tip("Save the picture as PNG (F2)")
+    imgui.same_line(0.0, 6.0 * ui.scale)
+    if icon_button("help", Icon.HELP, ui):
+        actions.append("help")
+    tip("Keys and mouse (F1)")

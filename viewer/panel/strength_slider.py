@@ -1,0 +1,162 @@
+"""The strength slider: 0 is the original, 1 the full edit; ticks where the trajectory was recorded.
+
+Press on the track jumps there, press on the handle grabs it, Shift drags ten times finer, Ctrl+click (or a
+click on the number) types a value, a double click goes back to 0. Where overshoot is on it goes beyond 1,
+on a ground that warns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from imgui_bundle import imgui
+
+from viewer.ui.context import PALETTE, Rgba, u32
+from viewer.ui.widgets import let_go, tip
+
+HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one types
+FINE = 0.1
+DEFAULT = 0.0
+"""The original; where a double click goes."""
+TIP = "Double click: back to 0, the original. Ctrl+click: type a value. Shift: drag ten times finer."
+
+
+def parse_strength(text: str, most: float = 1.0) -> float | None:
+    """What a person types for a strength, "0.7", "70%", ",7", kept to 0..`most`; None: it is no number."""
+    cleaned = text.strip().replace(",", ".")
+    percent = cleaned.endswith("%")
+    try:
+        value = float(cleaned.rstrip("% "))
+    except ValueError:
+        return None
+    value = value / 100.0 if percent else value
+    return min(most, max(0.0, value)) if value == value else None
+
+
+def draw(
+    label: str,
+    value: float,
+    ticks: Sequence[float],
+    width: float,
+    scale: float,
+    fill: Rgba,
+    active: bool = True,
+    most: float = 1.0,
+) -> float:
+    """Draw the slider at the cursor and return the value it now has.
+
+    Args:
+        label: imgui id
+        value: strength, 0..`most`
+        ticks: recorded strengths, 0..1
+        width: in window pixels
+        scale: window pixels per design pixel
+        fill: colour of the track up to the handle
+        active: False draws it muted (a hidden layer); it still works
+        most: upper end; beyond 1 the track lies on warning ground
+    """
+    storage = imgui.get_state_storage()
+    if storage.get_bool(_slot(label, "typing")):
+        return _typed(label, value, width, most)
+    left, top = imgui.get_cursor_screen_pos()
+    imgui.invisible_button(label, imgui.ImVec2(width, HEIGHT_PX * scale))
+    hovered, held = imgui.is_item_hovered(), imgui.is_item_active()
+    radius = 7.0 * scale
+    start, span = left + radius, max(width - 2 * radius, 1.0) / most
+    mouse = imgui.get_io().mouse_pos.x
+    if imgui.is_item_activated():
+        if imgui.get_io().key_ctrl:
+            start_typing(label)
+            imgui.set_cursor_screen_pos(imgui.ImVec2(left, top))
+            return _typed(label, value, width, most)  # at once: what is typed next is not lost
+        on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
+        value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
+        value = DEFAULT if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
+        _anchor(label, mouse, value)
+    elif held or let_go():  # a slow frame may hold the last move and the release
+        was_fine = storage.get_bool(_slot(label, "fine"))
+        moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if was_fine else 1.0)
+        value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
+        if was_fine != imgui.get_io().key_shift:
+            _anchor(label, mouse, value)  # after the move: a slow frame holds both
+    if not held:
+        tip(TIP)
+    colour = fill if active else PALETTE.faint
+    _paint(start, top, span, radius, value, ticks, scale, colour, hovered or held, most)
+    return value
+
+
+def start_typing(label: str) -> None:
+    """Turn the slider of this label into a text field with the keyboard focus."""
+    for slot in ("typing", "wants focus"):
+        imgui.get_state_storage().set_bool(_slot(label, slot), True)
+
+
+def _slot(label: str, name: str) -> int:
+    """Where imgui keeps one value of this slider between frames."""
+    return int(imgui.get_id(f"{label}/{name}"))
+
+
+def _anchor(label: str, mouse: float, value: float) -> None:
+    storage = imgui.get_state_storage()
+    storage.set_float(_slot(label, "x"), mouse)
+    storage.set_float(_slot(label, "value"), value)
+    storage.set_bool(_slot(label, "fine"), imgui.get_io().key_shift)
+
+
+def _typed(label: str, value: float, width: float, most: float) -> float:
+    storage = imgui.get_state_storage()
+    if storage.get_bool(_slot(label, "wants focus")):
+        imgui.set_keyboard_focus_here()
+        storage.set_bool(_slot(label, "wants focus"), False)
+    imgui.set_next_item_width(width)
+    flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
+    entered, text = imgui.input_text(f"{label}/field", f"{value:.3f}", flags)
+    left = imgui.is_item_deactivated()
+    if entered or left:
+        storage.set_bool(_slot(label, "typing"), False)
+    kept = entered or imgui.is_item_deactivated_after_edit()
+    parsed = parse_strength(text, most) if kept else None
+    return value if parsed is None else parsed
+
+
+def _paint(
+    start: float,
+    top: float,
+    span: float,
+    radius: float,
+    value: float,
+    ticks: Sequence[float],
+    scale: float,
+    fill: Rgba,
+    lit: bool,
+    most: float,
+) -> None:
+    canvas, p = imgui.get_window_draw_list(), PALETTE
+    middle, half = top + radius + 1.0 * scale, 2.0 * scale
+    at = start + value * span
+    canvas.add_rect_filled(
+        imgui.ImVec2(start - half, middle - half),
+        imgui.ImVec2(start + span * most + half, middle + half),
+        u32(p.field),
+        half,
+    )
+    canvas.add_rect_filled(
+        imgui.ImVec2(start - half, middle - half), imgui.ImVec2(at, middle + half), u32(fill), half
+    )
+    if most > 1.0:
+        end = imgui.ImVec2(start + span * most + half, middle + half)
+        canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning_dark), half)
+        if value > 1.0:
+            end.x = at
+            canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning), half)
+    foot = middle + radius + 2.0 * scale
+    for tick in ticks:
+        x = round(start + tick * span) + 0.5
+        tall = 6.0 if tick in (0.0, 1.0) else 4.0
+        colour = p.dim if tick <= value else p.faint
+        canvas.add_line(
+            imgui.ImVec2(x, foot), imgui.ImVec2(x, foot + tall * scale), u32(colour), max(1.0, scale)
+        )
+    canvas.add_circle_filled(imgui.ImVec2(at, middle), radius + 1.0 * scale, u32(p.card))
+    canvas.add_circle_filled(imgui.ImVec2(at, middle), radius - (0.0 if lit else 1.0) * scale, u32(p.handle))

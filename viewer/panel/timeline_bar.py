@@ -1,0 +1,252 @@
+"""The timeline along the lower edge of the picture: keys and playhead to drag, and its few settings.
+
+It changes nothing itself: it returns actions of `playback.ACTIONS`, as keys do.
+"""
+
+from __future__ import annotations
+
+import math
+
+from imgui_bundle import icons_fontawesome_6 as icons
+from imgui_bundle import imgui
+
+from viewer.state import timeline as tl
+from viewer.state.playback import Player
+from viewer.state.view_state import Timeline
+from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.overlay import Area
+from viewer.ui.widgets import icon_button, let_go, tip
+
+HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
+ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
+_SETTINGS_PX = 262.0
+_KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
+_NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+
+
+def height(player: Player, area: Area, ui: UiContext) -> float:
+    """How much of the picture it covers, window pixels."""
+    return _tall(area, ui) if player.shown else 0.0
+
+
+def _roomy(area: Area, ui: UiContext) -> bool:
+    return area.width >= ROOMY_PX * ui.scale
+
+
+def _tall(area: Area, ui: UiContext) -> float:
+    return (HEIGHT_PX if _roomy(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
+
+
+def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple[str, ...]:
+    """Draw the bar over the lower edge of `area`, between `imgui.new_frame` and `imgui.render`.
+
+    Returns:
+        What was asked for: actions of the workspace.
+    """
+    tall, roomy = _tall(area, ui), _roomy(area, ui)
+    imgui.set_next_window_pos(imgui.ImVec2(0.0, area.height - tall))
+    imgui.set_next_window_size(imgui.ImVec2(area.width, tall))
+    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10.0 * ui.scale, 10.0 * ui.scale))
+    imgui.begin("timeline", None, _FLAGS)
+    actions: list[str] = []
+    frame = min(player.frame, timeline.length)
+    _buttons(timeline, player, frame, actions, ui)
+    settings = _SETTINGS_PX * ui.scale if roomy else 0.0
+    wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
+    _ruler(timeline, frame, wide, actions, ui)
+    if roomy:
+        imgui.same_line(0.0, 12.0 * ui.scale)
+    _settings(timeline, frame, actions, ui)
+    imgui.end()
+    imgui.pop_style_var()
+    imgui.pop_style_color()
+    return tuple(actions)
+
+
+def place(timeline: Timeline, frame: float, start: float, span: float) -> float:
+    """Where a frame stands on a ruler that begins at `start`, window pixels."""
+    return start + span * frame / timeline.length
+
+
+def label_step(timeline: Timeline, span: float, room: float) -> int:
+    """Every how many frames the ruler has a number, so that each has `room` pixels."""
+    least = timeline.length * room / max(span, 1.0)
+    return next((step for step in _NICE if step >= least), _NICE[-1])
+
+
+def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str], ui: UiContext) -> None:
+    gap = 2.0 * ui.scale
+    imgui.begin_disabled(len(timeline.keys) < 2)
+    icon = icons.ICON_FA_PAUSE if player.playing else icons.ICON_FA_PLAY
+    if icon_button("play", icon, ui):
+        actions.append("play")
+    imgui.end_disabled()
+    tip("Play or pause (Space)" if len(timeline.keys) > 1 else "Two keys make a film")
+    imgui.same_line(0.0, gap)
+    on_key = tl.key_at(timeline, frame) is not None
+    if icon_button("key", icons.ICON_FA_DIAMOND, ui):
+        actions.append("key")
+    tip("Set this key anew (K)" if on_key else "Set a key: the camera and every strength (K)")
+    imgui.same_line(0.0, gap)
+    imgui.begin_disabled(not on_key)
+    if icon_button("drop_key", icons.ICON_FA_TRASH_CAN, ui, dim=not on_key):
+        actions.append("drop_key")
+    imgui.end_disabled()
+    tip("Delete the key at the playhead (Del)")
+    imgui.same_line(0.0, 10.0 * ui.scale)
+
+
+def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext) -> None:
+    gap = 4.0 * ui.scale
+    imgui.begin_disabled(not timeline.keys)
+    easing = tl.before(timeline, frame).easing if timeline.keys else tl.EASINGS[0]
+    if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
+        actions.append("easing")
+    imgui.end_disabled()
+    tip("How it goes on from the key before the playhead: smooth, linear or hold (Shift+K)")
+    imgui.same_line(0.0, gap)
+    if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
+        actions.append("ping_pong")
+    tip("There and back again (Alt+K): " + ("on" if timeline.ping_pong else "off"))
+    imgui.same_line(0.0, gap)
+    for name, now, most, unit, what in (
+        ("length", timeline.length, tl.LONGEST, "f", "The last frame"),
+        ("fps", timeline.fps, tl.FASTEST, "fps", "Frames per second"),
+    ):
+        imgui.set_next_item_width(58.0 * ui.scale)
+        changed, value = imgui.drag_int(
+            f"##{name}", now, 0.25, 1, most, f"%d {unit}", imgui.SliderFlags_.always_clamp.value
+        )
+        if changed and value != now:
+            actions.append(f"{name}:{value}")
+        tip(f"{what}; drag, or Ctrl+click to type")
+        imgui.same_line(0.0, gap)
+    imgui.begin_disabled(not timeline.keys)
+    if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
+        actions.append("timeline_file")
+    imgui.end_disabled()
+    tip("Save the timeline for `progdf render --timeline` (Ctrl+K)")
+
+
+def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: UiContext) -> None:
+    """The ruler: press or drag moves the playhead, or the key that was under the mouse."""
+    scale = ui.scale
+    left, top = imgui.get_cursor_screen_pos()
+    tall = imgui.get_frame_height()
+    inset = 8.0 * scale
+    start, span = left + inset, max(wide - 2 * inset, 1.0)
+    imgui.invisible_button("ruler", imgui.ImVec2(max(wide, 1.0), tall))
+    lit = imgui.is_item_hovered() or imgui.is_item_active()
+    mouse = imgui.get_io().mouse_pos.x
+    under = _key_under(timeline, start, span, mouse, scale) if lit else None
+    storage, slot = imgui.get_state_storage(), imgui.get_id("ruler/held")
+    to = max(0, min(timeline.length, round((mouse - start) / span * timeline.length)))
+    if imgui.is_item_activated():
+        storage.set_int(slot, -1 if under is None else under)
+        actions.append(f"seek:{to if under is None else under}")
+    elif imgui.is_item_active() or let_go():  # a slow frame may hold move and release
+        held = storage.get_int(slot, -1)
+        moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
+        if held < 0 and to != frame:
+            actions.append(f"seek:{to}")
+        elif held >= 0 and moved and to != held and tl.key_at(timeline, to) is None:
+            actions.append(f"move_key:{held}>{to}")
+            storage.set_int(slot, to)
+    if under is not None:
+        imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
+    _paint(timeline, frame, start, span, top, tall, under, lit, ui)
+
+
+def _key_under(timeline: Timeline, start: float, span: float, mouse: float, scale: float) -> int | None:
+    """The frame of the nearest key within reach of the mouse."""
+    places = [(abs(mouse - place(timeline, key.frame, start, span)), key.frame) for key in timeline.keys]
+    distance, frame = min(places, default=(math.inf, 0))
+    return frame if distance <= _GRIP_PX * scale else None
+
+
+def _paint(
+    timeline: Timeline,
+    frame: int,
+    start: float,
+    span: float,
+    top: float,
+    tall: float,
+    under: int | None,
+    lit: bool,
+    ui: UiContext,
+) -> None:
+    canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
+    line = top + tall - 6.0 * scale
+    thin = max(1.0, scale)
+    canvas.add_line(imgui.ImVec2(start, line), imgui.ImVec2(start + span, line), u32(p.faint), thin)
+    _paint_numbers(timeline, frame, start, span, top, line, ui)
+    for key in timeline.keys:
+        x, size = place(timeline, key.frame, start, span), (_KEY_PX + (key.frame == under)) * scale
+        colour = u32(p.handle if key.frame in (frame, under) else p.dim)
+        _paint_key(canvas, x, line, size, colour, key.easing)
+    if not timeline.keys:
+        hint = "K sets a key at the playhead; two make a film"
+        size = SMALL_PX * scale
+        at = imgui.ImVec2(round(start + 40.0 * scale), round(line - size - 3.0 * scale))
+        canvas.add_text(ui.fonts.regular, size, at, u32(p.dim), hint)
+    x = round(place(timeline, frame, start, span)) + 0.5
+    canvas.add_line(imgui.ImVec2(x, top - 2.0 * scale), imgui.ImVec2(x, line), u32(p.accent), 1.5 * scale)
+    canvas.add_triangle_filled(
+        imgui.ImVec2(x - 5.0 * scale, top - 4.0 * scale),
+        imgui.ImVec2(x + 5.0 * scale, top - 4.0 * scale),
+        imgui.ImVec2(x, top + 3.0 * scale),
+        u32(p.accent),
+    )
+
+
+def _paint_numbers(
+    timeline: Timeline, frame: int, start: float, span: float, top: float, line: float, ui: UiContext
+) -> None:
+    """Ticks and frame numbers; the playhead's own number in place of those near it."""
+    canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
+    size = 11.0 * scale
+    step = label_step(timeline, span, 38.0 * scale)
+    fine = label_step(timeline, span, 7.0 * scale)
+    for tick in range(0, timeline.length + 1, fine):
+        x = round(place(timeline, tick, start, span)) + 0.5
+        high = (5.0 if tick % step == 0 else 2.5) * scale
+        canvas.add_line(imgui.ImVec2(x, line - high), imgui.ImVec2(x, line), u32(p.faint), max(1.0, scale))
+    here = place(timeline, frame, start, span)
+    numbers = range(0, timeline.length + 1, step) if timeline.keys else ()
+    for number in (*(n for n in numbers if n != frame), frame):
+        x, text = place(timeline, number, start, span), str(number)
+        if number != frame and -16.0 * scale < x - here < 36.0 * scale:
+            continue
+        colour = u32(p.accent if number == frame else p.dim)
+        # the playhead's number stands beside its handle, left of it at the end of the ruler
+        after = x - 3.2 * scale * len(text)
+        if number == frame:
+            after = x + 7.0 * scale if x < start + span - 20.0 * scale else x - (7 + 6.4 * len(text)) * scale
+        at = imgui.ImVec2(round(after), round(top - 4.0 * scale))
+        canvas.add_text(ui.fonts.regular, size, at, colour, text)
+
+
+def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, colour: int, easing: str) -> None:
+    """Smooth is round, linear a diamond, hold a square."""
+    edge = u32(PALETTE.panel)
+    if easing == "smooth":
+        canvas.add_circle_filled(imgui.ImVec2(x, y), size + 1.5, edge)
+        canvas.add_circle_filled(imgui.ImVec2(x, y), size, colour)
+        return
+    corners = 4
+    turn = 0.0 if easing == "linear" else math.pi / 4
+    for radius, ink in ((size * 1.2 + 2.0, edge), (size * 1.2, colour)):
+        points = [turn + 2 * math.pi * i / corners for i in range(corners)]
+        a, b, c, d = (imgui.ImVec2(x + radius * math.cos(t), y + radius * math.sin(t)) for t in points)
+        canvas.add_quad_filled(a, b, c, d, ink)
+
+
+_FLAGS = (
+    imgui.WindowFlags_.no_decoration.value
+    | imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_bring_to_front_on_focus.value
+    | imgui.WindowFlags_.no_focus_on_appearing.value
+    | imgui.WindowFlags_.no_nav.value
+)

@@ -1,0 +1,1 @@
+"""Pictures made of pictures: comparisons, sheets, films, thumbnails."""

@@ -1,0 +1,200 @@
+"""Two pictures in one: side by side at a divider, or their difference amplified, with PSNR.
+
+Beside the edited picture stands the original, or the same edits as they were recorded. That side is drawn by
+a second engine, made when it is first asked for: against the original a slider then moves only one of the
+two pictures, the divider neither.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import moderngl
+import numpy as np
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.gdf.file import Gdf
+from viewer.gl.present import Presenter
+from viewer.render.engine import Engine, FrameTimings, drawn_size
+from viewer.render.renderers import Image
+from viewer.state import recordings
+from viewer.state.recordings import Recording
+from viewer.state.view_state import ViewState
+
+from .compare_labels import Labels, column, labels
+
+
+class Comparer:
+    """Draws a view as its `compare` asks, in place of the engine.
+
+    Args:
+        engine: draws the edited scene; stays the caller's
+        ctx: the engine's context; None for `image` only
+        found: where the engine's edits were recorded, one for each
+    """
+
+    def __init__(self, engine: Engine, ctx: moderngl.Context | None, found: Sequence[Recording] = ()) -> None:
+        self.engine = engine
+        self.psnr = math.nan
+        """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
+        self.recordings = tuple(found) or (Recording(),) * len(engine.gdfs)
+        """Where the edits were recorded; one that turned out to be broken is none."""
+        self._ctx = ctx
+        self._other: Engine | None = None
+        self._against = ""  # what `_other` draws, of `AGAINST`
+        self._presenter: Presenter | None = None
+        self._texture: moderngl.Texture | None = None
+        self._shown: float | None = None  # how much the difference in the texture is amplified
+
+    def needs_draw(self, view: ViewState, size: tuple[int, int], pixels: int = 1) -> bool:
+        """Whether splats have to be drawn for `view`, or a difference taken; arguments as for `draw`."""
+        drawn = size if view.compare.mode == "difference" else drawn_size(size, pixels)
+        if self.engine.needs_draw(view, drawn):
+            return True
+        if view.compare.mode == "off":
+            return False
+        apart = view.compare.mode == "difference" and self._shown != view.compare.amplify
+        return apart or self._second(view).needs_draw(self._beside(view), drawn)
+
+    def draw(
+        self,
+        view: ViewState,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int],
+        pixels: int = 1,
+    ) -> FrameTimings:
+        """Show `view` in the lower left `size` pixels of `framebuffer`.
+
+        Args:
+            pixels: of the framebuffer that one drawn pixel fills, each way; a difference is drawn in full
+
+        Raises:
+            ProgdfError: a layer of `view` means nothing.
+        """
+        if view.compare.mode == "difference":
+            return self._draw_difference(view, framebuffer, size)
+        self._shown = None  # the engines go on, and the next difference is another
+        if view.compare.mode == "split":
+            return self._draw_split(view, framebuffer, size, pixels)
+        return self.engine.draw(view, framebuffer, size, pixels)
+
+    def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
+        """The same as an array, without labels. [H,W,3] float32, see `Engine.image`"""
+        if view.compare.mode == "off":
+            return self.engine.image(view, size, camera)
+        edited = self.engine.image(view, size, camera)
+        other = self._second(view).image(self._beside(view), size, camera)
+        self.psnr = _psnr(other, edited)
+        if view.compare.mode == "split":
+            at = column(view.compare, edited.shape[1])
+            return np.concatenate([other[:, :at], edited[:, at:]], axis=1)
+        return difference(other, edited, view.compare.amplify)
+
+    def against(self, view: ViewState) -> str:
+        """What the picture of `view` is set against, of `AGAINST`: what it asks for, if that exists."""
+        return "original" if recordings.obstacle(self.recordings) else view.compare.against
+
+    def labels(self, view: ViewState) -> Labels:
+        """What to say over the last comparison, of `view`."""
+        wished, found = view.compare.against, self.against(view)
+        obstacle = recordings.obstacle(self.recordings) if wished != found else ""
+        recorded = recordings.told(view, self.engine.gdfs, self.recordings) if found == "recorded" else ""
+        return labels(view.compare, self.psnr, recorded, obstacle)
+
+    def release(self) -> None:
+        """Give back all but the engine."""
+        for held in (self._other, self._presenter, self._texture):
+            if held is not None:
+                held.release()
+
+    def _second(self, view: ViewState) -> Engine:
+        """What draws the other side of `view`."""
+        if self._other is None or self._against != self.against(view):
+            gdfs = self._recorded() if self.against(view) == "recorded" else ()
+            if self._other is not None:
+                self._other.release()
+            self._against = self.against(view)  # reading a recording may have shown that it is none
+            ways = self.engine.draws_with, self.engine.edits_with
+            self._other = Engine(self._ctx, self.engine.scene, gdfs, *ways)
+        return self._other
+
+    def _recorded(self) -> tuple[Gdf, ...]:
+        """The edits as they were recorded."""
+        gdfs, read = [], []
+        for gdf, recording in zip(self.engine.gdfs, self.recordings, strict=True):
+            try:
+                gdfs.append(recordings.recorded(gdf, recording))
+                read.append(recording)
+            except ProgdfError as error:
+                gdfs.append(gdf)
+                read.append(Recording(reason=str(error)))
+        self.recordings = tuple(read)
+        return tuple(gdfs)
+
+    def _beside(self, view: ViewState) -> ViewState:
+        """What the other side of `view` shows."""
+        recorded = self.against(view) == "recorded"
+        return recordings.within(view, self.recordings) if recorded else replace(view, layers=())
+
+    def _draw_split(
+        self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
+    ) -> FrameTimings:
+        at, new = column(view.compare, size[0]), self.needs_draw(view, size, pixels)
+        other, beside = self._second(view), self._beside(view)
+        edited = self.engine.draw(view, framebuffer, size, pixels)
+        framebuffer.scissor = (0, 0, at, size[1])
+        try:
+            original = other.draw(beside, framebuffer, size, pixels)
+        finally:
+            framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
+        if new and pixels == 1 and self._against == "recorded":
+            self.psnr = _psnr(other.image(beside, size), self.engine.image(view, size))
+        elif new:
+            self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors
+        return _together(edited, original)
+
+    def _draw_difference(
+        self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]
+    ) -> FrameTimings:
+        assert self._ctx is not None, "nothing to show on without a context"
+        if self.needs_draw(view, size) or self._texture is None:
+            apart = np.ascontiguousarray(self.image(view, size), np.float32)
+            if self._texture is None or self._texture.size != size:
+                if self._texture is not None:
+                    self._texture.release()
+                self._texture = self._ctx.texture(size, 3, dtype="f4")
+            self._texture.write(apart)
+            self._shown = view.compare.amplify
+            timings = _together(self.engine.timings, self._second(view).timings)
+        else:
+            timings = FrameTimings(drawn=self.engine.timings.drawn)
+        self._presenter = self._presenter or Presenter(self._ctx)
+        self._presenter.show(self._texture, framebuffer)
+        return timings
+
+
+def difference(other: Image, edited: Image, amplify: float) -> Image:
+    """amplify · |edited − other| of what is seen (0..1) of each; black where nothing differs. [H,W,3]"""
+    apart: Image = np.abs(np.clip(edited, 0.0, 1.0) - np.clip(other, 0.0, 1.0)) * np.float32(amplify)
+    return apart
+
+
+def _psnr(other: Image, edited: Image) -> float:
+    """As `progdf.metrics.image.psnr`, of what is seen, dB; without copies in float64: a hand waits for it."""
+    apart = difference(other, edited, 1.0).ravel()
+    error = float(np.square(apart, out=apart).mean(dtype=np.float64)) if apart.size else 0.0
+    return math.inf if error == 0.0 else -10.0 * math.log10(error)
+
+
+def _together(edited: FrameTimings, original: FrameTimings) -> FrameTimings:
+    """The time that both took, the figures of the edited one."""
+    return replace(
+        edited,
+        compose_ms=edited.compose_ms + original.compose_ms,
+        upload_ms=edited.upload_ms + original.upload_ms,
+        sort_ms=edited.sort_ms + original.sort_ms,
+        draw_ms=edited.draw_ms + original.draw_ms,
+    )

@@ -1,0 +1,201 @@
+"""Pictures of moving sliders: animations, films of a timeline, contact sheets of one slider and of two."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from progdf.errors import ProgdfError
+from progdf.io import images as pictures
+from progdf.io.atomic import unwritable
+from viewer.state.view_state import ViewState
+
+Pixels = NDArray[np.uint8]
+Draw = Callable[[ViewState], Pixels]
+
+SWEEP_STEPS = 24
+FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
+_PALETTE_REACH = 8  # levels: Pillow looks up the nearest colour of a palette in steps of 4
+SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+def to_pixels(image: NDArray[np.float32]) -> Pixels:
+    """0..1 to 0..255, rounded; what is brighter or darker is cut off."""
+    return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
+    """`view` with the named layers at these strengths."""
+    layers = (
+        replace(layer, strength=strengths.get(layer.name, layer.strength), enabled=True)
+        if layer.name in strengths
+        else layer
+        for layer in view.layers
+    )
+    return replace(view, layers=tuple(layers))
+
+
+def sweep(view: ViewState, name: str, steps: int = SWEEP_STEPS) -> Iterator[ViewState]:
+    """`view` with layer `name` at 0, 1/steps, …, 1: steps + 1 states."""
+    for step in range(steps + 1):
+        yield with_strengths(view, {name: step / steps})
+
+
+def contact_sheet(name: str, draw: Draw, view: ViewState) -> Pixels:
+    """`view` with layer `name` at five strengths, in a row."""
+    row = [draw(with_strengths(view, {name: s})) for s in SHEET_STRENGTHS]
+    return _sheet([row], [], [f"{name} {s:g}" for s in SHEET_STRENGTHS])
+
+
+def grid(down: str, across: str, draw: Draw, view: ViewState) -> Pixels:
+    """`view` under two sliders: `down` grows from row to row, `across` from column to column."""
+    rows = [
+        [draw(with_strengths(view, {down: s, across: t})) for t in SHEET_STRENGTHS] for s in SHEET_STRENGTHS
+    ]
+    return _sheet(
+        rows, [f"{down} {s:g}" for s in SHEET_STRENGTHS], [f"{across} {t:g}" for t in SHEET_STRENGTHS]
+    )
+
+
+def _sheet(rows: list[list[Pixels]], row_labels: list[str], column_labels: list[str]) -> Pixels:
+    images = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
+    return to_pixels(pictures.contact_sheet(images, row_labels, column_labels).numpy())
+
+
+def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
+    """An endless animation there and back again, with one palette for all frames so that nothing flickers.
+
+    Args:
+        path: a .gif file
+        frames: from one end of the slider to the other. [H,W,3] each
+    """
+    indexed = _indexed(frames)
+    shown = indexed + indexed[-2:0:-1]
+    rests = {0, len(indexed) - 1}
+    _save_gif(path, shown, [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))])
+
+
+def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
+    """Frames as they come, each for the same time: .gif, endless, or .mp4.
+
+    A .gif counts in hundredths of a second, so its frames take turns in being a little longer and shorter; no
+    frame is shorter than 2, as programs slow such down.
+    """
+    if path.suffix.lower() == ".mp4":
+        _encode_mp4(path, frames, frames_per_second)
+        return
+    indexed = _indexed(frames)
+    ends = [round(100 * (i + 1) / frames_per_second) for i in range(len(indexed))]
+    hundredths = [end - start for start, end in zip([0, *ends], ends, strict=False)]
+    _save_gif(path, indexed, [10 * max(2, each) for each in hundredths])
+
+
+def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
+    """Frames as frame_0000.png, frame_0001.png, …: they appear when all are written.
+
+    Raises:
+        ProgdfError: see `check_sequence`; or the place cannot be written, or is full.
+    """
+    check_sequence(folder)
+    there = folder.is_dir()
+    try:  # within a folder that is there, which may be a link, a mounted disk or where one stands
+        home = folder if there else folder.absolute().parent
+        drawn = Path(tempfile.mkdtemp(dir=home, prefix=f".{folder.name}."))
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    try:
+        for number, frame in enumerate(frames):
+            Image.fromarray(frame).save(drawn / f"frame_{number:04d}.png")
+        if there:
+            for path in sorted(drawn.iterdir()):
+                path.rename(folder / path.name)
+        else:
+            drawn.chmod(0o755)
+            drawn.rename(folder)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+    finally:
+        shutil.rmtree(drawn, ignore_errors=True)
+
+
+def check_sequence(folder: Path) -> None:
+    """Raises ProgdfError where no folder of frames can be made: its place is taken, or its parent missing."""
+    try:
+        taken = os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir()))
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    if taken:
+        raise ProgdfError(f"{folder} exists and is not an empty folder; give a new name for the frames")
+    if not folder.absolute().parent.is_dir():
+        raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; make it first")
+
+
+def _indexed(frames: Iterable[Pixels]) -> list[Image.Image]:
+    """Frames in one palette."""
+    there = [Image.fromarray(frame) for frame in frames]
+    few = there[:: max(1, len(there) // 4)]
+    mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in few]))
+    palette = _with_exact_background(mosaic, mosaic.quantize(256, method=Image.Quantize.MEDIANCUT))
+    return [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
+
+
+def _save_gif(path: Path, indexed: Sequence[Image.Image], durations: Sequence[int]) -> None:
+    indexed[0].save(
+        path, save_all=True, append_images=indexed[1:], duration=list(durations), loop=0, disposal=1
+    )
+
+
+def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
+    """The same palette, but what is nearly the commonest colour becomes that colour: white stays white."""
+    counts = picture.getcolors(picture.width * picture.height) or []
+    commonest = np.array(max(counts)[1])
+    colours = np.array(indexed.getpalette(), np.int64).reshape(-1, 3)
+    distances = np.abs(colours - commonest).max(axis=1)
+    colours[distances <= max(_PALETTE_REACH, int(distances.min()))] = commonest
+    indexed.putpalette(colours.ravel().tolist())
+    return indexed
+
+
+def check_encoder(path: Path) -> None:
+    """Raises ProgdfError where an .mp4 is wanted and the package that encodes it is not installed."""
+    if path.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ProgdfError(f"{path} needs a video encoder; pip install progdf-studio[video], or write a .gif")
+
+
+def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20) -> None:
+    """A film there and back again, H.264; the codec wants even sides, so an odd last row is doubled."""
+    there = list(frames)
+    hold = round(HOLD_MS * frames_per_second / 1000)
+    shown = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
+    _encode_mp4(path, shown, frames_per_second)
+
+
+def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
+    """H.264, frame by frame, so that a long film needs no memory."""
+    import imageio_ffmpeg  # an extra, see check_encoder
+
+    writer = None
+    for frame in frames:
+        even = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
+        if writer is None:
+            writer = imageio_ffmpeg.write_frames(
+                str(path),
+                (even.shape[1], even.shape[0]),
+                fps=frames_per_second,
+                quality=8,
+                macro_block_size=2,
+            )
+            writer.send(None)
+        writer.send(np.ascontiguousarray(even))
+    if writer is not None:
+        writer.close()

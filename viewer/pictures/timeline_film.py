@@ -1,0 +1,102 @@
+"""The film of a timeline, frame by frame: what is written does not depend on how long a frame takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.io import images as pictures
+from progdf.io.atomic import written_whole
+from viewer.camera.view_camera import to_camera
+from viewer.render.engine import Engine
+from viewer.state import timeline
+from viewer.state.view_state import Timeline, ViewState
+
+from . import film
+
+MOST_SHOWN = 100
+"""Pictures of a contact sheet."""
+
+
+def check_output(out: Path) -> None:
+    """Raises ProgdfError where `out` is neither a film nor a place for a folder of frames."""
+    suffix = out.suffix.lower()
+    if suffix not in (".gif", ".mp4", ""):
+        raise ProgdfError(
+            f"{out} cannot hold a film; --timeline writes a .gif, an .mp4 or a folder of frames"
+        )
+    if not suffix:
+        film.check_sequence(out)
+
+
+def frames(
+    shown: Timeline, view: ViewState, still: Camera, engine: Engine, numbers: Iterable[int]
+) -> Iterator[film.Pixels]:
+    """The pictures of some frames. [H,W,3] each
+
+    Args:
+        shown: the keys
+        view: what no key says: background, blend, edits that do not move
+        still: gives the size, and the camera where no key has one
+        engine: draws
+        numbers: of the frames
+    """
+    for frame in numbers:
+        state = timeline.shown_at(shown, frame, view)
+        moving = timeline.camera_at(shown, frame) is not None
+        camera = to_camera(state.camera, still.width, still.height) if moving else still
+        yield film.to_pixels(engine.image(state, camera=camera))
+
+
+def sheet_frames(shown: Timeline, count: int) -> list[int]:
+    """At most `count` frames from the first to the last, evenly; a way back shows none that are new."""
+    steps = max(count - 1, 1)
+    return sorted({round(i * shown.length / steps) for i in range(count)})
+
+
+def sheet(shown: Timeline, view: ViewState, still: Camera, engine: Engine, count: int) -> film.Pixels:
+    """A contact sheet of `count` frames, row by row, each with its number and its time. [H,W,3]"""
+    numbers = sheet_frames(shown, count)
+    drawn = [
+        torch.from_numpy(picture).float() / 255.0 for picture in frames(shown, view, still, engine, numbers)
+    ]
+    said = [f"frame {number}, {number / shown.fps:.2f} s" for number in numbers]
+    columns = math.ceil(math.sqrt(len(numbers)))
+    rows = range(0, len(numbers), columns)
+    page = pictures.contact_sheet(
+        [drawn[i : i + columns] for i in rows], notes=[said[i : i + columns] for i in rows]
+    )
+    return film.to_pixels(page.numpy())
+
+
+def write(out: Path, shown: Timeline, view: ViewState, still: Camera, engine: Engine, count: int = 0) -> str:
+    """Write the film: .gif, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
+
+    Returns:
+        A line that tells what was written.
+
+    Raises:
+        ProgdfError: see `check_output`.
+    """
+    size = f"{still.width}x{still.height}"
+    if count:
+        page = sheet(shown, view, still, engine, count)
+        with written_whole(out) as beside:
+            Image.fromarray(page).save(beside)
+        count = len(sheet_frames(shown, count))
+        return f"wrote {out} ({count} pictures of {size}, drawn by {engine.draws_with})"
+    check_output(out)
+    drawn = frames(shown, view, still, engine, timeline.film_frames(shown))
+    if out.suffix:
+        with written_whole(out) as beside:
+            film.write_film(beside, drawn, shown.fps)
+    else:
+        film.write_sequence(out, drawn)
+    count = sum(1 for _ in timeline.film_frames(shown))
+    return f"wrote {out} ({count} frames of {size}, {shown.fps} a second, drawn by {engine.draws_with})"

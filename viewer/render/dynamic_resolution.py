@@ -1,0 +1,73 @@
+"""Fewer pixels while something moves and a whole picture takes long; all of them once it rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .engine import FrameTimings
+
+SLOW_MS = 40.0
+"""What a picture may take before "auto" halves its sides: 25 pictures a second."""
+
+REST_S = 0.15
+"""How long nothing moves before the picture is drawn in full: more than between two steps of a hand."""
+
+COARSE = 2
+"""How many pixels of the window one pixel of a coarse picture covers, each way."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """How pictures are drawn while the hand is on something, and what is known of their cost.
+
+    Args:
+        pixels: of the window that one pixel drawn covers, each way: 1 or `COARSE`
+        rest_at: when to draw in full, seconds on the stage's clock; None while the picture is in full
+        camera_ms: what the last two whole pictures in full took; one alone may have waited for something
+        slider_ms: the same of the last two steps of a slider, within this grip
+    """
+
+    pixels: int = 1
+    rest_at: float | None = None
+    camera_ms: tuple[float, ...] = ()
+    slider_ms: tuple[float, ...] = ()
+
+
+def begun(draft: Draft, mode: str, held: bool, turned: bool, slid: bool, now: float) -> Draft:
+    """Before a picture is drawn: how it shall be drawn.
+
+    Args:
+        mode: of `DRAFT_MODES`
+        held: whether a hand is on something, so that more will follow
+        turned: whether the camera or the picture's size is another than in the last frame
+        slid: whether what is drawn is another
+        now: seconds on the stage's clock
+    """
+    draft = draft if held else replace(draft, slider_ms=())
+    full = replace(draft, pixels=1, rest_at=None)
+    if mode == "off":
+        return full
+    if turned or slid:
+        pays = mode == "on" or draft.pixels > 1 or _slow(draft.camera_ms if turned else draft.slider_ms)
+        return replace(draft, pixels=COARSE, rest_at=now + REST_S) if held and pays else full
+    return full if draft.rest_at is None or now >= draft.rest_at else draft
+
+
+def drawn(draft: Draft, timings: FrameTimings, turned: bool) -> Draft:
+    """After a picture was drawn: what it took. A coarse one tells nothing of a full one."""
+    if draft.pixels > 1:
+        return draft
+    if timings.share == 1.0:
+        draft = replace(draft, camera_ms=(*draft.camera_ms[-1:], timings.total_ms))
+    return draft if turned else replace(draft, slider_ms=(*draft.slider_ms[-1:], timings.total_ms))
+
+
+def _slow(pictures_ms: tuple[float, ...]) -> bool:
+    return len(pictures_ms) == 2 and min(pictures_ms) > SLOW_MS
+
+
+def patience(draft: Draft, now: float) -> float | None:
+    """Seconds until the picture has to be drawn in full; None where it is."""
+    return None if draft.rest_at is None else max(draft.rest_at - now, 0.0)

@@ -1,0 +1,336 @@
+"""One engine, on screen and headless: state → compose → upload → sort → draw, published together.
+
+It compares the state with the one it last drew and does only the work between them: a camera move composes
+nothing, a change of colour sorts nothing, the same state draws nothing, and where the CPU draws, a slider
+draws only the part of the picture that its members touch.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.compose.layers import Gains
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.scene.bounds import near_plane
+from viewer.camera.view_camera import bounds_of, to_camera
+from viewer.gl.edit_pass import EditPassError
+from viewer.state.layers import shown
+from viewer.state.paint import layer_of
+from viewer.state.view_state import ViewState
+
+from .attribute_updates import CpuEditing, Editing, GpuEditing, Stack
+from .cpu_renderer import CpuPainter
+from .depth_sort import back_to_front
+from .headless import is_software
+from .highlight import Tint, tints
+from .renderers import GlPainter, Image, Painter
+
+DRAWS = ("auto", "gl", "cpu")
+EDIT_PASSES = ("auto", "gpu", "cpu")
+"""What works out the attributes; "auto" leaves the edit pass to graphics cards: llvmpipe takes 0.6 µs of the
+processor's time a member (places, shapes and colours, three bases), where composing and sending take 0.06."""
+
+
+@dataclass(frozen=True)
+class FrameTimings:
+    """Where the time of one picture went: wall clock, milliseconds, the GPU's work waited for.
+
+    Args:
+        compose_ms: strengths → attributes, by the CPU
+        upload_ms: attributes → where they are drawn from; or the GPU's edit pass, which does both there
+        sort_ms: depth order (the CPU rasteriser sorts within `draw_ms`)
+        draw_ms: the picture
+        changed: Gaussians whose attributes were composed anew
+        drawn: Gaussians in front of the camera; all of them where the CPU rasteriser draws
+        share: of the picture's pixels that were drawn anew, 0..1
+    """
+
+    compose_ms: float = 0.0
+    upload_ms: float = 0.0
+    sort_ms: float = 0.0
+    draw_ms: float = 0.0
+    changed: int = 0
+    drawn: int = 0
+    share: float = 0.0
+
+    @property
+    def total_ms(self) -> float:
+        return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms
+
+
+@dataclass(frozen=True)
+class EditsBy:
+    """What worked out the attributes on screen, and how well.
+
+    Args:
+        where: "gpu" (the edit pass) or "cpu"
+        error: how far the attributes are from `progdf.compose`, in a sample that was read back: the largest
+            difference of a raw number, relative to it where it is larger than 1
+        obstacle: why the CPU does it though the GPU was wanted
+    """
+
+    where: str
+    error: float = 0.0
+    obstacle: str = ""
+
+    @property
+    def told(self) -> str:
+        """In words that fit after "edited by"."""
+        return f"CPU: {self.obstacle}" if self.where == "cpu" else f"GPU ±{self.error:.1g}"
+
+
+@dataclass(frozen=True)
+class _Edits:
+    """What decides the attributes: the layers that do something, and how they go together."""
+
+    layers: tuple[tuple[int, float, Gains, str], ...] = ()
+    blend: str = ""
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """What decides the picture."""
+
+    edits: _Edits
+    background: tuple[float, float, float]
+    viewmat: bytes
+    K: bytes
+    size: tuple[int, int]
+    tint: Tint | None = None
+
+
+class Engine:
+    """Draws one scene under its edits.
+
+    Args:
+        ctx: the GL context that pictures are drawn or shown in; None draws on the CPU, for `image` only
+        scene: the original
+        gdfs: the edits that `LayerState.gdf` counts
+        draw: "gl", "cpu", or "auto": "gl" where OpenGL has hardware behind it
+        edit_pass: what works out the attributes of a new strength: "gpu" (see gl/edit_pass.py), "cpu", or
+            "auto": "gpu" where OpenGL draws with hardware behind it
+
+    Raises:
+        ProgdfError: an edit was made for another scene; or "gpu" where the CPU draws.
+        ValueError: `draw` or `edit_pass` is unknown, or `draw` is "gl" without a context.
+    """
+
+    def __init__(
+        self,
+        ctx: moderngl.Context | None,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf] = (),
+        draw: str = "auto",
+        edit_pass: str = "auto",
+    ) -> None:
+        if draw not in DRAWS:
+            raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
+        if edit_pass not in EDIT_PASSES:
+            raise ValueError(f"edit_pass is '{edit_pass}', expected one of {', '.join(EDIT_PASSES)}")
+        if draw == "gl" and ctx is None:
+            raise ValueError("draw is 'gl', which needs a context")
+        self.ctx, self.scene = ctx, scene
+        self.gdfs = tuple(gdfs)
+        self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
+        self.timings = FrameTimings()
+        """Of the last picture."""
+        self.near = near_plane(bounds_of(scene).radius)
+        """Depth at and below which nothing is drawn, world units."""
+        self._edits = _Edits()
+        self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
+        self._ordered_for: bytes | None = None
+        self._picture: _Picture | None = None
+        self.tint: Tint | None = None
+        """What `draw` shows over the members of an edit; `image` never does."""
+        self._tinted: tuple[Tint, NDArray[np.uint8]] | None = None  # and the tints of its members
+        if edit_pass == "gpu" and self.draws_with == "cpu":
+            raise ProgdfError("the CPU draws here, so the GPU cannot edit; add --draw gl to --edit-pass gpu")
+        self._edit_obstacle = ""
+        self._edit_error: float | None = None
+        wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))
+        self._painter, self._editing = self._made(wants_pass and self.draws_with == "gl")
+
+    def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
+        """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
+        wanted = self._wanted(view, camera or to_camera(view.camera, *size))
+        return replace(wanted, tint=self.tint) != self._picture
+
+    def draw(
+        self,
+        view: ViewState,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int],
+        pixels: int = 1,
+    ) -> FrameTimings:
+        """Bring the picture up to date and show it in the lower left `size` pixels of `framebuffer`.
+
+        Args:
+            pixels: of the framebuffer that one pixel of the picture fills, each way (see draft.py)
+
+        Raises:
+            ProgdfError: a layer of `view` means nothing; the last picture stays.
+        """
+        self.timings = self._bring(view, to_camera(view.camera, *drawn_size(size, pixels)), self.tint)
+        self._painter.show(framebuffer, size)
+        return self.timings
+
+    def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
+        """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colours are.
+
+        Args:
+            view: what to draw
+            size: width, height in pixels
+            camera: takes the place of the view's own camera and of `size`
+
+        Returns:
+            [H,W,3] float32
+
+        Raises:
+            ProgdfError: a layer of `view` means nothing.
+        """
+        self.timings = self._bring(view, camera or to_camera(view.camera, *size))
+        return self._painter.pixels()
+
+    def gaussians(self, view: ViewState) -> Gaussians:
+        """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
+        edits = _edits(view)
+        self._compose(edits)
+        return self._editing.gaussians(*self._stack(edits))
+
+    @property
+    def edits_with(self) -> str:
+        """What works out the attributes: "gpu" or "cpu"."""
+        return self._editing.where
+
+    def edit_error(self) -> float:
+        """How far the attributes that are drawn are from `progdf.compose`: see `EditsBy.error`."""
+        if self._edit_error is None:
+            self._edit_error = self._editing.error(*self._stack(self._edits))
+        return self._edit_error
+
+    def edits(self) -> EditsBy | None:
+        """What worked out the attributes that are drawn; None where the CPU did, and nobody wanted more."""
+        if self.edits_with == "gpu":
+            return EditsBy("gpu", self.edit_error())
+        return EditsBy("cpu", obstacle=self._edit_obstacle) if self._edit_obstacle else None
+
+    def forget(self) -> None:
+        """Draw the next picture as a whole, though only a part of the last one has changed."""
+        self._picture = None
+        self._painter.forget()
+
+    def release(self) -> None:
+        """Give back what lives in the context; the context is the caller's."""
+        self._editing.release()
+        self._painter.release()
+
+    def _made(self, wants_pass: bool) -> tuple[Painter, Editing]:
+        """The painter with the scene in it, and what edits it there."""
+        if self.draws_with == "cpu" or self.ctx is None:
+            painter: Painter = CpuPainter(self.ctx, self.near)
+            return painter, CpuEditing(painter, self.scene, self.gdfs)
+        if wants_pass:
+            by_gl = GlPainter(self.ctx, editable=True)
+            try:
+                return by_gl, GpuEditing(by_gl, self.scene, self.gdfs)
+            except EditPassError as error:
+                by_gl.release()
+                self._edit_obstacle = str(error)
+        painter = GlPainter(self.ctx)
+        return painter, CpuEditing(painter, self.scene, self.gdfs)
+
+    def _wanted(self, view: ViewState, camera: Camera) -> _Picture:
+        return _Picture(
+            _edits(view),
+            view.background,
+            camera.viewmat.numpy().tobytes(),
+            camera.K.numpy().tobytes(),
+            (camera.width, camera.height),
+        )
+
+    def _bring(self, view: ViewState, camera: Camera, tint: Tint | None = None) -> FrameTimings:
+        """Do what lies between the last picture and this one."""
+        wanted = replace(self._wanted(view, camera), tint=tint)
+        if wanted == self._picture:
+            return FrameTimings(drawn=self.timings.drawn)
+        compose_ms, upload_ms, changed = self._compose(wanted.edits)
+        dye_ms = self._dye(tint)
+        started = time.perf_counter()
+        if self._painter.wants_order and self._ordered_for != wanted.viewmat:
+            self._order = back_to_front(self._editing.means, camera, self.near)
+            self._ordered_for = wanted.viewmat
+        sorted_at = time.perf_counter()
+        share = self._painter.draw(camera, view.background, self._order)
+        drawn_at = time.perf_counter()
+        self._picture = wanted
+        return FrameTimings(
+            compose_ms,
+            upload_ms + dye_ms,
+            1e3 * (sorted_at - started),
+            1e3 * (drawn_at - sorted_at),
+            changed,
+            len(self._order) if self._painter.wants_order else len(self.scene),
+            share,
+        )
+
+    def _compose(self, edits: _Edits) -> tuple[float, float, int]:
+        """Bring attributes up to date; gives ms for composing and uploading, and how many rows changed."""
+        if edits == self._edits:
+            return 0.0, 0.0, 0
+        started = time.perf_counter()
+        stack = self._stack(edits)
+        unpacked_ms = 1e3 * (time.perf_counter() - started)
+        step = self._editing.bring(*stack)
+        self._edits, self._picture, self._edit_error = edits, None, None
+        if step.moved:
+            self._ordered_for = None
+        return unpacked_ms + step.compose_ms, step.upload_ms, step.changed
+
+    def _dye(self, tint: Tint | None) -> float:
+        """Bring the tints up to date, those alone that are others than before; gives the ms it took."""
+        if tint == (self._tinted and self._tinted[0]):
+            return 0.0
+        started = time.perf_counter()
+        if self._tinted is not None and (tint is None or tint.gdf != self._tinted[0].gdf):
+            last, shown = self._tinted
+            self._tinted = None
+            self._painter.tint(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
+        if tint is not None:
+            members = self._gdf(tint.gdf).region.members.numpy()
+            new = tints(tint, self.gdfs)
+            others = slice(None) if self._tinted is None else (new != self._tinted[1]).any(1)
+            self._tinted = tint, new
+            self._painter.tint(members[others], new[others])
+        return 1e3 * (time.perf_counter() - started)
+
+    def _stack(self, edits: _Edits) -> tuple[Stack, str]:
+        """The layers and the blend rule of what was asked for."""
+        stack = [(layer[0], layer_of(self._gdf(layer[0]), *layer[1:])) for layer in edits.layers]
+        return stack, edits.blend or "normalised"
+
+    def _gdf(self, index: int) -> Gdf:
+        if not 0 <= index < len(self.gdfs):
+            raise ProgdfError(
+                f"a layer asks for edit {index + 1} of {len(self.gdfs)}; open its .gdf file too"
+            )
+        return self.gdfs[index]
+
+
+def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
+    """Width and height of a picture of which each pixel fills `pixels` of `size`, each way."""
+    return -(-size[0] // pixels), -(-size[1] // pixels)
+
+
+def _edits(view: ViewState) -> _Edits:
+    """Layers that are not shown or at strength 0 do not count, so that touching them does no work."""
+    layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in shown(view) if l.strength != 0.0)
+    return _Edits(layers, view.blend) if layers else _Edits()

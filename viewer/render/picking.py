@@ -1,0 +1,140 @@
+"""What lies under the cursor: which Gaussians with which shares, which point of the surface, which layer."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.rasterize import reference
+from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN
+from viewer.camera.up_axis import Vec3
+from viewer.state.layers import shown
+from viewer.state.view_state import ViewState
+
+HALF = 0.5
+FAINT = 0.05  # less than this in all counts as background
+LEAST_SHARE = 0.25  # of what one sees at a pixel must be a layer's own before a click there means it
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one sees at a pixel, nearest first.
+
+    Args:
+        rows: indices of the Gaussians. [M] int64
+        shares: the part of the pixel's colour that each gives; with the background's share they make 1. [M]
+        depths: in front of the camera, world units. [M]
+    """
+
+    rows: NDArray[np.int64]
+    shares: NDArray[np.float64]
+    depths: NDArray[np.float64]
+
+
+def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Vec3 | None:
+    """The point under a pixel position, on its ray at the depth of the Gaussian that makes it half opaque.
+
+    Args:
+        scene: what is on screen, so with its edits
+        camera: the picture's camera
+        x, y: pixels from the upper left corner, pixel centres at +0.5
+        near: least depth, world units
+
+    Returns:
+        World position; the strongest Gaussian's depth where the pixel never gets half opaque; None on the
+        background.
+    """
+    seen = seen_at(scene, camera, x, y, near)
+    if seen is None:
+        return None
+    opaque = np.flatnonzero(np.cumsum(seen.shares) >= HALF)
+    at = int(opaque[0]) if len(opaque) else int(seen.shares.argmax())
+    z = float(seen.depths[at])
+    fx, fy, cx, cy = _lens(camera)
+    rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
+    wx, wy, wz = (
+        float(v) for v in rotation.T @ (np.array([(x - cx) / fx * z, (y - cy) / fy * z, z]) - translation)
+    )
+    return (wx, wy, wz) if all(math.isfinite(v) for v in (wx, wy, wz)) else None
+
+
+def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
+    """The layer that most of what one sees belongs to, an index into `view.layers`.
+
+    Args:
+        view: what is on screen
+        gdfs: the edits that `LayerState.gdf` counts
+        seen: at the pixel
+
+    Returns:
+        A shown layer goes before a hidden one, of equal ones the later; None where no layer has
+        `LEAST_SHARE` of the pixel.
+    """
+    visible, best, chosen = shown(view), (False, 0.0), None
+    for i, layer in enumerate(view.layers):
+        members = gdfs[layer.gdf].region.members.numpy()  # sorted
+        if not len(members):
+            continue
+        own = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
+        share = float(seen.shares[own].sum())
+        if share >= LEAST_SHARE and (layer in visible, share) >= best:
+            best, chosen = (layer in visible, share), i
+    return chosen
+
+
+def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Seen | None:
+    """The Gaussians that one sees at a pixel position, None on the background; as `surface_point`."""
+    rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
+    fx, fy, cx, cy = _lens(camera)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        # by columns: a row at a time takes many times as long
+        across, down, depth = rotation @ scene.means.numpy().T + translation[:, None]
+        dx, dy = across / depth, down / depth
+        dx += np.float32((cx - x) / fx)
+        dy += np.float32((cy - y) / fy)
+        off = dx * dx + dy * dy
+        widest = np.exp(functools.reduce(np.maximum, scene.log_scales.numpy().T))
+        # √(1 + off) ≤ 1 + off / 2: what is taken too many here, `_alphas` leaves out
+        reach = widest / depth * (max(fx, fy) / min(fx, fy) * (1.0 + 0.5 * off)) + np.float32(1 / min(fx, fy))
+        sized = np.isfinite(widest) & np.isfinite(scene.logit_opacities.numpy())
+        near_ray = np.flatnonzero(sized & (depth > near) & (off < 3.5**2 * reach * reach))
+    if not len(near_ray):
+        return None
+    rows, alphas = _alphas(scene, near_ray, camera, x, y, near)
+    through = np.cumprod(1.0 - alphas)
+    if not len(rows) or 1.0 - through[-1] < FAINT:
+        return None
+    shares = alphas * np.concatenate([[1.0], through[:-1]])
+    return Seen(rows, shares, depth[rows].astype(np.float64))
+
+
+def _lens(camera: Camera) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point, pixels."""
+    fx, fy, cx, cy = (float(v) for v in (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]))
+    return fx, fy, cx, cy
+
+
+def _alphas(
+    scene: Gaussians, rows: NDArray[np.int64], camera: Camera, x: float, y: float, near: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Which of some Gaussians the rasteriser draws at a position, nearest first, and their alphas there."""
+    some = scene[torch.from_numpy(rows)]
+    pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
+    splats, _ = reference.project(
+        some.means.double(), some.quats, some.scales, some.opacities, torch.zeros(len(rows), 3),
+        camera.viewmat, camera.K, camera.width, camera.height, near, None, scene.antialiased, pixel,
+    )  # fmt: skip
+    l11, l21, l22 = splats.whitening.unbind(1)
+    dx, dy = (torch.tensor([x, y], dtype=torch.float64) - splats.means2d).unbind(1)
+    alphas = splats.opacities * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))
+    alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp_max(ALPHA_MAX), 0.0)
+    return rows[splats.rows.numpy()], alphas.numpy()

@@ -1,0 +1,130 @@
+"""Two ways to draw a scene, one interface: OpenGL, and the CPU rasteriser (cpu_painter.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Protocol, TypeVar
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from viewer.camera.up_axis import Vec3
+from viewer.gl.edit_pass import EditPass
+from viewer.gl.present import Presenter
+from viewer.gl.splats import SplatRenderer
+
+Image = NDArray[np.float32]
+T = TypeVar("T")
+
+
+class Painter(Protocol):
+    """Keeps a scene ready for drawing and the last picture of it."""
+
+    wants_order: bool
+    """Whether `draw` uses the order it is given."""
+
+    def upload(self, scene: Gaussians) -> None:
+        """Take a whole scene."""
+
+    def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
+        """Take the changed attributes of the changed rows (sorted)."""
+
+    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        """Draw Gaussians (sorted) in other colours from now on, whatever becomes of their own.
+
+        Args:
+            tints: rgb and the share that it takes of a Gaussian's colour, 0..255; 0 takes none. [R,4]
+        """
+
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
+        """Make the picture and wait until it is done.
+
+        Args:
+            order: farthest first, from `sort.back_to_front`
+
+        Returns:
+            The share of its pixels that had to be drawn, 0..1.
+        """
+
+    def forget(self) -> None:
+        """Draw the next picture as a whole, whatever the last one was."""
+
+    def pixels(self) -> Image:
+        """The picture, upper row first, not clamped. [H,W,3]"""
+
+    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
+        """Fill the framebuffer's lower left `size` pixels with the picture; None: as many as it has."""
+
+    def release(self) -> None:
+        """Give back what it holds."""
+
+
+class GlPainter:
+    """Draws with OpenGL (see `SplatRenderer`).
+
+    Args:
+        ctx: to draw in
+        editable: let an edit pass write every attribute (see `SplatTextures`)
+    """
+
+    wants_order = True
+
+    def __init__(self, ctx: moderngl.Context, editable: bool = False) -> None:
+        self._ctx, self._editable = ctx, editable
+        self._renderer = SplatRenderer(ctx)
+        self._presenter = Presenter(ctx)
+        self._picture: moderngl.Texture | None = None
+
+    def upload(self, scene: Gaussians) -> None:
+        self._renderer.upload(scene, self._editable)
+        self._ctx.finish()
+
+    def edit_pass(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> EditPass:
+        """An edit pass that writes into the scene that is drawn; the caller releases it.
+
+        Raises:
+            ProgdfError: see `EditPass`.
+        """
+        return EditPass(self._ctx, self._renderer.textures, scene, gdfs)
+
+    def finish(self) -> None:
+        """Wait until all that OpenGL was asked for is done."""
+        self._ctx.finish()
+
+    def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
+        self._renderer.update(scene, attributes, rows)
+        self._ctx.finish()
+
+    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+        self._renderer.tint(rows, tints)
+
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
+        self._renderer.set_order(order)
+        self._picture = self._renderer.draw(camera, background)
+        self._ctx.finish()
+        return 1.0
+
+    def forget(self) -> None:
+        pass  # as it does every time
+
+    def pixels(self) -> Image:
+        picture = _drawn(self._picture)
+        rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
+        return np.ascontiguousarray(rgba[..., :3])
+
+    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
+        self._presenter.show(_drawn(self._picture), framebuffer, size)
+
+    def release(self) -> None:
+        self._presenter.release()
+        self._renderer.release()
+
+
+def _drawn(thing: T | None) -> T:
+    if thing is None:
+        raise ValueError("there is no picture yet; draw first")
+    return thing

@@ -1,0 +1,266 @@
+"""Painted strength: a weight per member of a layer, and the strokes of a brush that change it.
+
+A stroke keeps the weights it began with and how far the brush has reached each member; what it gives does not
+depend on how many events the hand's way was cut into.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import zlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.compose.layers import Gains, Layer
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.rasterize import rasterize
+
+from .view_state import Brush
+
+MODES = ("add", "erase", "smooth")
+SMALLEST_PX, LARGEST_PX = 4.0, 400.0
+FULL = ""
+"""The paint of a layer that was never painted: weight 1 everywhere."""
+
+_COARSE = 4  # the depth of the surface is looked up in a picture so many times smaller
+_BEHIND = 0.01  # of the depth: what lies no further behind the surface still belongs to it
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A stroke under way.
+
+    Args:
+        before: weights when it began, 0..1. [M]
+        places: where each member is in the picture, pixels, and f·log(depth), so that neighbours are as far
+            apart as they look; NaN where the brush cannot reach it. [M,3]
+        reached: largest touch of the brush so far, 0..1. [M]
+        mode: of `MODES`
+        last: where the brush was last, pixels
+    """
+
+    before: Floats
+    places: Floats
+    reached: Floats
+    mode: str = "erase"
+    last: tuple[float, float] | None = None
+
+
+def next_mode(mode: str) -> str:
+    """The mode after this one."""
+    return MODES[(MODES.index(mode) + 1) % len(MODES)]
+
+
+def mode_while(mode: str, modifier: str) -> str:
+    """What a stroke does that begins with a modifier held: Ctrl the opposite, Shift smooths, as elsewhere."""
+    if modifier == "Shift":
+        return "smooth"
+    return {"add": "erase", "erase": "add"}.get(mode, mode) if modifier == "Ctrl" else mode
+
+
+def radius(wanted: float) -> float:
+    """A radius that a hand can use."""
+    return min(LARGEST_PX, max(SMALLEST_PX, round(wanted, 1)))
+
+
+def softness(wanted: float) -> float:
+    """A softness, 0..1."""
+    return min(1.0, max(0.0, round(wanted, 3)))
+
+
+def encoded(weights: Floats) -> str:
+    """Weights 0..1 as the text that a state and a session keep; `FULL` where all are 1."""
+    levels = np.round(np.clip(weights, 0.0, 1.0) * 255.0).astype(np.uint8)
+    if (levels == 255).all():
+        return FULL
+    return base64.b64encode(zlib.compress(levels.tobytes(), 1)).decode()
+
+
+@lru_cache(maxsize=16)  # the composer knows weights by their identity
+def decoded(paint: str, members: int) -> Tensor | None:
+    """Weight of every member, None for `FULL`. [M] float32
+
+    Raises:
+        ProgdfError: the text is damaged or holds weights of another number of members.
+    """
+    if paint == FULL:
+        return None
+    unpacker = zlib.decompressobj()
+    try:
+        levels = unpacker.decompress(base64.b64decode(paint, validate=True), members + 1)
+    except (ValueError, binascii.Error, zlib.error):
+        raise ProgdfError("the painted weights of a layer are damaged; paint it anew") from None
+    if len(levels) != members:
+        raise ProgdfError(f"a layer's painted weights do not fit its {members} members; paint it anew")
+    return torch.from_numpy(np.frombuffer(levels, np.uint8).astype(np.float32) / 255.0)
+
+
+def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
+    """The layer that the composer takes, with the painted weights.
+
+    Raises:
+        ProgdfError: see `decoded`.
+    """
+    return Layer(gdf, strength, True, gains, decoded(paint, len(gdf.region)))
+
+
+def begun(
+    paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool, mode: str = "erase"
+) -> Stroke:
+    """A stroke that has touched nothing yet.
+
+    Args:
+        paint: of the layer
+        gdf: its edit
+        scene: as it is on screen
+        camera: of the picture
+        through: also what lies behind the front surface
+        mode: of `MODES`
+    """
+    weights, count = decoded(paint, len(gdf.region)), len(gdf.region)
+    before = np.ones(count, np.float32) if weights is None else weights.numpy()
+    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    depth_of_all = (scene.means @ rotation.T + translation)[:, 2].numpy()
+    members = gdf.region.members
+    local = (scene.means[members] @ rotation.T + translation).numpy()
+    depth = local[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = local[:, :2] / depth[:, None] * camera.K.diagonal()[:2].numpy() + camera.K[:2, 2].numpy()
+        places = np.column_stack([places, float(camera.K[0, 0]) * np.log(depth)])
+    reachable = np.isfinite(places).all(1) & (depth > 0.0)
+    if not through:
+        size = scene.log_scales[members].amax(1).exp().numpy()
+        surface = _surface(scene, depth_of_all, camera, np.where(reachable[:, None], places, 0.0))
+        reachable &= depth <= surface * (1.0 + _BEHIND) + size
+    places = np.where(reachable[:, None], places, np.nan).astype(np.float32)
+    return Stroke(before, places, np.zeros(count, np.float32), mode)
+
+
+def drawn_to(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 1.0) -> Stroke:
+    """The stroke with the brush moved in a straight line to a pixel position.
+
+    Args:
+        stroke: under way
+        x, y: pixels of the picture
+        brush: its radius is in pixels at 1×
+        density: pixels of the picture per pixel at 1×
+    """
+    here = np.array([x, y], np.float32)
+    there = here if stroke.last is None else np.array(stroke.last, np.float32)
+    way = here - there
+    places = stroke.places[:, :2]
+    along = np.clip(((places - there) @ way) / max(float(way @ way), 1e-12), 0.0, 1.0)
+    away = np.linalg.norm(places - there - along[:, None] * way, axis=1) / (brush.radius * density)
+    fall = np.clip((1.0 - away) / max(brush.softness, 1e-3), 0.0, 1.0)
+    touch = np.nan_to_num(fall * fall * (3.0 - 2.0 * fall)).astype(np.float32)
+    return replace(stroke, reached=np.maximum(stroke.reached, touch), last=(x, y))
+
+
+def painted(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
+    """The paint that the stroke has made so far: to 1, to 0, or to the mean of neighbours under the brush.
+
+    Args:
+        stroke: under way
+        brush, density: as for `drawn_to`; smoothing reaches as far as half the brush
+    """
+    goal = np.full_like(stroke.before, 1.0 if stroke.mode == "add" else 0.0)
+    if stroke.mode == "smooth":
+        under = np.flatnonzero(stroke.reached)
+        width = 0.5 * brush.radius * density
+        goal[under] = near_mean(stroke.places[under], stroke.before[under], width)
+    return encoded(stroke.before + (goal - stroke.before) * stroke.reached)
+
+
+def feathered(paint: str, points: Floats, width: float) -> str:
+    """The paint with its edges softened, wherever one looks from.
+
+    Args:
+        paint: of a layer
+        points: the centres of its members, world units. [M,3]
+        width: see `near_mean`, world units, > 0
+
+    Raises:
+        ProgdfError: see `decoded`.
+    """
+    weights = decoded(paint, len(points))
+    if weights is None:
+        return FULL
+    soft, somewhere = weights.numpy().copy(), np.isfinite(points).all(1)
+    soft[somewhere] = near_mean(points[somewhere], soft[somewhere], width)
+    return encoded(soft)
+
+
+def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -> Floats:
+    """Depth of the front surface at each place, infinite on the background. [M]"""
+    width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
+    small = camera.resized(width, height)
+    with torch.no_grad():
+        image, clear, _ = rasterize(
+            scene.means,
+            scene.quats,
+            scene.scales,
+            scene.opacities,
+            torch.from_numpy(depths).float()[:, None].expand(-1, 3).contiguous().nan_to_num(),
+            small.viewmat,
+            small.K,
+            width,
+            height,
+            (0.0, 0.0, 0.0),
+            antialiased=scene.antialiased,
+        )
+    covered = 1.0 - clear.reshape(height, width).numpy()
+    depth = np.where(covered > 0.05, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
+    column = np.clip(places[:, 0] / camera.width * width, 0, width - 1).astype(int)
+    row = np.clip(places[:, 1] / camera.height * height, 0, height - 1).astype(int)
+    found: Floats = depth[row, column].astype(np.float32)
+    return found
+
+
+_LEAST = float(np.finfo(np.float64).tiny)  # a corner without a share has no mean, and gives none
+
+
+_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+
+def near_mean(points: Floats, values: Floats, width: float) -> Floats:
+    """Mean of the values around each point: continuous, and its cost grows with the points alone.
+
+    Each point gives its value to the eight corners of its cell and takes their means, by its place among
+    them: a kernel of about 0.6 `width` standard deviation.
+
+    Args:
+        points: finite, in any unit. [M,3]
+        values: at the points. [M]
+        width: side of a cell, in the unit of the points, > 0
+
+    Returns:
+        Within the range of the values. [M]
+    """
+    if not len(points):
+        return values.copy()
+    places = points / np.float32(width)
+    low = np.floor(places)
+    ends = np.stack([1.0 - (places - low), places - low], 2)  # to the lower corner and to the upper one
+    shares = (ends[:, 0, :, None, None] * ends[:, 1, None, :, None] * ends[:, 2, None, None, :]).reshape(
+        -1, 8
+    )
+    low -= low.min(0)
+    _, y_side, z_side = (low.max(0) + 2).tolist()
+    steps = np.array([y_side * z_side, z_side, 1.0])
+    cells = (low @ steps)[:, None] + _CORNERS @ steps  # whole numbers, exact in float64 up to 2⁵³
+    corners = np.unique(cells, return_inverse=True)[1].reshape(cells.shape)
+    given = np.bincount(corners.ravel(), shares.ravel())[corners]
+    total = np.bincount(corners.ravel(), (shares * values[:, None]).ravel())[corners]
+    found: Floats = (shares * (total / np.maximum(given, _LEAST))).sum(1).astype(np.float32)
+    return np.clip(found, values.min(), values.max())

@@ -1,0 +1,104 @@
+"""What a run recorded of an edit, found beside its .gdf, and shown in the field's place.
+
+Between two snapshots the recording goes straight, as it does for the errors in the run's report.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
+from progdf.gdf.file import Gdf
+
+from .layers import shown
+from .view_state import ViewState
+
+NO_FILE = "the edit was not opened from a file"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Where the recording of one edit lies.
+
+    Args:
+        path: its file; None where there is none to show
+        reason: why there is none
+    """
+
+    path: Path | None = None
+    reason: str = ""
+
+
+def found(gdf: Gdf, path: Path) -> Recording:
+    """The recording in the run folder that the edit at `path` lies in, if it is this edit's."""
+    beside = path.with_name(FILE_NAME)
+    if not beside.is_file():
+        return Recording(reason=f"there is no {FILE_NAME} beside {path.name}")
+    try:
+        s, members = peek_trajectory(beside)
+    except ProgdfError as error:
+        return Recording(reason=str(error))
+    same_way = torch.equal(s, torch.tensor(gdf.field.recorded, dtype=s.dtype))
+    if not same_way or not torch.equal(members, gdf.region.members):
+        return Recording(reason=f"the {FILE_NAME} beside {path.name} is of another edit")
+    return Recording(beside)
+
+
+def recorded(gdf: Gdf, recording: Recording) -> Gdf:
+    """The edit with its recording as the field; as it is where there is none.
+
+    Raises:
+        ProgdfError: the file is gone or damaged.
+    """
+    if recording.path is None:
+        return gdf
+    field = recorded_field(load_trajectory(recording.path)[0])
+    if field.attributes and field.members != len(gdf.region):
+        raise ProgdfError(f"{recording.path} is of another edit; train again")
+    return replace(gdf, field=field)
+
+
+def obstacle(recordings: Sequence[Recording]) -> str:
+    """Why there is nothing recorded to compare with; "" where there is."""
+    if any(recording.path is not None for recording in recordings):
+        return ""
+    return (recordings[0].reason or NO_FILE) if recordings else "no edit is open"
+
+
+def within(view: ViewState, recordings: Sequence[Recording]) -> ViewState:
+    """`view` with no recorded edit beyond its last snapshot: past 1 nothing was recorded."""
+    layers = (
+        replace(layer, strength=min(layer.strength, 1.0)) if recordings[layer.gdf].path else layer
+        for layer in view.layers
+    )
+    return replace(view, layers=tuple(layers))
+
+
+def told(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[Recording]) -> str:
+    """Which snapshots are shown, and which edits have none: "recorded, between 0.42 and 0.47"."""
+    active = [layer for layer in shown(view) if layer.strength != 0.0]
+    places, fields = {}, []
+    for layer in active:
+        if recordings[layer.gdf].path is None:
+            fields.append(layer.name)
+        else:
+            places[layer.name] = _neighbours(gdfs[layer.gdf].field.recorded, layer.strength)
+    if len(places) < 2 and not fields:
+        ends = [f"{s:.3g}" for s in next(iter(places.values()), (0.0,))]
+        return f"recorded, between {ends[0]} and {ends[1]}" if len(ends) == 2 else f"recorded at {ends[0]}"
+    said = [f"{name} {'–'.join(f'{s:.3g}' for s in ends)}" for name, ends in places.items()]
+    parts = ("recorded: " + ", ".join(said) if said else "", "field: " + ", ".join(fields) if fields else "")
+    return "; ".join(part for part in parts if part)
+
+
+def _neighbours(nodes: Sequence[float], strength: float) -> tuple[float, ...]:
+    """The snapshot at a strength, or those on either side of it."""
+    right = min(bisect_left(nodes, strength), len(nodes) - 1)
+    exact = nodes[right] <= strength
+    return (nodes[right],) if exact or right == 0 else (nodes[right - 1], nodes[right])

@@ -1,0 +1,76 @@
+"""Kept states of the sliders: what was edited and from where one looked; the original is always the first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from viewer.camera.view_camera import ViewCamera
+
+from . import history
+from .history import Edit
+from .layers import LONGEST_NAME
+from .view_state import Timeline, ViewState
+
+MOST = 200
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One kept state.
+
+    Args:
+        name: under its picture
+        edit: what going back to it restores, as one undo entry
+        camera: where its small picture is taken from
+    """
+
+    name: str
+    edit: Edit
+    camera: ViewCamera = ViewCamera()
+
+
+def taken(snapshots: Sequence[Snapshot], view: ViewState) -> tuple[Snapshot, ...]:
+    """One more, of `view`; as they were where the last one is the same, or there are `MOST`."""
+    new = Snapshot(_name(snapshots), _sliders(view), view.camera)
+    same = snapshots and replace(snapshots[-1], name=new.name) == new
+    return tuple(snapshots) if same or len(snapshots) >= MOST else (*snapshots, new)
+
+
+def without(snapshots: Sequence[Snapshot], index: int) -> tuple[Snapshot, ...]:
+    """All but one."""
+    return (*snapshots[:index], *snapshots[index + 1 :])
+
+
+def renamed(snapshots: Sequence[Snapshot], index: int, name: str) -> tuple[Snapshot, ...]:
+    """One under another name, on one line; no name changes nothing."""
+    name = " ".join(name.split())[:LONGEST_NAME]
+    kept = list(snapshots)
+    kept[index] = replace(kept[index], name=name or kept[index].name)
+    return tuple(kept)
+
+
+def shown(snapshots: Sequence[Snapshot], view: ViewState) -> tuple[Snapshot, ...]:
+    """What the panel shows: the original of `view`, then those kept."""
+    layers = tuple(replace(layer, strength=0.0) for layer in view.layers)
+    edit = _sliders(replace(view, layers=layers))
+    first = snapshots[0].camera if snapshots else view.camera
+    return Snapshot("original", edit, first), *snapshots
+
+
+def back_to(view: ViewState, snapshot: Snapshot) -> ViewState:
+    """`view` edited as it was then; edits that were opened since stay in the stack, at 0."""
+    kept = {layer.gdf for layer in snapshot.edit.layers}
+    later = tuple(replace(layer, strength=0.0) for layer in view.layers if layer.gdf not in kept)
+    back = history.restored(view, snapshot.edit)
+    return replace(back, layers=(*back.layers, *later), timeline=view.timeline)
+
+
+def _sliders(view: ViewState) -> Edit:
+    """What a snapshot keeps: all that undo knows but the film."""
+    return replace(history.edit_of(view), timeline=Timeline())
+
+
+def _name(snapshots: Sequence[Snapshot]) -> str:
+    taken_names = {snapshot.name for snapshot in snapshots}
+    return next(str(n) for n in range(1, MOST + 2) if str(n) not in taken_names)

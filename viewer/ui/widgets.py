@@ -1,0 +1,191 @@
+"""The panel's small parts: headings, labels, tips, icon buttons, rows of choices, text that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from imgui_bundle import imgui
+
+from .context import PALETTE, SMALL_PX, Rgba, UiContext, u32
+
+
+def section(name: str, ui: UiContext) -> None:
+    """The heading of a part of the panel."""
+    imgui.push_font(ui.fonts.bold, SMALL_PX)
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.dim))
+    imgui.align_text_to_frame_padding()
+    imgui.text(name.upper())
+    imgui.pop_style_color()
+    imgui.pop_font()
+
+
+def right_edge() -> float:
+    """Where the line ends, in the coordinates of `same_line`; ask at the line's start."""
+    return float(imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x)
+
+
+def label(text: str, column: float) -> None:
+    """A name at the left; what follows begins at `column`."""
+    imgui.align_text_to_frame_padding()
+    imgui.text_disabled(text)
+    imgui.same_line(column)
+
+
+def small(text: str, colour: Rgba, room: float | None = None) -> None:
+    """Small text, shortened to `room` window pixels, or to the line."""
+    imgui.push_font(None, SMALL_PX)
+    room = imgui.get_content_region_avail().x if room is None else room
+    imgui.text_colored(imgui.ImVec4(*colour), elided(text, room))
+    imgui.pop_font()
+
+
+def tip(text: str) -> None:
+    """What the last item does, told when the mouse rests on it."""
+    flags = imgui.HoveredFlags_
+    if imgui.is_item_hovered(flags.for_tooltip.value | flags.allow_when_disabled.value):
+        imgui.set_tooltip(text)
+
+
+def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
+    """A square button without a frame; True when it was pressed."""
+    side = imgui.get_frame_height()
+    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if dim else PALETTE.text)))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
+    pressed = imgui.button(f"{icon}##{name}", imgui.ImVec2(side, 0.0))
+    imgui.pop_style_var()
+    imgui.pop_style_color(2)
+    return bool(pressed)
+
+
+def typed_name(name: str, room: float) -> str | None:
+    """The text field of a name; None while it is open, "" where it was left as it was."""
+    storage, slot = imgui.get_state_storage(), int(imgui.get_id("name/focused"))
+    if not storage.get_bool(slot):
+        imgui.set_keyboard_focus_here()
+        storage.set_bool(slot, True)
+    imgui.set_next_item_width(room)
+    flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
+    entered, text = imgui.input_text("##name", name, flags)
+    if not (entered or imgui.is_item_deactivated()):
+        return None
+    storage.set_bool(slot, False)
+    return text if entered or imgui.is_item_deactivated_after_edit() else ""
+
+
+@contextmanager
+def menu(name: str, ui: UiContext) -> Iterator[bool]:
+    """A context menu that `imgui.open_popup(name)` opens; whether it is open. Escape closes it."""
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(8.0 * ui.scale, 8.0 * ui.scale))
+    is_open = imgui.begin_popup(name)
+    imgui.pop_style_var()
+    try:
+        yield bool(is_open)
+    finally:
+        if is_open:
+            if imgui.is_key_pressed(imgui.Key.escape):
+                imgui.close_current_popup()
+            imgui.end_popup()
+
+
+def let_go() -> bool:
+    """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
+    return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
+
+
+def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
+    """A button of small text on the present line, in the accent's colour while on; True when pressed."""
+    colours = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)
+    height = 3.0 * ui.scale  # reaches above its line, so that the hand finds it
+    x, y = imgui.get_cursor_screen_pos()
+    imgui.push_font(None, SMALL_PX)
+    line = imgui.get_text_line_height()
+    imgui.set_cursor_screen_pos(imgui.ImVec2(x, y - height))
+    pressed = bool(imgui.invisible_button(name, imgui.ImVec2(width, line + height)))
+    size = imgui.calc_text_size(text)
+    at = imgui.ImVec2(round(x + (width - size.x) / 2), round(y + (line - size.y) / 2))
+    imgui.get_window_draw_list().add_text(at, u32(colours[imgui.is_item_hovered()]), text)
+    imgui.pop_font()
+    return pressed
+
+
+def double_clicked() -> bool:
+    """Whether the last item, a slider, was double-clicked, which takes it back to its default.
+
+    It lets go of the slider, which would follow the mouse again in the next frame.
+    """
+    left = imgui.MouseButton_.left.value
+    if not (imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left)):
+        return False
+    imgui.internal.clear_active_id()
+    return True
+
+
+def value_slider(
+    name: str, value: float, ends: tuple[float, float], form: str, default: float, ui: UiContext
+) -> float:
+    """A slider to the end of the line, its number beside it where no handle hides it.
+
+    Ctrl+click types, a double click goes back to `default`. A range over orders of magnitude is logarithmic.
+    The value is as before, or what the number shows.
+    """
+    room = 44.0 * ui.scale
+    imgui.set_next_item_width(imgui.get_content_region_avail().x - room)
+    flags = imgui.SliderFlags_.always_clamp.value
+    if ends[0] > 0.0:
+        flags |= imgui.SliderFlags_.logarithmic.value
+    alpha = 1.0 if imgui.get_io().want_text_input else 0.0
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.text[:3], alpha))
+    changed, new = imgui.slider_float(name, value, *ends, form, flags)
+    imgui.pop_style_color()
+    if double_clicked():
+        changed, new = True, default
+    low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
+    number = form % (new if changed else value)
+    wide = imgui.calc_text_size(number).x
+    at = imgui.ImVec2(round(high.x + room - wide), round(low.y + imgui.get_style().frame_padding.y))
+    imgui.get_window_draw_list().add_text(at, imgui.get_color_u32(imgui.Col_.text), number)
+    return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
+
+
+def choice(
+    name: str, options: Sequence[str], current: int | None, ui: UiContext, usable: int | None = None
+) -> int | None:
+    """A row of joined buttons, the first `usable` of them; the index that was pressed, or None."""
+    gap = 2.0 * ui.scale
+    each = (imgui.get_content_region_avail().x - gap * (len(options) - 1)) / len(options)
+    pressed = None
+    imgui.begin_group()
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
+    for i, option in enumerate(options):
+        if i:
+            imgui.same_line(0.0, gap)
+        for slot in _BUTTON_COLOURS if i == current else ():
+            imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.accent_dark))
+        imgui.begin_disabled(usable is not None and i >= usable)
+        if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
+            pressed = i
+        imgui.end_disabled()
+        imgui.pop_style_color(len(_BUTTON_COLOURS) if i == current else 0)
+    imgui.pop_style_var()
+    imgui.end_group()
+    return pressed
+
+
+_BUTTON_COLOURS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
+
+
+def grouped(count: int) -> str:
+    """12345 as "12 345", with a thin space."""
+    return f"{count:,}".replace(",", "\u2009")
+
+
+def elided(text: str, room: float) -> str:
+    """The text, shortened with "…" to fit `room` window pixels in the present font."""
+    if imgui.calc_text_size(text).x <= room:
+        return text
+    kept = text
+    while kept and imgui.calc_text_size(kept + "…").x > room:
+        kept = kept[:-1]
+    return kept.rstrip() + "…"

@@ -1,0 +1,265 @@
+"""A glfw window with OpenGL 3.3: opened, listened to, scaled, closed. Nothing of ours is drawn here."""
+
+from __future__ import annotations
+
+import ctypes
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from imgui_bundle import imgui  # before glfw: it makes glfw load the library that imgui was built with
+
+# isort: split
+import glfw
+import moderngl
+
+from progdf.errors import ProgdfError
+from viewer.camera import controls
+from viewer.camera.inputs import Keys, Press, next_event_id
+
+LEAST = (640, 400)
+_FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
+_NAMES = {
+    **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
+    **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
+    **{
+        getattr(glfw, f"KEY_{name.upper()}"): name
+        for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete")
+    },
+    glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
+    glfw.KEY_LEFT_BRACKET: "[",
+    glfw.KEY_RIGHT_BRACKET: "]",
+    glfw.KEY_COMMA: ",",
+    glfw.KEY_PERIOD: ".",
+    glfw.KEY_KP_ENTER: "Enter",
+}
+_X11_LINE_FEED = 109
+"""Scancode of a key that glfw does not name: what programs that type for one press as Enter."""
+_HINTS = (
+    (glfw.CONTEXT_VERSION_MAJOR, 3),
+    (glfw.CONTEXT_VERSION_MINOR, 3),
+    (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+    (glfw.OPENGL_FORWARD_COMPAT, True),
+    (glfw.SCALE_TO_MONITOR, True),
+    (glfw.DEPTH_BITS, 0),
+    (glfw.STENCIL_BITS, 0),
+)
+
+
+class Window:
+    """The window, with its GL context current.
+
+    Args:
+        title: in the title bar
+        size: width and height at 1×
+
+    Raises:
+        ProgdfError: there is no display, or no OpenGL 3.3 on it.
+    """
+
+    def __init__(self, title: str, size: tuple[int, int]) -> None:
+        errors: list[str] = []
+        glfw.set_error_callback(lambda _, text: errors.append(_decoded(text)))
+        if not glfw.init():
+            raise _no_window("no window can be opened here", errors)
+        for hint, value in _HINTS:
+            glfw.window_hint(hint, value)
+        self.handle: Any = glfw.create_window(*size, title, None, None)
+        if not self.handle:
+            glfw.terminate()
+            raise _no_window("no window with OpenGL 3.3 can be opened here", errors)
+        glfw.set_window_size_limits(self.handle, *LEAST, glfw.DONT_CARE, glfw.DONT_CARE)
+        glfw.make_context_current(self.handle)
+        glfw.swap_interval(1)
+        self._pressed: list[Press] = []
+        self._down: dict[int, str] = {}  # names of the keys that are down
+        self._windowed: tuple[int, int, int, int] | None = None
+
+    def context(self) -> moderngl.Context:
+        """Its GL context, for drawing; through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do."""
+        moderngl.init_context(_GlfwLoader())
+        return moderngl.get_context()
+
+    def close(self) -> None:
+        glfw.destroy_window(self.handle)
+        glfw.terminate()
+
+    def listen(
+        self, wake: Callable[[], None], dropped: Callable[[Sequence[Path]], None], redraw: Callable[[], None]
+    ) -> None:
+        """Hand on events, and let imgui listen too. Call with the imgui context current.
+
+        Args:
+            wake: something happened
+            dropped: files were dropped on the window
+            redraw: draw at once (while a window is being resized, some systems run no event loop but this)
+        """
+
+        def on_event(*_: object) -> None:
+            wake()
+
+        def on_key(_: object, key: int, scancode: int, action: int, mods: int) -> None:
+            if key == glfw.KEY_UNKNOWN and scancode == _X11_LINE_FEED:
+                key = glfw.KEY_ENTER
+            self._note_key(key, scancode, action, mods)
+            if scancode == _X11_LINE_FEED and action != glfw.REPEAT:  # imgui's own callback does not know it
+                imgui.get_io().add_key_event(imgui.Key.enter, action == glfw.PRESS)
+            wake()
+
+        def on_drop(_: object, names: Sequence[str]) -> None:
+            dropped([Path(name) for name in names])
+
+        def on_refresh(_: object) -> None:
+            redraw()
+
+        for listen in (
+            glfw.set_cursor_pos_callback,
+            glfw.set_cursor_enter_callback,
+            glfw.set_mouse_button_callback,
+            glfw.set_scroll_callback,
+            glfw.set_char_callback,
+            glfw.set_window_focus_callback,
+            glfw.set_window_iconify_callback,
+            glfw.set_framebuffer_size_callback,
+        ):
+            listen(self.handle, on_event)
+        callback: Any = on_drop  # glfw's own annotation has the arguments of the C function
+        glfw.set_drop_callback(self.handle, callback)
+        glfw.set_key_callback(self.handle, on_key)
+        glfw.set_window_refresh_callback(self.handle, on_refresh)
+        # imgui's own callbacks call the ones that were there before
+        imgui.backends.glfw_init_for_opengl(ctypes.cast(self.handle, ctypes.c_void_p).value or 0, True)
+
+    def wait(self, patience: float | None) -> None:
+        """Handle events: at once (0), for so many seconds at most, or when the next one comes (None)."""
+        if patience is None:
+            glfw.wait_events()
+        elif patience > 0.0:
+            glfw.wait_events_timeout(patience)
+        else:
+            glfw.poll_events()
+
+    def ask_to_close(self) -> None:
+        glfw.set_window_should_close(self.handle, True)
+
+    def stay_open(self) -> None:
+        """Take back a wish to close."""
+        glfw.set_window_should_close(self.handle, False)
+
+    @property
+    def closing(self) -> bool:
+        return bool(glfw.window_should_close(self.handle))
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Size of the framebuffer; (0, 0) while minimised."""
+        width, height = glfw.get_framebuffer_size(self.handle)
+        return int(width), int(height)
+
+    @property
+    def ui_scale(self) -> float:
+        """Window coordinates per design pixel: the screen's density, less what the coordinates hide of it."""
+        content = float(glfw.get_window_content_scale(self.handle)[0])
+        pixels, coordinates = self.pixels[0], int(glfw.get_window_size(self.handle)[0])
+        return max(content * coordinates / pixels, 0.5) if pixels else 1.0
+
+    def take_keys(self) -> Keys:
+        """What the keyboard did since the last call."""
+        fly = frozenset(n for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS)
+        keys = Keys(tuple(self._pressed), frozenset(self._down.values()), fly)
+        self._pressed.clear()
+        return keys
+
+    def _note_key(self, key: int, scancode: int, action: int, mods: int) -> None:
+        if action == glfw.RELEASE:
+            self._down.pop(key, None)
+            return
+        name = key_name(key, scancode)
+        self._down[key] = name
+        # imgui adds its own event after this one
+        self._pressed.append(Press(chord(name, mods), action == glfw.REPEAT, next_event_id()))
+
+    def present(self) -> None:
+        glfw.swap_buffers(self.handle)
+
+    def rename(self, title: str) -> None:
+        glfw.set_window_title(self.handle, title)
+
+    def toggle_full_screen(self) -> None:
+        if self._windowed is not None:
+            no_monitor: Any = None
+            glfw.set_window_monitor(self.handle, no_monitor, *self._windowed, glfw.DONT_CARE)
+            self._windowed = None
+            return
+        monitor = glfw.get_primary_monitor()
+        if monitor:
+            self._windowed = (*glfw.get_window_pos(self.handle), *glfw.get_window_size(self.handle))
+            mode = glfw.get_video_mode(monitor)
+            glfw.set_window_monitor(
+                self.handle, monitor, 0, 0, mode.size.width, mode.size.height, mode.refresh_rate
+            )
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl+C in the terminal end a wait for events; Python alone would hear of it with the next event."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard, told = socket.socketpair()
+    told.setblocking(False)
+    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+
+    def listen() -> None:
+        while heard.recv(1):
+            glfw.post_empty_event()
+
+    listener = threading.Thread(target=listen, daemon=True)
+    listener.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        told.close()
+        listener.join()
+        heard.close()
+
+
+def key_name(key: int, scancode: int) -> str:
+    """The name of a glfw key in `controls`: letters as the layout has them, others by their place."""
+    place = _NAMES.get(key, "")
+    if len(place) == 1 and place.isalpha():
+        label = glfw.get_key_name(key, scancode) or ""
+        return label.upper() if label.isascii() and label.isalpha() else place
+    return place
+
+
+def chord(name: str, mods: int) -> str:
+    """A key with its modifiers, as in `controls.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
+    ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
+    held = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
+    return "".join(prefix for prefix, bit in held if mods & bit) + name
+
+
+class _GlfwLoader:
+    """What moderngl asks for the addresses of OpenGL's functions."""
+
+    def load_opengl_function(self, name: str) -> int:
+        return ctypes.cast(glfw.get_proc_address(name), ctypes.c_void_p).value or 0
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+
+def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
+    why = f" ({errors[-1]})" if errors else ""
+    return ProgdfError(f"{what}{why}; `progdf render` makes pictures without one")
+
+
+def _decoded(text: str | bytes) -> str:
+    return text.decode(errors="replace") if isinstance(text, bytes) else text
