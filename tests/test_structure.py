@@ -1,0 +1,220 @@
+"""The limits of the layout: packages, import cycles, the order of folders, sizes, what the wheel holds."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("progdf", "trainer", "viewer", "benchmarks")
+
+# What a package must not import: progdf ← trainer, progdf ← viewer, and nothing else.
+FORBIDDEN = {
+    "progdf": {"trainer", "viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle", "pyrr"},
+    "trainer": {"viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle", "pyrr"},
+    "viewer": {"trainer", "benchmarks", "diffusers", "transformers"},
+}
+ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all packages
+
+# Inside a package a folder, or a file beside the folders, imports only from those before it.
+ORDER = {
+    "progdf": """gaussians lens sh terminal errors region camera color metrics demo_scenes io rasterize
+        pixel_cells field formats gdf scene compose cli __init__ __main__""",
+    "trainer": """__init__ options store views presets editors segmenters setup regions optimize fit report
+        pipeline cli""",
+    "viewer": "__init__ camera gl state render files pictures ui panel app commands",
+    "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer recorded_runs viewer
+        field_network field_plot field __main__""",
+}
+
+MOST_FILES = 14
+MOST_LINES = 400
+# Still to be divided.
+FULL_FOLDERS = {"progdf/field", "progdf/rasterize"}
+LONG_FILES = {"viewer/state/workspace.py"}
+
+Graph = dict[str, set[str]]
+
+
+def source_files() -> list[Path]:
+    """All Python files of the packages, relative to the repository."""
+    return sorted(path.relative_to(ROOT) for name in PACKAGES for path in (ROOT / name).rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    parts = path.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def place(path: Path) -> str:
+    """The folder of a module inside its package, or the module itself beside the folders."""
+    return path.parts[1] if len(path.parts) > 2 else path.stem
+
+
+def imported_modules(source: str, module: str, is_package: bool) -> list[tuple[int, str]]:
+    """Line and absolute name of everything imported, but for what only type checkers import."""
+    found: list[tuple[int, str]] = []
+    home = module.split(".") if is_package else module.split(".")[:-1]
+
+    def visit(node: ast.AST) -> None:
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            return
+        if isinstance(node, ast.Import):
+            found.extend((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = home[: len(home) - node.level + 1] if node.level else []
+            base += [node.module] if node.module else []
+            found.extend((node.lineno, ".".join([*base, alias.name])) for alias in node.names)
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(source))
+    return found
+
+
+def import_graph(files: Mapping[Path, str]) -> Graph:
+    """Which module imports which, from paths and their source."""
+    names = {module_name(path) for path in files}
+    graph: Graph = {}
+    for path, source in files.items():
+        module = module_name(path)
+        targets = set()
+        for _, name in imported_modules(source, module, path.stem == "__init__"):
+            known = name if name in names else name.rpartition(".")[0]
+            if known in names and known != module:
+                targets.add(known)
+        graph[module] = targets
+    return graph
+
+
+def import_cycle(graph: Graph) -> list[str]:
+    """The modules of one import cycle, if there is any."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def forbidden_imports(source: str, package: str, where: str) -> list[str]:
+    """Imports in `source` that its package must not make, as `where:line imports module`."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            modules = [node.module or ""]
+        else:
+            continue
+        found += [
+            f"{where}:{node.lineno} imports {name}"
+            for name in modules
+            if name.split(".")[0] in FORBIDDEN[package]
+        ]
+    return found
+
+
+def upward_imports(package: str, order: list[str], files: Mapping[Path, str]) -> list[str]:
+    """Imports inside a package that go against its order, as `module imports module`."""
+    mine = {path: source for path, source in files.items() if path.parts[0] == package}
+    places = {module_name(path): place(path) for path in mine}
+    return [
+        f"{module} imports {target}"
+        for module, targets in import_graph(mine).items()
+        for target in sorted(targets)
+        if order.index(places[target]) > order.index(places[module])
+    ]
+
+
+@pytest.fixture(scope="module")
+def sources() -> dict[Path, str]:
+    return {path: (ROOT / path).read_text(encoding="utf-8") for path in source_files()}
+
+
+@pytest.mark.parametrize("package", sorted(FORBIDDEN))
+def test_no_package_imports_one_it_must_not_know(package: str, sources: dict[Path, str]) -> None:
+    offending = [
+        line
+        for path, source in sources.items()
+        if path.parts[0] == package and ROOT / path != ENTRY_POINT
+        for line in forbidden_imports(source, package, path.as_posix())
+    ]
+    assert not offending, "\n".join(offending)
+
+
+def test_the_test_of_packages_names_a_forbidden_import() -> None:
+    assert forbidden_imports("import viewer.app.app\n", "trainer", "trainer/x.py") == [
+        "trainer/x.py:1 imports viewer.app.app"
+    ]
+    assert forbidden_imports("def f():\n    from trainer import pgs\n", "viewer", "viewer/y.py")
+
+
+def test_no_modules_import_each_other_in_a_circle(sources: dict[Path, str]) -> None:
+    cycle = import_cycle(import_graph(sources))
+    assert not cycle, " → ".join(cycle)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_folders_import_one_way(package: str, sources: dict[Path, str]) -> None:
+    order = ORDER[package].split()
+    found = {place(path) for path in sources if path.parts[0] == package}
+    assert found == set(order), f"the order of {package} names other folders and files than there are"
+    upward = upward_imports(package, order, sources)
+    assert not upward, "\n".join(upward)
+
+
+def test_the_tests_of_imports_see_cycles_and_upward_imports() -> None:
+    files = {
+        Path("progdf/a/one.py"): "from progdf.b.two import x\n",
+        Path("progdf/b/two.py"): "def f():\n    from ..a import one\n",
+        Path("progdf/b/three.py"): "if TYPE_CHECKING:\n    from progdf.c.four import y\n",
+        Path("progdf/c/four.py"): "from progdf.b import three\n",
+    }
+    assert set(import_cycle(import_graph(files))) == {"progdf.a.one", "progdf.b.two"}
+    assert upward_imports("progdf", ["b", "a", "c"], files) == ["progdf.b.two imports progdf.a.one"]
+
+
+def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str]) -> None:
+    files = Counter(path.parent.as_posix() for path in sources)
+    shaders = Counter(path.parent.as_posix() for path in (ROOT / "shaders").rglob("*.*"))
+    full = {folder for folder, count in (files + shaders).items() if count > MOST_FILES}
+    assert full == FULL_FOLDERS, f"more than {MOST_FILES} files: {sorted(full)}"
+
+
+def test_no_file_is_longer_than_one_reads_in_a_sitting(sources: dict[Path, str]) -> None:
+    lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
+    long = {name for name, lines in lengths.items() if lines > MOST_LINES}
+    assert long == LONG_FILES, f"more than {MOST_LINES} lines: {sorted(long)}"
+
+
+def test_the_wheel_holds_what_is_used_and_the_sdist_what_is_read() -> None:
+    targets = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
+    assert targets["wheel"]["packages"] == ["progdf", "viewer", "trainer", "shaders"]
+    assert {"benchmarks", "tests", "assets", "README.md", "LICENSE"} <= set(targets["sdist"]["include"])
+
+
+def test_progdf_and_trainer_load_no_window_system() -> None:
+    code = (
+        "import sys, pkgutil, importlib, progdf, trainer\n"
+        "for package in (progdf, trainer):\n"
+        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        if not module.name.endswith('__main__'): importlib.import_module(module.name)\n"
+        f"print(sorted({{name.split('.')[0] for name in sys.modules}} & {FORBIDDEN['trainer']!r}))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "[]"
+
+
+def test_importing_progdf_does_not_compile_or_load_kernels() -> None:
+    code = "import sys, progdf; print('numba' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert run.stdout.strip() == "False", run.stderr
