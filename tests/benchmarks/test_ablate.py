@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 import benchmarks.ablation.ablate
+from benchmarks.__main__ import ablate as ablate_command
 from benchmarks.ablation.ablate import ablate
 from benchmarks.ablation.options import AblateOptions
 from benchmarks.ablation.setup import run_options
@@ -23,7 +24,6 @@ from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, write_bear
-from trainer import cli
 from trainer.options import TrainOptions, settled
 from trainer.pipeline.reopen import reopened
 from trainer.pipeline.run import train
@@ -123,7 +123,7 @@ def test_variants_of_the_slider_share_one_optimisation_and_end_alike(run: Path) 
     assert linear["between"] != base["between"]
     assert by_time["between"] == base["between"], "judged where each shows it"
     assert by_time["uniformity"] < base["uniformity"]
-    assert "going on at step 12 of 12" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
+    assert "going on at step 25 of 25" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
     assert "going on" not in (run / "ablation/one-target/log.txt").read_text(encoding="utf-8")
 
 
@@ -182,7 +182,7 @@ def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch
 def test_what_is_no_finished_run_is_one_line(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ProgdfError, match="give a folder that progdf train finished"):
-            cli.ablate([str(folder)])
+            ablate_command([str(folder)])
     assert not list(tmp_path.iterdir())
 
 
@@ -190,7 +190,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmarks.ablation.ablate, "trained", _nothing_trains)
-    assert cli.ablate([str(run), "--only", "base", "--threads", "1"]) == 0
+    assert ablate_command([str(run), "--only", "base", "--threads", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
     assert any(line.startswith("2-keyframes ") for line in lines)

@@ -173,7 +173,7 @@ def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
 
 KILLED = """
 import os, signal, sys
-from progdf.files import is_temporary, written_whole
+from progdf.io.atomic import is_temporary, written_whole
 with written_whole(sys.argv[1]) as beside:
     beside.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)

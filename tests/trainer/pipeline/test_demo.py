@@ -67,7 +67,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Se
         opened.append(command)
         return SimpleNamespace(returncode=3)
 
-    monkeypatch.setattr(trainer.run, "train", train)
+    monkeypatch.setattr(trainer.pipeline.run, "train", train)
     monkeypatch.setattr(subprocess, "run", run)
     return opened
 
@@ -179,7 +179,7 @@ def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
             raise KeyboardInterrupt("--resume")
 
     here = {"scarf": "finished", "gold": "stopped", "frost": "nothing"}
-    monkeypatch.setattr(trainer.run, "train", train)
+    monkeypatch.setattr(trainer.pipeline.run, "train", train)
     monkeypatch.setattr(trainer.pipeline.resume, "found", lambda options: here[options.out.name])
     arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
     with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
@@ -187,7 +187,7 @@ def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
     assert asked == [("scarf", True), ("gold", True)]
     here["gold"] = "nothing"
     monkeypatch.setattr(
-        trainer.run, "train", lambda options: asked.append((options.out.name, options.resume))
+        trainer.pipeline.run, "train", lambda options: asked.append((options.out.name, options.resume))
     )
     with pytest.raises(ProgdfError):  # this training writes nothing
         demo.main(arguments)

@@ -80,7 +80,7 @@ def test_ctrl_c_before_the_optimisation_is_kept_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.run, "edited_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(trainer.pipeline.run, "edited_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt, match="--resume"):
             train(small_run(bear_folder), quiet=True)
     gone_on(bear_folder, uninterrupted)
@@ -139,7 +139,7 @@ def test_views_that_are_edited_are_not_edited_again(
     def make_editor(*_: object) -> None:
         raise AssertionError("edited again")
 
-    monkeypatch.setattr(trainer.run, "make_editor", make_editor)
+    monkeypatch.setattr(trainer.pipeline.run, "make_editor", make_editor)
     gone_on(bear_folder, uninterrupted)
 
 
@@ -150,7 +150,7 @@ def test_the_region_is_not_looked_for_again(
     def parse_region(*_: object) -> None:
         raise AssertionError("looked for again")
 
-    monkeypatch.setattr(trainer.run, "parse_region", parse_region)
+    monkeypatch.setattr(trainer.pipeline.run, "parse_region", parse_region)
     gone_on(bear_folder, uninterrupted)
 
 
@@ -171,7 +171,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = small_run(bear_folder, kind="geometry", group_steps=8, steps=16)
-    monkeypatch.setattr(trainer.run, "finished", lambda *_: None)
+    monkeypatch.setattr(trainer.pipeline.run, "finished", lambda *_: None)
     train(options, quiet=True)
     expected = (OUT / "trajectory.safetensors").read_bytes()
     shutil.rmtree(OUT)

@@ -154,7 +154,7 @@ def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
 PEAKS = """
 import resource
 from pathlib import Path
-from trainer.memory import PeakMemory
+from trainer.store.memory import PeakMemory
 memory = PeakMemory()
 block = bytearray(128 << 20)
 memory.end("large")

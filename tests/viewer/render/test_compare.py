@@ -17,7 +17,7 @@ from progdf.__main__ import main
 from progdf.metrics.image import psnr
 from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.pictures import compare_view as compare
+from viewer.state import comparison as compare
 from viewer.state.view_state import Comparison, ViewState
 
 

@@ -24,8 +24,8 @@ from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.stacks import recording_of
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.pictures import compare_labels
-from viewer.pictures import compare_view as compare
 from viewer.render.engine import Engine
+from viewer.state import comparison as compare
 from viewer.state import recordings
 from viewer.state.recordings import Recording
 from viewer.state.view_state import Comparison, ViewState

@@ -10,7 +10,8 @@ import torch
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from tests.helpers.ui_rig import bear
-from viewer.commands import arguments, render
+from viewer.commands import render
+from viewer.files import document
 from viewer.render import threads
 
 
@@ -28,7 +29,7 @@ def test_a_command_draws_on_one_thread_and_reads_edits_on_all(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(threads, "_MOST", 3)
-    monkeypatch.setattr(arguments, "load_gdf", reading)
+    monkeypatch.setattr(document, "load_gdf", reading)
     monkeypatch.setattr(render.Engine, "image", drawing)
     before = torch.get_num_threads()
     scene, edit, *_ = bear().save(tmp_path)
