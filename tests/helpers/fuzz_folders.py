@@ -40,7 +40,7 @@ FILES_OF_RUNS = {
     "resume run.json": "state/run.json",
     "resume training": "state/training.safetensors",
     "resume region": "state/region.safetensors",
-    "resume recordings": "state/recordings/000001.safetensors",
+    "resume recordings": "state/recordings/000000.safetensors",
     "fit trajectory": "trajectory.safetensors",
     "fit cameras": "cameras.json",
     "fit report": "report.json",

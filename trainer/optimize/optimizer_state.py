@@ -9,15 +9,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import msgspec
 import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
+from progdf.io.json_values import typed
 from trainer.store.state import Saved, generator
 
 from .objective import TermMeans
 
 _ROWS = ("moved", "previous", "average", "first", "second")
+
+
+class _Values(msgspec.Struct):
+    """What `PgsState.saved` gives beside tensors."""
+
+    step: int
+    stage: int
+    local: int
+    recorded: int
+    running: float | None
+    means: dict[str, tuple[float, int]]
+    queue: list[int]
 
 
 class PgsState:
@@ -118,13 +132,13 @@ class PgsState:
 
     def restore(self, saved: Saved) -> None:
         """See `state.Resumable`."""
-        tensors, values = saved.tensors, saved.values
+        tensors, values = saved.tensors, typed(saved.values, _Values)
         with torch.no_grad():
             for name in _ROWS:
                 getattr(self, name).copy_(tensors[name])
         self.pictures = [tensors[f"picture{i}"] for i in range(sum(k.startswith("picture") for k in tensors))]
-        self.step, self.stage, self.local = values["step"], values["stage"], values["local"]
-        self.recorded = values["recorded"]
-        self.running = math.nan if values["running"] is None else values["running"]
-        self.means.sums = {name: (total, count) for name, (total, count) in values["means"].items()}
-        self._order, self._queue = generator(tensors["order"]), list(values["queue"])
+        self.step, self.stage, self.local = values.step, values.stage, values.local
+        self.recorded = values.recorded
+        self.running = math.nan if values.running is None else values.running
+        self.means.sums = dict(values.means)
+        self._order, self._queue = generator(tensors["order"]), list(values.queue)

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import msgspec
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.io.json_values import typed
 from progdf.scene.bounds import scene_sphere
 from trainer.editors.base import EditKind
 from trainer.fit.network import begin_alongside, keep
@@ -63,16 +65,26 @@ class Recording:
     means: Mapping[str, float]
 
 
+class _Values(msgspec.Struct):
+    """What is saved of a recording beside its offsets."""
+
+    step: int
+    stage: int
+    ends_stage: bool
+    means: dict[str, float]
+
+
 class Recordings:
     """All recordings so far, a `state.Resumable`: each is written once, to a file of its own.
 
     Args:
         folder: where
+        shape: of the offsets
     """
 
-    def __init__(self, folder: StateFolder) -> None:
+    def __init__(self, folder: StateFolder, shape: torch.Size) -> None:
         self.made: list[Recording] = []
-        self._folder, self._written = folder, 0
+        self._folder, self._shape, self._written = folder, shape, 0
 
     def add(self, found: Snapshot) -> None:
         """Keep one."""
@@ -94,7 +106,13 @@ class Recordings:
         found = [self._folder.load("recordings", index) for index in range(self._written)]
         if None in found:
             raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
-        self.made = [Recording(offsets=kept.tensors["offsets"], **kept.values) for kept in found if kept]
+        self.made = [self._read(kept) for kept in found if kept]
+
+    def _read(self, kept: Saved) -> Recording:
+        values, offsets = typed(kept.values, _Values), kept.tensors["offsets"]
+        if offsets.shape != self._shape or offsets.dtype != torch.float16:
+            raise ValueError("a recording is of other members")
+        return Recording(values.step, values.stage, values.ends_stage, offsets, values.means)
 
 
 def trained(
@@ -152,7 +170,7 @@ def trained(
         with log.stage("weights"):
             solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
 
-    state, recordings = PgsState(original, settings.seed), Recordings(folder)
+    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     beside = begin_alongside(options, stand, settings.rates, stages)
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
     kept = Autosave(folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every)

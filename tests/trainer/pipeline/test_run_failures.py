@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from dataclasses import replace
@@ -13,6 +14,7 @@ import torch
 import trainer.optimize.pgs
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.io.tensors import read_tensors, write_tensors
 from tests.helpers.full_disk import files_up_to
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
@@ -105,6 +107,19 @@ def test_two_runs_in_one_folder_are_refused(bear_folder: Path) -> None:
     OUT.mkdir()
     with locked(RunFolder(OUT)), pytest.raises(ProgdfError, match="being trained by another process; "):
         train(small_run(bear_folder), quiet=True)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_values_of_another_type_are_a_damaged_state(bear_folder: Path) -> None:
+    """Signed as if they had been saved."""
+    path = OUT / "state" / "training.safetensors"
+    mapped, metadata = read_tensors(path)
+    tensors = {name: tensor.clone() for name, tensor in mapped.items()}
+    values = json.loads(metadata["values"])
+    values["pgs"]["means"] = {"l1": ["0.5", 1]}
+    write_tensors(path, tensors, {"values": json.dumps(values)}, checksum=True)
+    with pytest.raises(ProgdfError, match=r"training\.safetensors is damaged .*; delete .*state and train"):
+        train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
 @pytest.mark.parametrize("part", ["run.json", "training.safetensors", "recordings/000001.safetensors"])
