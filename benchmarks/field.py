@@ -31,6 +31,7 @@ from .courses import KnownCourse, edit_of, known_course, milliseconds
 from .field_forms import Form, baked_forms
 from .field_network import STEPS, network_forms
 from .field_plot import draw_forms
+from .position_floor import floor_table
 from .table import Table
 
 EDITS = ("gold", "stripes", "big ears")
@@ -49,17 +50,14 @@ def tables(recorded: Sequence[KnownCourse] = (), plot: Path | None = None) -> li
     scene = bear(BEAR)
     edits = bear_edits(scene)
     cameras = [camera.resized(SIDE, SIDE) for camera in scene.cameras]
-    forms: list[Form] = []
-    for name in EDITS:
-        course = known_course(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS)
-        forms += [*baked_forms(course), *network_forms(course)]
-    for course in recorded:
-        forms += [*baked_forms(course), *network_forms(course)]
+    known = [known_course(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS) for name in EDITS]
+    courses = [*known, *recorded]
+    forms = [form for course in courses for form in (*baked_forms(course), *network_forms(course))]
     if plot is not None:
         with written_whole(plot) as beside:
             drawn = draw_forms(forms).quantize(128, kmeans=3, dither=Image.Dither.NONE)
             drawn.save(beside, format="PNG", optimize=True)
-    return [field_table(forms), _compose_table()]
+    return [field_table(forms), floor_table(courses), _compose_table()]
 
 
 def field_table(forms: Sequence[Form]) -> Table:

@@ -196,11 +196,6 @@ class TrainOptions:
     bytes_budget: float | None = None
     """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
     PSNR. Not for neural."""
-    refine: bool = False
-    """auto, separable: fit the coefficients to pictures as well, for up to 1.6 dB and some 10 s."""
-    drop_invisible: bool = False
-    """Leave out members that no view shows: they keep their old looks and save 0 to 6 % of the
-    bytes. Not for neural."""
     quick: bool = False
     """A draft in a third of the time: 240 steps in 4 stages, 12 views."""
     seed: int = 0
@@ -245,11 +240,6 @@ class FitOptions:
     bytes_budget: float | None = None
     """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
     PSNR. Not for neural."""
-    refine: bool = False
-    """auto, separable: fit the coefficients to pictures as well, for up to 1.6 dB and some 10 s."""
-    drop_invisible: bool = False
-    """Leave out members that no view shows: they keep their old looks and save 0 to 6 % of the
-    bytes. Not for neural."""
     scene: Path | None = None
     """Where the scene is now, if it has moved since the run."""
     text_before: str = ""
@@ -363,10 +353,6 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
         option = "--" + name.replace("_", "-")
         if options.field != "neural" and getattr(options, name, default) != default:
             raise ProgdfError(f"{option} means nothing to --field {options.field}; add --field neural")
-    if options.refine and options.field not in ("auto", "separable"):
-        raise ProgdfError(f"--refine means nothing to --field {options.field}; leave it out")
-    if options.drop_invisible and options.field == "neural":
-        raise ProgdfError("--drop-invisible means nothing to --field neural; leave one out")
     if options.bytes_budget is not None:
         if options.field in ("neural", "lossless"):
             raise ProgdfError(f"--bytes-budget means nothing to --field {options.field}; leave one out")

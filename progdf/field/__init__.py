@@ -6,7 +6,6 @@ from .bake import NeuralForm, baked_neural
 from .baked import AttributeBases, BakedField
 from .choose import Choice, choose_field
 from .evaluate import Candidate, FieldJudge
-from .floor import PositionFloor, position_floor
 from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
 from .neural_fit import NeuralSettings, fit_neural
@@ -21,12 +20,10 @@ __all__ = [
     "NeuralField",
     "NeuralForm",
     "NeuralSettings",
-    "PositionFloor",
     "baked_neural",
     "choose_field",
     "fit_keyframes",
     "fit_lossless",
     "fit_neural",
     "fit_separable",
-    "position_floor",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -19,7 +19,6 @@ from .baked import BakedField
 from .evaluate import Candidate, FieldJudge, sample_strengths
 from .keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
 from .ranks import emphasised_modes, expected_worst, grown_ranks
-from .refine import refined
 from .rendered import Render, RenderedCourses, picture_gram, rendered_courses
 from .separable import channel_weights, check_trajectory, leading_modes, moving_attributes, stored_attribute
 
@@ -74,7 +73,6 @@ def choose_field(
     budget: float | None = None,
     judge: FieldJudge | None = None,
     recorded: Sequence[float] | None = None,
-    refine: bool = False,
 ) -> Choice:
     """The smallest field whose worst PSNR against the trajectory reaches the target, or the best in a budget.
 
@@ -88,7 +86,6 @@ def choose_field(
         budget: most bytes a member; None is as many as it takes
         judge: has the last word, best on views that `render` does not show; None judges on `render`
         recorded: strengths for the slider's ticks; `strengths` when None
-        refine: try what `refine.refined` makes of a separable choice, and keep it if that is better
 
     Returns:
         The choice; where nothing reaches the target within the budget, the best there is, with `met` false.
@@ -115,17 +112,7 @@ def choose_field(
         limit = min([budget or math.inf, *(c.field.bytes_per_member for c in tried if c.worst >= target)])
         gram = picture_gram(offsets, render) if gram is None else gram
         tried += _keyframes(strengths, offsets, gram, target, limit, judge, recorded, curves=kind != "auto")
-    choice = _chosen(tuple(tried), target, budget)
-    if not refine or choice.best.field.kind != "separable":
-        return choice
-    label = f"{choice.best.label}, refined"
-    better = judge.candidate(refined(choice.best.field, offsets, render), label)
-    tried.append(better)
-    if better.worst <= choice.best.worst:
-        return replace(choice, tried=tuple(tried), why=f"{choice.why}; refining it gains nothing")
-    met = choice.met or (better.worst >= target and better.field.bytes_per_member <= (budget or math.inf))
-    gain = better.worst - choice.best.worst
-    return Choice(better, met, tuple(tried), f"{choice.why}; refining it gains {gain:.1f} dB")
+    return _chosen(tuple(tried), target, budget)
 
 
 def _chosen(tried: tuple[Candidate, ...], target: float, budget: float | None) -> Choice:

@@ -44,7 +44,7 @@ def test_the_field_table_names_error_bytes_and_time_and_the_plot_is_written(
         bench_network, "NETWORKS", (("neural, tiny", NeuralSettings("tiny", "position", batch=16)),)
     )
     monkeypatch.setattr(bench_network, "PAPER", NeuralSettings("small", "position"))
-    fields, steps = bench_field.tables(plot=tmp_path / "pareto.png")
+    fields, floor, steps = bench_field.tables(plot=tmp_path / "pareto.png")
     labels = [row[1] for row in fields.rows]
     assert {"2 keyframes, float32", "4 keyframes, int8", "joint SVD, rank 2", "neural, tiny"} < set(labels)
     assert any(label.startswith("auto at 40 dB") for label in labels)
@@ -52,6 +52,7 @@ def test_the_field_table_names_error_bytes_and_time_and_the_plot_is_written(
     assert fields.rows[-1][4] == fields.rows[-1][6] == "-"
     assert fields.rows[-1][-1] == "1.0×"
     assert "tilted ears +" in fields.note or "tilted ears -" in fields.note
+    assert [row[0] for row in floor.rows] == ["tilted ears"]
     assert steps.rows[0][-1] == "0"
     with Image.open(tmp_path / "pareto.png") as picture:
         assert picture.width > 900

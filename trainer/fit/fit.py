@@ -53,7 +53,6 @@ def fit_field(
     kind: Kind,
     target_psnr: float,
     budget: float | None = None,
-    refine: bool = False,
 ) -> Fitted:
     """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target, or the best one.
 
@@ -65,7 +64,6 @@ def fit_field(
         kind: "auto" tries separable and keyframe fields, the others only their kind
         target_psnr: dB; where none reaches it, the best is kept and `met` is false
         budget: bytes a member; the best field within it is kept, whatever the target is
-        refine: see `choose_field`
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
@@ -81,7 +79,6 @@ def fit_field(
         budget,
         judge=errors,
         recorded=ticks,
-        refine=refine,
     )
     baselines = _baselines(trajectory, offsets, errors)
     return Fitted(choice.best, choice.met, choice.tried, baselines, choice.why)
@@ -150,7 +147,7 @@ def visibility(
     and weighting each number by the gradient of pictures on top of that costs up to 3 dB (scarf at 72 bytes
     46.8 dB instead of 48.9, hands at 65 bytes 52.8 instead of 56.2; a robot at 162 bytes 38.5 both ways).
 
-    Members that no picture shows stay in the region unless one asks for less (`trainer.fit.active`).
+    Members that no picture shows stay in the region: leaving them out saves 0 to 6 % of the bytes.
     """
     total = torch.zeros(len(members))
     for view in views:

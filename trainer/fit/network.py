@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field import BakedField, NeuralSettings, PositionFloor, baked_neural, position_floor
+from progdf.field import BakedField, NeuralSettings, baked_neural
 from progdf.field.evaluate import FieldJudge
 from progdf.field.neural import Inputs, NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
@@ -49,28 +49,20 @@ class NetworkFit:
 
     Args:
         field: baked, with the network as its origin
-        floor: what the members' places tell of the edit
         unbaked: PSNR of the network's own answers over the slider, its ends not pinned, dB
     """
 
     field: BakedField
-    floor: PositionFloor
     unbaked: tuple[float, ...]
 
     def figures(self) -> dict[str, Any]:
         """For report.json."""
         curve, form = self.unbaked, self.field.origin
         assert form is not None
-        floor = {k: round(v, 3) for k, v in self.floor.unpredictable.items()}
         return {
             "unbaked": {"psnr_mean": round(sum(curve) / len(curve), 2), "psnr_worst": round(min(curve), 2)},
             "bake_error": dict(form.error or {}),
             "baked_bytes_per_gaussian": round(self.field.baked_bytes_per_member, 1),
-            "position_floor": {
-                "unpredictable": floor,
-                "psnr_mean": round(self.floor.psnr_mean, 2),
-                "psnr_worst": round(self.floor.psnr_worst, 2),
-            },
         }
 
 
@@ -175,7 +167,6 @@ def fit_network(
     errors = FieldJudge(trajectory.s, offsets, judge.counted)
     return NetworkFit(
         baked_neural(network, rows, trajectory.at, judge.counted),
-        position_floor(trajectory.s, offsets, rows[:, :3], weights, errors),
         errors.curve(network.bound(rows)),
     )
 

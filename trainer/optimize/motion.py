@@ -31,10 +31,6 @@ class Motion:
     log_scale: Tensor
     turn: Tensor
 
-    def detached(self) -> Motion:
-        """The same numbers without their history."""
-        return Motion(self.shift.detach(), self.log_scale.detach(), self.turn.detach())
-
 
 @dataclass(frozen=True)
 class Parts:

@@ -2,7 +2,7 @@
 
 Nothing pulls at a member that is out of every view's sight, so it keeps its old colour: white spots in a room
 at night, for whoever looks where no camera stood. Its neighbours along the surface, of the same colour, know
-what the edit does there (see `neighbours.surface_likeness`).
+what the edit does there (see `surface.surface_likeness`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from progdf.gaussians import Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
-from trainer.regions.neighbors import surface_likeness
+from trainer.regions.surface import surface_likeness
 from trainer.setup.training_setup import Stand
 from trainer.views.view import View
 

@@ -17,7 +17,6 @@ from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import decode_json
-from trainer.fit.active import Dropped, dropped_of
 from trainer.fit.evaluate import Judge, make_judge
 from trainer.fit.evenness import evened
 from trainer.fit.fit import expected_looks, fit_field, judged_field, visibility
@@ -69,7 +68,6 @@ def finished(
     """Fit, measure, and write NAME.gdf, report.json and report.png. `begun`: see `network.fit_network`."""
     options = about["options"]
     scene, region = stand.scene, stand.region
-    dropped: Dropped | None = None
     with log.stage("fit"):
         judge = kept_judge(folder, stand, stand.held_out, trajectory)
         few = stand.train[:: max(1, len(stand.train) // _RANK_VIEWS)][:_RANK_VIEWS]
@@ -82,7 +80,6 @@ def finished(
         else:
             network = None
             target, budget = options["target_psnr"], options.get("bytes_budget")
-            refine = options.get("refine", False)
             with log.looks("fit the field", expected_looks(trajectory, choice)) as looked:
                 fitted = fit_field(
                     trajectory,
@@ -92,12 +89,7 @@ def finished(
                     choice,
                     target,
                     budget,
-                    refine,
                 )
-            if options.get("drop_invisible", False):
-                dropped = dropped_of(stand, trajectory, judge, fitted)
-                fitted = dropped.fitted
-                log.say(dropped.line())
     with log.stage("even"):
         slider = slider_meant(options.get("slider", "stages"), options["editor"], trajectory.strengths)
         field, dial = fitted.chosen.field, same()
@@ -121,18 +113,13 @@ def finished(
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
             watched = replace(judge, looked=looked)
             measured = measure(watched, trajectory, fitted, field, dial, perceptual, clip)
-        end = end_rows(stand, trajectory)
-        if dropped is not None:
-            region, field, end = dropped.region(region), dropped.field(field), end[dropped.kept]
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
-        endpoint, outside = exactness(scene, gdf, end)
+        endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
         title = f"{options['name']}: {options['editor']}"
         picture = report_picture(judge, measured, about["losses"], title)
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
-    if dropped is not None:
-        measures["field"]["dropped"] = dropped.figures()
     report = {
         **measures,
         "trajectory": {

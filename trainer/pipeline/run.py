@@ -327,7 +327,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         said = {"text_before": options.text_before, "text_after": options.text_after}
         said = {name: text for name, text in {**said, "clip_model": options.clip_model}.items() if text}
         network = {name: getattr(options, name) for name in NETWORK_OPTIONS if name != "fit"}
-        asked = ("target_psnr", "bytes_budget", "refine", "drop_invisible")
+        asked = ("target_psnr", "bytes_budget")
         aims = {name: getattr(options, name) for name in asked}
         now = {"field": options.field, "fit": "after", **aims, **network, **said}
         about = {**run.about, "options": {**run.about["options"], **now}}

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from progdf.formats.load_report import counted
 from progdf.gaussians import Gaussians
+from progdf.scene.neighbors import nearest_rows
 
 FEW = 8
 """Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""
@@ -59,7 +59,7 @@ def without_strays(
     if not bool(twice.any()):
         return twice
     rows = twice.nonzero()[:, 0]
-    piece = _pieces(scene.means[rows].numpy())
+    piece = _pieces(scene.means[rows])
     sizes = np.bincount(piece)
     # what two masks hold counts, not what one view alone shows: a tree may be larger than the bear
     sure = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
@@ -93,28 +93,27 @@ def holes_of(
     inner = means[member]
     low, high = inner.amin(dim=0), inner.amax(dim=0)
     inside = ((means >= low) & (means <= high)).all(dim=1)
-    rows = (inside & ~member & (views_outside < 2)).nonzero()[:, 0].numpy()
+    rows = (inside & ~member & (views_outside < 2)).nonzero()[:, 0]
     if not len(rows):
-        return torch.zeros(0, dtype=torch.int64)
-    count = min(_AROUND + 1, len(means))
-    near = cKDTree(means.numpy()).query(means.numpy()[rows], k=count)[1].reshape(len(rows), -1)[:, 1:]
-    filled = member.numpy().copy()
+        return rows
+    near, _ = nearest_rows(means, rows, _AROUND)
+    filled = member.clone()
     for _ in range(_ROUNDS):
-        filled[rows[filled[near].mean(axis=1) >= _FILLED]] = True
-    holes = torch.from_numpy(np.flatnonzero(filled & ~member.numpy()))
+        filled[rows[filled[near].double().mean(dim=1) >= _FILLED]] = True
+    holes = (filled & ~member).nonzero()[:, 0]
     _tell(say, len(holes), "in holes of it, added")
     return holes
 
 
-def _pieces(points: np.ndarray) -> np.ndarray:
+def _pieces(points: Tensor) -> np.ndarray:
     """Which connected piece each point belongs to. [P,3] -> [P] int"""
-    count = min(_LINKS + 1, len(points))
+    count = len(points)
     if count < 2:
-        return np.zeros(len(points), np.int64)
-    apart, near = cKDTree(points).query(points, k=count)
-    held = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
-    first = np.broadcast_to(np.arange(len(points))[:, None], near.shape)[held]
-    links = coo_matrix((np.ones(len(first), np.bool_), (first, near[held])), (len(points), len(points)))
+        return np.zeros(count, np.int64)
+    near, apart = nearest_rows(points, torch.arange(count), _LINKS)
+    linked = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
+    first, second = torch.arange(count)[:, None].expand_as(near)[linked], near[linked]
+    links = coo_matrix((np.ones(len(first), np.bool_), (first.numpy(), second.numpy())), (count, count))
     pieces: np.ndarray = connected_components(links, directed=False)[1]
     return pieces
 

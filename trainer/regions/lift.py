@@ -16,7 +16,7 @@ from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.region import Region
 
 from .few_masks import FEW, holes_of, without_strays
-from .neighbors import surface_vote
+from .surface import surface_vote
 
 Rule = Literal["share", "count", "paper"]
 
@@ -115,7 +115,7 @@ def lift_masks(
     Returns:
         The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
         is the rule's for Gaussians that the views decide; for the others it tells how much of the surface
-        around them belongs to the members (see `neighbours.surface_vote`), half of it being the threshold.
+        around them belongs to the members (see `surface.surface_vote`), half of it being the threshold.
         Where the views decide on no member there is none.
 
     Intersection over union with the exact labels, mean and worst of the seven parts of the demo bear (24 000

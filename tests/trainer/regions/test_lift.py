@@ -11,12 +11,13 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.demo_scenes import DemoScene, bear
 from progdf.gaussians import Gaussians
+from progdf.scene.neighbors import nearest_rows
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, random_gaussians
 from tests.helpers.trained import label_mask
 from trainer.regions import lift
 from trainer.regions.lift import Evidence, gather, lift_masks, score
-from trainer.regions.neighbors import nearest_rows, surface_vote
+from trainer.regions.surface import surface_vote
 
 WALL = 15
 

@@ -1,17 +1,17 @@
-"""Neighbours among splats: the nearest ones, and which of them lie on the same surface."""
+"""Which neighboring splats lie on the same surface, and how they vote on what no view shows."""
 
 from __future__ import annotations
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.rasterize.threads import threads
 from progdf.scene.bounds import normals_of
+from progdf.scene.neighbors import nearest_rows
 from progdf.sh import sh0_to_rgb
 
-_NEIGHBOURS = 96
+_NEIGHBORS = 96
 _ROUNDS = 100
 
 # Standard deviations within one surface. The bear's parts lift back with IoU .977-.999, the worst without the
@@ -22,29 +22,6 @@ _ALONG, _OFF_PLANE = 2.0, 0.5
 _TURN = 0.18  # radians between the normals
 _COLOUR = 0.16  # sRGB, length of the difference
 _SIZE = 0.25  # natural logarithm of the three scales, length of the difference
-
-
-def nearest_rows(points: Tensor, rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The k nearest other points of some of the points, exactly.
-
-    Args:
-        points: all points, finite. [N,3]
-        rows: those whose neighbours are wanted. [Q] int64
-        k: how many, 1..N−1; fewer where there are not as many points
-
-    Returns:
-        Their rows, nearest first, [Q,k] int64; their distances [Q,k].
-    """
-    k = min(k, len(points) - 1)
-    tree = cKDTree(points.double().numpy())
-    distances, found = tree.query(points[rows].double().numpy(), k + 1, workers=threads())
-    dropped = found == rows.numpy()[:, None]
-    dropped[~dropped.any(axis=1), -1] = True  # more points than k in its own place, and it is not among them
-    others = ~dropped
-    return (
-        torch.from_numpy(found[others].reshape(len(rows), k)),
-        torch.from_numpy(distances[others].reshape(len(rows), k)).float(),
-    )
 
 
 def surface_vote(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
@@ -76,8 +53,8 @@ def surface_likeness(scene: Gaussians, rows: Tensor) -> tuple[Tensor, Tensor]:
 
     The likelihoods of each add up to 1; see `surface_vote` for what they go by.
     """
-    near, distances = nearest_rows(scene.means, rows, _NEIGHBOURS)
-    return near, _likeness(scene, rows, near, distances)
+    near, distances = nearest_rows(scene.means, rows, _NEIGHBORS, threads())
+    return near, _likeness(scene, rows, near, distances.float())
 
 
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:

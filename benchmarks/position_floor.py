@@ -1,46 +1,48 @@
 """How much of an edit a Gaussian's place tells: the floor of fields that see nothing but positions.
 
 Two Gaussians at one place cannot move differently in such a field, however large its network is. What the
-nearest neighbours do is the best guess that the place allows; a network that is given the time gets there,
+nearest neighbors do is the best guess that the place allows; a network that is given the time gets there,
 and beyond it only by learning its members by heart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from .evaluate import FieldJudge
-from .separable import channel_weights, check_trajectory, moving_attributes
+from progdf.field.evaluate import FieldJudge
+from progdf.field.separable import channel_weights, check_trajectory, moving_attributes
+from progdf.scene.neighbors import nearest_rows
 
-NEIGHBOURS = (1, 2, 4, 8, 16)
+from .courses import KnownCourse
+from .table import Table
 
-_MOST_DISTANCES = 1 << 24  # at a time, 64 MB
+NEIGHBORS = (1, 2, 4, 8, 16)
 
 
 @dataclass(frozen=True)
 class PositionFloor:
-    """What the neighbours of a Gaussian tell of its movement.
+    """What the neighbors of a Gaussian tell of its movement.
 
     Args:
         unpredictable: share of the movement, about its mean, that they do not tell, by attribute; 0..1, 1
             where they are no help at all
-        neighbours: how many of them tell most
-        psnr_mean, psnr_worst: of the movement that they foretell against the recorded one, over the slider,
+        neighbors: how many of them tell most
+        psnr_mean, psnr_worst: of the movement that they predict against the recorded one, over the slider,
             dB; NaN where no judge was given
     """
 
     unpredictable: Mapping[str, float]
-    neighbours: int
+    neighbors: int
     psnr_mean: float
     psnr_worst: float
 
 
-class _Foretold:
-    """Every member moves as its neighbours do on average; a `judge.Field`."""
+class _Predicted:
+    """Every member moves as its neighbors do on average; an `evaluate.Field`."""
 
     def __init__(self, strengths: Tensor, offsets: Tensor, nearest: Tensor, attributes: list[str]) -> None:
         self.attributes = attributes
@@ -51,7 +53,7 @@ class _Foretold:
         right = int(torch.searchsorted(self._strengths, torch.tensor(s)).clamp(1, len(self._strengths) - 1))
         low, high = float(self._strengths[right - 1]), float(self._strengths[right])
         share = (s - low) / (high - low)
-        return _told(torch.lerp(self._offsets[right - 1], self._offsets[right], share), self._nearest)
+        return _mean_of(torch.lerp(self._offsets[right - 1], self._offsets[right], share), self._nearest)
 
 
 def position_floor(
@@ -81,21 +83,21 @@ def position_floor(
     if len(places) < 2 or not attributes:
         return nothing
     shown = channel_weights(visibility, len(places), 1)
-    nearest = _nearest(places, max(NEIGHBOURS))
+    nearest, _ = nearest_rows(places, torch.arange(len(places)), max(NEIGHBORS))
     found = {}
-    for count in [n for n in NEIGHBOURS if n <= nearest.shape[1]]:
+    for count in [n for n in NEIGHBORS if n <= nearest.shape[1]]:
         share = {name: _left(offsets[:, :, c], shown, nearest[:, :count]) for name, c in attributes.items()}
         found[count] = share
     best = min(found, key=lambda n: sum(found[n].values()))
     mean = worst = float("nan")
     if judge is not None:
-        curve = judge.curve(_Foretold(strengths, offsets, nearest[:, :best], list(attributes)))
+        curve = judge.curve(_Predicted(strengths, offsets, nearest[:, :best], list(attributes)))
         mean, worst = sum(curve) / len(curve), min(curve)
     return PositionFloor({name: min(1.0, s) for name, s in found[best].items()}, best, mean, worst)
 
 
-def _told(offsets: Tensor, nearest: Tensor) -> Tensor:
-    """Mean of each member's neighbours. [M,C], [M,k] -> [M,C]"""
+def _mean_of(offsets: Tensor, nearest: Tensor) -> Tensor:
+    """Mean of each member's neighbors. [M,C], [M,k] -> [M,C]"""
     total = offsets[nearest[:, 0]]
     for k in range(1, nearest.shape[1]):
         total = total + offsets[nearest[:, k]]
@@ -103,24 +105,29 @@ def _told(offsets: Tensor, nearest: Tensor) -> Tensor:
 
 
 def _left(offsets: Tensor, shown: Tensor, nearest: Tensor) -> float:
-    """Share of the movement about its mean that neighbours do not tell. [T,M,c], [M,1]"""
+    """Share of the movement about its mean that neighbors do not tell. [T,M,c], [M,1]"""
     wrong = whole = 0.0
     for moved in offsets[1:]:
         mean = (moved * shown).sum(dim=0) / shown.sum()
-        wrong += float((shown * (moved - _told(moved, nearest)).square()).sum())
+        wrong += float((shown * (moved - _mean_of(moved, nearest)).square()).sum())
         whole += float((shown * (moved - mean).square()).sum())
     return wrong / whole if whole > 0 else 0.0
 
 
-def _nearest(places: Tensor, most: int) -> Tensor:
-    """Every member's nearest others, nearest first. [M,3] -> [M,≤most] int64"""
-    count = len(places)
-    most = min(most, count - 1)
-    rows = max(1, _MOST_DISTANCES // count)
-    found = []
-    for start in range(0, count, rows):
-        own = torch.arange(start, min(count, start + rows))
-        distances = torch.cdist(places[own], places)
-        distances[torch.arange(len(own)), own] = float("inf")
-        found.append(distances.topk(most, largest=False).indices)
-    return torch.cat(found)
+def floor_table(courses: Sequence[KnownCourse]) -> Table:
+    """What places tell of every edit, beside which a network that sees positions alone may be held."""
+    rows = []
+    for course in courses:
+        places = course.scene.means[course.members]
+        found = position_floor(course.strengths, course.offsets, places, course.weights, course.judge)
+        shares = ", ".join(f"{name} {share:.2f}" for name, share in found.unpredictable.items())
+        rows.append(
+            (course.name, str(found.neighbors), shares, f"{found.psnr_mean:.1f} / {found.psnr_worst:.1f}")
+        )
+    return Table(
+        name="position floor",
+        title="Position floor: every member moves as its nearest neighbors do on average",
+        columns=("edit", "neighbors", "share not predicted", "PSNR between snapshots, mean / worst, dB"),
+        rows=tuple(rows),
+        note="What a field can know that sees nothing but positions, without training one.",
+    )
