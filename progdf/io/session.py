@@ -89,13 +89,17 @@ def reference(path: Path, folder: Path) -> FileRef:
     """A file as a session in `folder` names it.
 
     Raises:
-        ProgdfError: it cannot be read.
+        ProgdfError: it cannot be read, or its name is not UTF-8, which JSON cannot hold.
     """
     whole = path.resolve()
     try:
         name = os.path.relpath(whole, folder.resolve())
     except ValueError:  # another drive
         name = str(whole)
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise ProgdfError(f"a session cannot hold the file name {name}: it is not UTF-8; rename it") from None
     return FileRef(str(PurePosixPath(Path(name))), sha256(whole))
 
 

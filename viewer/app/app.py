@@ -99,7 +99,7 @@ class App:
 
     def loop(self) -> None:
         """Draw while something changes, sleep while nothing does."""
-        imgui.backends.glfw_new_frame()
+        self.window.new_frame()
         self.stage.greet(self.context.screen)
         self.window.present()
         while not self._left:
@@ -125,7 +125,7 @@ class App:
         seconds, self.last = arrived - self.last, arrived
         self.stage.ui.make_current()
         self.stage.ui.set_scale(self.window.ui_scale)
-        imgui.backends.glfw_new_frame()
+        self.window.new_frame()
         screen = self.context.screen
         self.stage.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
         self.window.present()

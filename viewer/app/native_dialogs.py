@@ -14,6 +14,7 @@ from pathlib import Path
 
 from imgui_bundle import portable_file_dialogs as dialogs
 
+from progdf.terminal import printable
 from viewer.state.workspace import Dialog
 
 PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")
@@ -63,9 +64,9 @@ class Browser:
         path = Path(dialog.text or near).expanduser().absolute()
         if dialog.kind != "save":
             folder = path if path.is_dir() else path.parent
-            self._shown = dialogs.open_file("Open", f"{folder}/", _OPEN)
+            self._shown = dialogs.open_file("Open", printable(f"{folder}/"), _OPEN)
         else:
-            self._shown = dialogs.save_file("Save the session", str(path), _SAVE)
+            self._shown = dialogs.save_file("Save the session", printable(str(path)), _SAVE)
         return replace(dialog, choosing=True, notice="Choose in the desktop's dialog, or type the path here")
 
     def looked(self, dialog: Dialog | None) -> Dialog | None:

@@ -14,7 +14,7 @@ MOST = 8
 def read(folder: Path | None = None) -> tuple[Path, ...]:
     """Those that are still there; none where nothing can be read."""
     try:
-        lines = ((folder or state_folder()) / "recent.txt").read_text(encoding="utf-8").splitlines()
+        lines = ((folder or state_folder()) / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
         return tuple(path for path in map(Path, lines) if path.is_file())[:MOST]
     except (OSError, ValueError):
         return ()
@@ -28,7 +28,9 @@ def remember(paths: Sequence[Path], folder: Path | None = None) -> tuple[Path, .
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with written_whole(folder / "recent.txt") as beside:
-            beside.write_text("".join(f"{path}\n" for path in files), encoding="utf-8")
+            beside.write_text(
+                "".join(f"{path}\n" for path in files), encoding="utf-8", errors="surrogateescape"
+            )
     except OSError:
         pass
     return files

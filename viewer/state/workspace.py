@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from progdf.compose.layers import BLENDS
+from progdf.terminal import printable
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST, Bounds, Fit, ViewCamera, unmoved
 
@@ -155,7 +156,7 @@ def original(view: ViewState) -> ViewState:
 def told(workspace: Workspace, text: str, now: float, error: bool = False) -> Workspace:
     """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
     until = now + (ERROR_S if error else MESSAGE_S)
-    return replace(workspace, message=Message(" ".join(text.split()), until, error))
+    return replace(workspace, message=Message(printable(" ".join(text.split())), until, error))
 
 
 def settled(workspace: Workspace) -> Workspace:

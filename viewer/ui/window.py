@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,8 @@ import moderngl
 from progdf.errors import ProgdfError
 from viewer.camera import controls
 from viewer.camera.inputs import Keys, Press, next_event_id
+
+from .double_clicks import DoubleClicks
 
 LEAST = (640, 400)
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
@@ -79,6 +82,9 @@ class Window:
         self._pressed: list[Press] = []
         self._down: dict[int, str] = {}  # names of the keys that are down
         self._windowed: tuple[int, int, int, int] | None = None
+        self._clicks = DoubleClicks()
+        self._heard_until = time.perf_counter()  # when it last stopped listening, to draw
+        self._unheard_s = 0.0  # how long it had not listened when it last began to
 
     def context(self) -> moderngl.Context:
         """Its GL context, for drawing; through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do."""
@@ -111,6 +117,12 @@ class Window:
                 imgui.get_io().add_key_event(imgui.Key.enter, action == glfw.PRESS)
             wake()
 
+        def on_button(_: object, button: int, action: int, __: int) -> None:
+            if button == glfw.MOUSE_BUTTON_LEFT and action == glfw.PRESS:
+                # imgui adds its own event after this one
+                self._clicks.note_press(time.perf_counter(), self._unheard_s, next_event_id())
+            wake()
+
         def on_drop(_: object, names: Sequence[str]) -> None:
             dropped([Path(name) for name in names])
 
@@ -120,7 +132,6 @@ class Window:
         for listen in (
             glfw.set_cursor_pos_callback,
             glfw.set_cursor_enter_callback,
-            glfw.set_mouse_button_callback,
             glfw.set_scroll_callback,
             glfw.set_char_callback,
             glfw.set_window_focus_callback,
@@ -131,18 +142,26 @@ class Window:
         callback: Any = on_drop  # glfw's own annotation has the arguments of the C function
         glfw.set_drop_callback(self.handle, callback)
         glfw.set_key_callback(self.handle, on_key)
+        glfw.set_mouse_button_callback(self.handle, on_button)
         glfw.set_window_refresh_callback(self.handle, on_refresh)
         # imgui's own callbacks call the ones that were there before
         imgui.backends.glfw_init_for_opengl(ctypes.cast(self.handle, ctypes.c_void_p).value or 0, True)
 
     def wait(self, patience: float | None) -> None:
         """Handle events: at once (0), for so many seconds at most, or when the next one comes (None)."""
+        self._unheard_s = time.perf_counter() - self._heard_until
         if patience is None:
             glfw.wait_events()
         elif patience > 0.0:
             glfw.wait_events_timeout(patience)
         else:
             glfw.poll_events()
+        self._heard_until = time.perf_counter()
+
+    def new_frame(self) -> None:
+        """Give imgui what the window has heard, for the frame that begins."""
+        imgui.backends.glfw_new_frame()
+        self._clicks.apply()
 
     def ask_to_close(self) -> None:
         glfw.set_window_should_close(self.handle, True)

@@ -1,0 +1,80 @@
+"""Double clicks count by when the presses arrived, however long a frame takes."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.null_app import null_app
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.app import app as application
+from viewer.files.document import Document
+from viewer.ui.double_clicks import DoubleClicks
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig() as made:
+        yield made
+
+
+def click_twice(hand: Rig, gap: float, frame: float, unheard: float = 0.0) -> None:
+    """Two clicks on the upper slider's handle, `gap` seconds apart, in frames of `frame` seconds."""
+    clicks = DoubleClicks()
+    hand.move(*hand.slider(1, 0.5))
+    for press in range(2):
+        clicks.note_press(press * gap, unheard, imgui.get_current_context().input_events_next_event_id)
+        for down in (True, False):
+            hand.io.add_mouse_button_event(0, down)
+        for _ in range(3):
+            clicks.apply()
+            hand.stage.frame(hand.screen, hand.pixels, frame)
+
+
+@pytest.mark.parametrize("frame", [1 / 60, 0.12, 0.5])
+def test_two_presses_that_came_quickly_reset_the_slider_however_slow_frames_are(
+    hand: Rig, frame: float
+) -> None:
+    click_twice(hand, 0.06, frame)
+    assert hand.strengths == [0.5, 0.0]
+
+
+@pytest.mark.parametrize("frame", [1 / 60, 0.12])
+def test_two_slow_clicks_stay_two_clicks(hand: Rig, frame: float) -> None:
+    click_twice(hand, 0.45, frame)
+    assert hand.strengths == [0.5, 0.5]
+
+
+def test_a_press_that_waited_for_a_long_frame_to_end_may_be_as_old_as_that(hand: Rig) -> None:
+    click_twice(hand, 0.45, 0.4, unheard=0.4)
+    assert hand.strengths == [0.5, 0.0]
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[application.App]:
+    stack = bear()
+    with null_app(
+        Document("bear.ply", stack.scene, stack.gdfs), first_view(stack, 0.5, 0.5), tmp_path
+    ) as app:
+        yield app
+
+
+def test_the_window_notes_when_it_heard_of_a_press(opened: application.App) -> None:
+    from viewer.ui.window import glfw
+
+    handle = ctypes.cast(opened.window.handle, ctypes.c_void_p).value or 0
+    glfw.set_cursor_pos(opened.window.handle, 900 - 300 + 29 + 0.5 * 242, 136.0)  # the upper slider's handle
+    for _ in range(3):
+        opened.draw()
+    for action in (1, 0, 1, 0):
+        imgui.backends.glfw_mouse_button_callback(handle, 0, action, 0)
+    for _ in range(6):
+        opened.last -= 0.4  # so long a frame takes
+        opened.draw()
+    assert [layer.strength for layer in opened.stage.work.view.layers] == [0.5, 0.0]

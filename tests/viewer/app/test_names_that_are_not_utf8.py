@@ -1,0 +1,56 @@
+"""Files whose names are no text: the window shows them with an escape and goes on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from progdf.formats.ply import save_ply
+from tests.helpers.null_app import null_app, press
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app import app as application
+from viewer.files import document as documents
+from viewer.files import recent
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[application.App]:
+    path = tmp_path / os.fsdecode(b"b\xe4r.ply")
+    try:
+        save_ply(path, bear().scene)
+    except OSError:
+        pytest.skip("this file system wants names in UTF-8")
+    with null_app(documents.load(path), first_view(bear()), tmp_path) as app:
+        yield app
+
+
+def test_the_title_and_the_recent_files_are_shown_and_the_file_is_found_again(
+    opened: application.App, tmp_path: Path
+) -> None:
+    assert opened.document.title == "b\\udce4r.ply"
+    press(opened, "Ctrl+O")
+    assert opened.stage.recent == (opened.document.path,) == recent.read(tmp_path / "memory")
+
+
+def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: application.App) -> None:
+    press(opened, "Ctrl+S")
+    dialog = opened.stage.work.dialog
+    assert dialog is not None
+    assert dialog.text.endswith("b\udce4r.session.json"), "the path stays the file's own"
+    press(opened, "Enter")
+    dialog = opened.stage.work.dialog
+    assert dialog is not None
+    assert "it is not UTF-8; rename it" in dialog.error
+
+
+def test_a_message_with_such_a_name_is_shown(opened: application.App, tmp_path: Path) -> None:
+    opened.open(tmp_path / os.fsdecode(b"no\xff.gdf"))
+    opened.draw()
+    message = opened.stage.work.message
+    assert message is not None
+    assert "no\\udcff.gdf" in message.text
