@@ -73,11 +73,11 @@ class Composer:
         self._index = {id(gdf): i for i, gdf in enumerate(gdfs)}
         self._gdfs = tuple(gdfs)  # held, so that their ids stay theirs
         self._members = [gdf.region.members.numpy() for gdf in gdfs]
-        self._reach = np.unique(np.concatenate([np.zeros(0, np.int64), *self._members]))
+        self._edited_rows = np.unique(np.concatenate([np.zeros(0, np.int64), *self._members]))
         self._names = tuple(n for n in ATTRIBUTES if any(n in gdf.field.attributes for gdf in gdfs))
         self._moving = [frozenset(gdf.field.attributes) for gdf in gdfs]
         self._edits = flat_edits(scene, gdfs, self._names)
-        self._base, self._out, self._columns = flat_scene(scene, self._names, self._reach)
+        self._base, self._out, self._columns = flat_scene(scene, self._names, self._edited_rows)
         tensors: dict[str, Any] = {}
         for name, (_, _, at) in zip(self._names, self._columns[:, :3].tolist(), strict=True):
             shape = getattr(scene, name).shape
@@ -137,20 +137,21 @@ class Composer:
         """Write these attributes of the plan's rows; the largest squared step of a centre."""
         edits = self._edits
         layers, numbers, bounds = plan.stacked(tuple(edit for edit, _ in stack))
-        cover = 0.0
+        strengths = 0.0
         for i, (edit, layer) in enumerate(stack):
             node, on_node, share = between(edits.nodes[edit], layer.strength)
             layers[i, 3:] = weights_at[i], node, on_node
             gains = layer.gains
-            numbers[i] = share, layer.cover, gains.geometry, gains.opacity, gains.colour
-            cover += layer.cover
+            numbers[i] = share, layer.clamped_strength, gains.geometry, gains.opacity, gains.colour
+            strengths += layer.clamped_strength
         # a little below 1: sums in float32 may round up to where the kernel has to look
-        crowded = blend == "normalised" and cover > 1 - 1e-6
+        normalize = blend == "normalised" and strengths > 1 - 1e-6
         blocks = plan.blocks
         arguments = (
-            self._base, self._out, plan.rows.view(np.uint64), plan.reach, self._columns,
-            self._chosen(chosen), layers, numbers, bounds, plan.members, plan.places, edits.edits,
-            edits.parts, edits.floats, edits.bytes_, edits.tables, self._weights[2], blend == "over", crowded,
+            self._base, self._out, plan.rows.view(np.uint64), plan.base_index, self._columns,
+            self._chosen(chosen), layers, numbers, bounds, plan.members, plan.row_index, edits.edits,
+            edits.parts, edits.floats, edits.bytes_, edits.tables, self._weights[2], blend == "over",
+            normalize,
         )  # fmt: skip
         count = min(1 + len(plan.rows) // WORTH_A_THREAD, max(blocks, 1))
         count = min(count, threads()) if count > 1 else 1
@@ -167,7 +168,7 @@ class Composer:
         if changed not in self._plans:
             if len(self._plans) >= 32:  # a handful is in use while one drags
                 self._plans.clear()
-            self._plans[changed] = plan_rows(self._members, changed, self._reach)
+            self._plans[changed] = plan_rows(self._members, changed, self._edited_rows)
         return self._plans[changed]
 
     def _chosen(self, chosen: tuple[int, ...]) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from progdf.rasterize.jit import Number, kernel
 BLOCK = 256
 """Rows worked on at once: the sums of a channel stay in the first cache. The kernels spell it out."""
 
-PART = ("full", "rest", "rest_is_float", "rank", "table", "step", "covers")
+PART = ("full", "rest", "rest_is_float", "rank", "table", "step", "coverage")
 """Columns of `parts`, one line an edit and attribute: where the lines of 256 begin in an edit's block of
 `floats`, −1 where the edit does not move it; those of bases 1..R, in `bytes_` or `floats`; R; where its
 coefficients begin in `tables`, [S,1+R], and its steps, [R,c]; the line of its coverage in `floats`."""
@@ -24,13 +24,13 @@ coefficients begin in `tables`, [S,1+R], and its steps, [R,c]; the line of its c
 EDIT = ("floats", "float_lines", "bytes", "byte_lines")
 """Columns of `edits`: where its blocks begin in `floats`, the lines of 256 of each; the same in `bytes_`."""
 
-LAYER = ("edit", "places", "aligned", "weights", "node", "on_node")
+LAYER = ("edit", "list", "aligned", "weights", "node", "on_node")
 """Columns of `layers`: which edit; where its list of members and rows begins; 1 where the members of the list
 are all of the edit's; where its [M] weights begin, −1 for all 1; the node at or right of the strength; 1
 where it is at the node."""
 
-NUMBER = ("share", "cover", "geometry", "opacity", "colour")
-"""Columns of `numbers`: where between two nodes the strength is; the layer's cover; its gains."""
+NUMBER = ("between", "clamped_strength", "geometry", "opacity", "colour")
+"""Columns of `numbers`: where between two nodes the strength is; the strength within 0..1; its gains."""
 
 COLUMN = ("line", "width", "out", "gain", "centres")
 """Columns of `columns`, one line an attribute: its first line in a block of `base`, its width, its first
@@ -42,7 +42,7 @@ def compose_rows(
     base: NDArray[np.float32],
     out: NDArray[np.float32],
     rows: NDArray[np.uint64],
-    reach: NDArray[np.uint32],
+    base_index: NDArray[np.uint32],
     columns: NDArray[np.int64],
     chosen: NDArray[np.int64],
     layers: NDArray[np.int64],
@@ -57,7 +57,7 @@ def compose_rows(
     tables: NDArray[np.float32],
     weights: NDArray[np.float32],
     over: bool,
-    crowded: bool,
+    normalize: bool,
     first_block: int,
     last_block: int,
 ) -> float:
@@ -67,7 +67,7 @@ def compose_rows(
         base: the scene's numbers of all rows that any edit may change, in blocks of 256
         out: the edited attributes, back to back, each of N rows
         rows: what is written, ascending. [U]
-        reach: which row of `base` each of them is. [U]
+        base_index: which row of `base` each of them is. [U]
         columns: [A,5], see `COLUMN`
         chosen: the attributes to write
         layers: the stack, lowest first. [L,6], see `LAYER`
@@ -79,15 +79,15 @@ def compose_rows(
         tables: coefficients and steps
         weights: per member
         over: the blend rule "over"
-        crowded: the blend rule "normalised", and strengths may add up to more than 1 somewhere
+        normalize: the blend rule "normalised", and strengths may add up to more than 1 somewhere
         first_block, last_block: which blocks of 256 rows
 
     Returns:
         The largest squared distance between new and old centres; 0 where these are not chosen.
     """
     one = np.float32(1.0)
-    crowd = np.empty(256, np.float32)
-    shares = np.ones(len(layers) * 256, np.float32)
+    weight_sum = np.empty(256, np.float32)
+    member_weights = np.ones(len(layers) * 256, np.float32)
     base_lines = columns[-1, 0] + columns[-1, 1]
     offset = np.uint64(columns[:, 1].max() * 256)
     values = np.empty(
@@ -102,17 +102,21 @@ def compose_rows(
             if layers[index, 3] >= 0:
                 start = layers[index, 1] + bounds[index, block]
                 for i in range(bounds[index, block + 1] - bounds[index, block]):
-                    shares[index * 256 + i] = weights[layers[index, 3] + list_members[start + i]]
-        if crowded:
+                    member_weights[index * 256 + i] = weights[layers[index, 3] + list_members[start + i]]
+        if normalize:
             for i in range(count):
-                crowd[i] = np.float32(0.0)
+                weight_sum[i] = np.float32(0.0)
             for index in range(len(layers)):
                 start = layers[index, 1] + bounds[index, block]
                 for i in range(bounds[index, block + 1] - bounds[index, block]):
-                    crowd[list_rows[start + i] - begin] += shares[index * 256 + i] * numbers[index, 1]
+                    weight_sum[list_rows[start + i] - begin] += (
+                        member_weights[index * 256 + i] * numbers[index, 1]
+                    )
             for i in range(count):
-                crowd[i] = max(crowd[i], one)
-        in_line = reach[begin] % 256 == 0 and reach[begin + count - 1] - reach[begin] == count - 1
+                weight_sum[i] = max(weight_sum[i], one)
+        contiguous = (
+            base_index[begin] % 256 == 0 and base_index[begin + count - 1] - base_index[begin] == count - 1
+        )
         for attribute in chosen:
             width = columns[attribute, 1]
             for c in range(width):
@@ -145,30 +149,30 @@ def compose_rows(
                             values[total + np.uint64(i)] += gain * values[offset + np.uint64(i)]
                         continue
                     hidden = numbers[index, 1] * min(abs(gain), one)
-                    full, covers = np.uint64(edits[edit, 0]), parts[edit, attribute, 6]
+                    full, coverage = np.uint64(edits[edit, 0]), parts[edit, attribute, 6]
                     for i in range(found):
-                        share = shares[index * 256 + i]
-                        if share == 0.0:
+                        weight = member_weights[index * 256 + i]
+                        if weight == 0.0:
                             continue
                         row = total + np.uint64(list_rows[start + i] - begin)
                         if over:
-                            at = full + _place(list_members[start + i], edits[edit, 1], covers)
-                            values[row] *= one - (share * hidden) * floats[at]
-                        values[row] += (share * gain) * values[offset + np.uint64(i)]
+                            at = full + _place(list_members[start + i], edits[edit, 1], coverage)
+                            values[row] *= one - (weight * hidden) * floats[at]
+                        values[row] += (weight * gain) * values[offset + np.uint64(i)]
                 if empty:
                     for i in range(count):
                         values[total + np.uint64(i)] = np.float32(-0.0)
-                if crowded:
+                if normalize:
                     for i in range(count):
-                        values[total + np.uint64(i)] /= crowd[i]
+                        values[total + np.uint64(i)] /= weight_sum[i]
                 line = columns[attribute, 0] + c
-                if in_line:
-                    at = _place(reach[begin], base_lines, line)
+                if contiguous:
+                    at = _place(base_index[begin], base_lines, line)
                     for i in range(count):
                         values[total + np.uint64(i)] += base[at + np.uint64(i)]
                 else:
                     for i in range(count):
-                        values[total + np.uint64(i)] += base[_place(reach[begin + i], base_lines, line)]
+                        values[total + np.uint64(i)] += base[_place(base_index[begin + i], base_lines, line)]
             at = np.uint64(columns[attribute, 2])
             if columns[attribute, 4] != 0:
                 for i in range(count):
@@ -215,11 +219,11 @@ def _sum(
     full = np.uint64(edits[edit, 0])
     rest, lines = full if is_float else np.uint64(edits[edit, 2]), edits[edit, 1 if is_float else 3]
     member = list_members[start]
-    still = True
+    zero = True
     k = 0
     while k <= rank:
         factor = _coefficient(tables, parts, layers, numbers, index, attribute, k)
-        still = still and factor == 0
+        zero = zero and factor == 0
         if k == 0:
             line = parts[edit, attribute, 0] + c
             if aligned:
@@ -252,17 +256,17 @@ def _sum(
         if k <= rank:
             following = _coefficient(tables, parts, layers, numbers, index, attribute, k)
         if following != 0:  # two bases at once: half as many sums to fetch and to put back
-            still = False
+            zero = False
             following *= tables[parts[edit, attribute, 5] + (k - 1) * width + c]
             k += 1
             for i in range(found):
                 value = values[into + np.uint64(i)] + factor * np.float32(bytes_[at + np.uint64(i)])
-                beside = np.float32(bytes_[at + np.uint64(256 + i)])
-                values[into + np.uint64(i)] = value + following * beside
+                second = np.float32(bytes_[at + np.uint64(256 + i)])
+                values[into + np.uint64(i)] = value + following * second
         else:
             for i in range(found):
                 values[into + np.uint64(i)] += factor * np.float32(bytes_[at + np.uint64(i)])
-    if still:
+    if zero:
         for i in range(found):
             values[into + np.uint64(i)] = np.float32(0.0)
 

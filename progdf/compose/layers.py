@@ -58,8 +58,8 @@ class Layer:
         return self.enabled and self.strength != 0.0
 
     @property
-    def cover(self) -> float:
-        """How much of a Gaussian's place the layer asks for: the strength, without its overshoot. 0..1"""
+    def clamped_strength(self) -> float:
+        """The strength without its overshoot, 0..1."""
         return min(max(self.strength, 0.0), 1.0)
 
     def gain(self, attribute: str) -> float:

@@ -30,22 +30,22 @@ class Plan:
 
     Args:
         rows: what is rewritten. [U]
-        reach: where each of them is among the rows of all edits, if asked for. [U]
+        base_index: where each of them is among the rows of all edits, if asked for. [U]
         edits: indices of the edits that have members among them
-        begin: where each edit's list begins within `members` and `places`
+        begin: where each edit's list begins within `members` and `row_index`
         aligned: edits whose members are the rows, one for one
-        members, places: members of the edits, and where in `rows` they are
+        members, row_index: members of the edits, and where in `rows` they are
         bounds: where each block of rows begins in each edit's list. [B+1]
         prepared: see `stacked`, by the edits of a stack
     """
 
     rows: NDArray[np.int64]
-    reach: NDArray[np.uint32]
+    base_index: NDArray[np.uint32]
     edits: frozenset[int]
     begin: Mapping[int, int]
     aligned: frozenset[int]
     members: NDArray[np.uint32]
-    places: NDArray[np.uint32]
+    row_index: NDArray[np.uint32]
     bounds: Mapping[int, NDArray[np.int64]]
     prepared: dict[tuple[int, ...], Stacked]
 
@@ -69,14 +69,14 @@ class Plan:
 
 
 def plan_rows(
-    members: Sequence[NDArray[np.int64]], changed: frozenset[int], reach: NDArray[np.int64] | None = None
+    members: Sequence[NDArray[np.int64]], changed: frozenset[int], edited: NDArray[np.int64] | None = None
 ) -> Plan:
     """The plan that rewrites all members of the changed edits.
 
     Args:
         members: of every edit, sorted. [M] each
         changed: indices of edits
-        reach: all members, sorted; None where nobody asks where the rows are among them
+        edited: all members, sorted; None where nobody asks where the rows are among them
     """
     chosen = [members[edit] for edit in sorted(changed)]
     rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
@@ -84,30 +84,32 @@ def plan_rows(
     begin: dict[int, int] = {}
     bounds: dict[int, NDArray[np.int64]] = {}
     aligned = set()
-    found_members, found_places = [], []
+    found_members, found_rows = [], []
     length = 0
     for edit, own in enumerate(members):
-        places = np.searchsorted(rows, own)
-        inside = np.flatnonzero(rows[np.minimum(places, len(rows) - 1)] == own) if len(rows) else places[:0]
+        row_index = np.searchsorted(rows, own)
+        inside = (
+            np.flatnonzero(rows[np.minimum(row_index, len(rows) - 1)] == own) if len(rows) else row_index[:0]
+        )
         if not len(inside):
             continue
         begin[edit] = length
         length += len(inside)
         if len(inside) == len(own) == len(rows):
             aligned.add(edit)
-        places = places[inside]
+        row_index = row_index[inside]
         found_members.append(inside.astype(np.uint32))
-        found_places.append(places.astype(np.uint32))
-        bounds[edit] = np.searchsorted(places, edges).astype(np.int64)
+        found_rows.append(row_index.astype(np.uint32))
+        bounds[edit] = np.searchsorted(row_index, edges).astype(np.int64)
     nothing = np.zeros(0, np.uint32)
     return Plan(
         rows=rows,
-        reach=nothing if reach is None else np.searchsorted(reach, rows).astype(np.uint32),
+        base_index=nothing if edited is None else np.searchsorted(edited, rows).astype(np.uint32),
         edits=frozenset(begin),
         begin=begin,
         aligned=frozenset(aligned),
         members=np.concatenate([nothing, *found_members]),
-        places=np.concatenate([nothing, *found_places]),
+        row_index=np.concatenate([nothing, *found_rows]),
         bounds=bounds,
         prepared={},
     )
@@ -133,7 +135,7 @@ class FlatEdits:
 
 
 def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
-    """Lay out the edits' bases for these attributes, and what they cover."""
+    """Lay out the edits' bases for these attributes, and their coverage."""
     edits = np.zeros((len(gdfs), len(EDIT)), np.int64)
     parts = np.full((len(gdfs), len(names), len(PART)), -1, np.int64)
     floats, bytes_ = [np.zeros(0, np.float32)], [np.zeros(0, np.int8)]
@@ -142,9 +144,9 @@ def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> F
     for i, gdf in enumerate(gdfs):
         float_lines: list[NDArray[np.float32]] = []
         byte_lines: list[NDArray[np.int8]] = []
-        covers: dict[str, int] = {}
+        coverages: dict[str, int] = {}
         for kind, covered in coverage(scene, gdf).items():
-            covers[kind] = len(float_lines)
+            coverages[kind] = len(float_lines)
             float_lines.append(covered.numpy())
         for j, name in enumerate(names):
             bases = gdf.field.attributes.get(name)
@@ -162,7 +164,7 @@ def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> F
             table, step = ends[2], ends[2] + bases.coefficients.numel()
             tables += [bases.coefficients.numpy().reshape(-1), bases.step.numpy().reshape(-1)]
             ends[2] = step + bases.step.numel()
-            parts[i, j] = full, lines, is_float, len(bases.rest), table, step, covers[KINDS[name]]
+            parts[i, j] = full, lines, is_float, len(bases.rest), table, step, coverages[KINDS[name]]
         edits[i] = ends[0], len(float_lines), ends[1], len(byte_lines)
         floats.append(in_blocks(float_lines, np.float32))
         bytes_.append(in_blocks(byte_lines, np.int8))
@@ -186,16 +188,16 @@ def in_blocks(lines: Sequence[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def flat_scene(
-    scene: Gaussians, names: Sequence[str], reach: NDArray[np.int64]
+    scene: Gaussians, names: Sequence[str], edited: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Attributes of the rows in reach in blocks, those of all rows back to back, and where each is.
+    """Attributes of the edited rows in blocks, those of all rows back to back, and where each is.
 
     Returns:
         What `compose_kernel.compose_rows` takes as `base`, `out` and `columns`.
     """
     tensors: list[Tensor] = [getattr(scene, name).detach().float() for name in names]
     tables = [tensor.numpy().reshape(len(tensor), math.prod(tensor.shape[1:])) for tensor in tensors]
-    base = in_blocks([line for table in tables for line in table[reach].T], np.float32)
+    base = in_blocks([line for table in tables for line in table[edited].T], np.float32)
     out = np.concatenate([np.zeros(0, np.float32), *(table.reshape(-1) for table in tables)])
     columns = np.zeros((len(names), len(COLUMN)), np.int64)
     line = at = 0

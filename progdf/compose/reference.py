@@ -6,8 +6,8 @@ while a slider is dragged, in buffers that are made once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -21,8 +21,9 @@ from .layers import BLENDS, KINDS, Gains, Layer, check_layers
 
 __all__ = ["BLENDS", "Gains", "Layer", "compose"]
 
-NOTHING = -0.0
+NEGATIVE_ZERO = -0.0
 """The number that added to any other, −0.0 included, leaves every bit as it was."""
+_ALL = slice(None)
 
 
 def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised") -> Gaussians:
@@ -60,48 +61,75 @@ def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised"
     active = [layer for layer in layers if layer.active]
     if not active or not len(scene):
         return scene
-    weights = [_weights(layer) for layer in active]
-    reached = [layer.gdf.region.members[m != 0] for layer, m in zip(active, weights, strict=True)]
-    rows = torch.unique(torch.cat(reached))
-    crowd = torch.zeros(len(rows))  # Σ m s
-    for layer, m in zip(active, weights, strict=True):
-        index, selected = _places(rows, layer.gdf.region.members, m)
-        crowd[index] += m[selected] * layer.cover
+    rows, parts = _parts(scene, active, blend)
+    weight_sum = torch.zeros(len(rows))  # Σ m s
+    for part in parts:
+        weight_sum[part.rows] += part.weights * part.layer.clamped_strength
 
-    hides = [coverage(scene, layer.gdf) if blend == "over" else {} for layer in active]
     changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
-        movers = [name in layer.gdf.field.attributes and layer.gain(name) != 0 for layer in active]
-        if not any(movers):
+        movers = [part for part in parts if part.moves(name)]
+        if not movers:
             continue
         old: Tensor = getattr(scene, name)
-        total = torch.full((len(rows), old[0].numel()), NOTHING)
-        for layer, m, moves, covers in zip(active, weights, movers, hides, strict=True):
-            if not moves:
-                continue
-            index, selected = _places(rows, layer.gdf.region.members, m)
-            share = m[selected, None]
-            below = total[index]
+        total = torch.full((len(rows), old[0].numel()), NEGATIVE_ZERO)
+        for part in movers:
+            layer, weight = part.layer, part.weights[:, None]
+            below = total[part.rows]
             if blend == "over":
-                hidden = torch.tensor(layer.cover) * torch.tensor(min(abs(layer.gain(name)), 1.0))
-                below = below * (1 - share * hidden * covers[KINDS[name]][selected, None])
-            offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[selected]
-            total[index] = below + share * layer.gain(name) * offsets
+                hidden = torch.tensor(layer.clamped_strength) * torch.tensor(min(abs(layer.gain(name)), 1.0))
+                below = below * (1 - weight * hidden * part.coverage[KINDS[name]][part.members, None])
+            offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[part.members]
+            total[part.rows] = below + weight * layer.gain(name) * offsets
         if blend == "normalised":
-            total = total / crowd.clamp(min=1.0)[:, None]
+            total = total / weight_sum.clamp(min=1.0)[:, None]
         new = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
         changed[name] = old.index_copy(0, rows, new)
     return replace(scene, **changed)
 
 
-def _weights(layer: Layer) -> Tensor:
-    """Weight of every member. [M] float32"""
-    if layer.weights is None:
-        return torch.ones(len(layer.gdf.region))
-    return layer.weights.float()
+@dataclass(frozen=True)
+class _Part:
+    """A layer's members of weight ≠ 0, m in number.
+
+    Args:
+        layer: the layer
+        members: which of its members these are, all of them as a slice. [m] int64
+        rows: where they are among the rows that change, all of them as a slice. [m] int64
+        weights: theirs. [m] float32
+        coverage: how far it hides the layers below, by kind of attribute; empty but for "over". [M] float32
+    """
+
+    layer: Layer
+    members: Tensor | slice
+    rows: Tensor | slice
+    weights: Tensor
+    coverage: Mapping[str, Tensor]
+
+    def moves(self, attribute: str) -> bool:
+        """Whether it changes an attribute at all."""
+        return attribute in self.layer.gdf.field.attributes and self.layer.gain(attribute) != 0
 
 
-def _places(rows: Tensor, members: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Where in `rows` a layer's members of weight ≠ 0 lie, and which members these are. [m], [m] int64"""
-    selected = weights.nonzero()[:, 0]
-    return torch.searchsorted(rows, members[selected]), selected
+def _parts(scene: Gaussians, layers: Sequence[Layer], blend: str) -> tuple[Tensor, list[_Part]]:
+    """The sorted rows of the scene that change, [U] int64, and each layer's part in them."""
+    chosen: list[tuple[Tensor | slice, Tensor]] = []  # members and their weights
+    for layer in layers:
+        weights = torch.ones(len(layer.gdf.region)) if layer.weights is None else layer.weights.float()
+        selected = weights.nonzero()[:, 0]
+        chosen.append((_ALL, weights) if len(selected) == len(weights) else (selected, weights[selected]))
+    reached = [layer.gdf.region.members[members] for layer, (members, _) in zip(layers, chosen, strict=True)]
+    rows = reached[0] if len(reached) == 1 else torch.unique(torch.cat(reached))
+    place = torch.empty(len(scene) if len(reached) > 1 else 0, dtype=torch.int64)
+    if len(reached) > 1:
+        place[rows] = torch.arange(len(rows))
+    return rows, [
+        _Part(
+            layer,
+            members,
+            _ALL if len(own) == len(rows) else place[own],
+            weights,
+            coverage(scene, layer.gdf) if blend == "over" else {},
+        )
+        for layer, own, (members, weights) in zip(layers, reached, chosen, strict=True)
+    ]

@@ -12,7 +12,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any
@@ -21,6 +21,7 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from progdf.errors import ProgdfError
 from progdf.field.bake import rows_hash
@@ -34,6 +35,8 @@ from .field_packing import packed_field, unpacked_field
 from .header import FORMAT, GdfHead, SceneFingerprint, contradiction, damaged, head_checksum, read_head
 from .region_packing import packed_region, unpacked_region
 
+_FINGERPRINTS: MutableMapping[Tensor, tuple[int, str]] = WeakIdKeyDictionary()
+"""Version and hash of the centres of scenes that are alive."""
 _FAR = 1e18
 """An offset that is larger is absurd, as a position is (see `progdf.formats.repair`)."""
 _FARTHEST = {"log_scales": 80.0}
@@ -75,9 +78,15 @@ class Gdf:
 
 
 def fingerprint(scene: Gaussians) -> SceneFingerprint:
-    """What a .gdf of this scene must carry."""
-    means = scene.means.detach().to("cpu", torch.float32).contiguous()
-    return SceneFingerprint(len(scene), hashlib.sha256(means.numpy().tobytes()).hexdigest())
+    """What a .gdf of this scene must carry; hashed once while the means are the same, unwritten tensor."""
+    means = scene.means
+    version = -1 if means.is_inference() else means._version
+    known_version, sha256 = _FINGERPRINTS.get(means, (-1, ""))
+    if version < 0 or version != known_version:
+        content = means.detach().to("cpu", torch.float32).contiguous().numpy().tobytes()
+        sha256 = hashlib.sha256(content).hexdigest()
+        _FINGERPRINTS[means] = version, sha256
+    return SceneFingerprint(len(scene), sha256)
 
 
 def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "the scene") -> None:

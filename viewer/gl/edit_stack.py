@@ -42,7 +42,7 @@ def described(
         entry: Any = layers[i]
         entry["places"], entry["weights"] = edit * len(packed.slots), weights_at[i]
         entry["covers"] = packed.covers[edit]
-        entry["numbers"] = put(np.array([[layer.cover, 0.0, 0.0, 0.0]], np.float32))
+        entry["numbers"] = put(np.array([[layer.clamped_strength, 0.0, 0.0, 0.0]], np.float32))
         entry["targets"]["numbers"] = -1
         for target, bases in packed.edits[edit].items():
             if not any(layer.gain(mover.attribute) for mover in bases.movers):

@@ -228,6 +228,14 @@ def test_weights_that_do_not_fit_are_refused(scene: Gaussians, shirt: Gdf, weigh
         compose(scene, [Layer(shirt, 0.5, weights=weights)])
 
 
+def test_a_scene_written_to_in_place_is_another_scene(scene: Gaussians, shirt: Gdf) -> None:
+    own = replace(scene, means=scene.means.clone())
+    compose(own, [Layer(shirt)])
+    own.means[0] += 1.0
+    with pytest.raises(ProgdfError, match="shirt was made for another scene"):
+        compose(own, [Layer(shirt)])
+
+
 def test_an_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> None:
     with pytest.raises(ProgdfError, match="shirt was made for another scene: it has 400 Gaussians"):
         compose(random_gaussians(30), [Layer(shirt)])
