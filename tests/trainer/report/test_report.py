@@ -21,7 +21,7 @@ from trainer.fit.evaluate import Judge, make_judge
 from trainer.fit.fit import without_idle_attributes
 from trainer.optimize.losses import GradientL1
 from trainer.report.measures import courses
-from trainer.report.plots import LINES, Plot, draw_plot, ticks
+from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
 from trainer.store.memory import PeakMemory
 from trainer.views.crops import moving_attributes
@@ -104,17 +104,6 @@ def test_a_thumbnail_has_the_width_that_is_asked_for_and_is_never_tall(size: tup
     assert float((picture < 0.1).float().sum()) > 0
 
 
-@pytest.mark.parametrize(
-    ("low", "high"), [(0.0, 1.0), (23.96, 63.4), (0.9, 0.9), (-0.31, 0.27), (1e-4, 3e-4)]
-)
-def test_ticks_are_few_even_and_enclose_the_range(low: float, high: float) -> None:
-    marks = ticks(low, high)
-    assert 2 <= len(marks) <= 9
-    assert marks[0] <= low
-    assert marks[-1] >= high
-    assert np.allclose(np.diff(marks), marks[1] - marks[0])
-
-
 @pytest.mark.parametrize("scale", ["linear", "log"])
 def test_every_line_of_a_plot_is_drawn_in_its_colour(scale: str) -> None:
     x = [i / 10 for i in range(11)]
@@ -147,8 +136,8 @@ def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
     lines = {f"a name of some length {k}": ([0.0, 1.0], [k, k + 1.0]) for k in range(4)}
     picture = np.asarray(draw_plot(Plot("t", lines), 400, 270), dtype=int)
     for color in LINES[:4]:
-        rows = np.nonzero((np.abs(picture - np.array(color)).max(axis=2) <= 12).sum(axis=1) >= 10)[0]
-        assert rows.min() < 90, color  # the legend's, above the plot
+        blot = (np.abs(picture - np.array(color)).max(axis=2) <= 12).sum(axis=1)
+        assert np.nonzero(blot >= 10)[0].max() > 210, color  # the legend's, below the plot
 
 
 PEAKS = """
