@@ -22,7 +22,7 @@ from progdf.field.rendered import Render
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.rasterize import alpha_weights, render, set_threads
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 from progdf.region import from_mask
 
 AT_SNAPSHOTS = 6

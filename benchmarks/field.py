@@ -25,7 +25,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import written_whole
 from progdf.rasterize import set_threads
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 
 from .courses import KnownCourse, edit_of, known_course, milliseconds
 from .field_forms import Form, baked_forms

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics
 from progdf.rasterize import rasterize, reference, set_threads
+from progdf.rasterize.engines import ActivatedGaussians, RasterView
 
 from .table import Table
 
@@ -124,9 +125,8 @@ def _image(engine: str, gaussians: tuple[Tensor, ...], camera: Camera) -> Tensor
         )
         return image
     window = (0, 0, *size)
-    splats, _ = reference.project(
-        means, quats, scales, opacities, colors, camera.viewmat, camera.K, *size, 0.01, None, False, window
-    )
+    view = RasterView(camera.viewmat, camera.K, *size, window)
+    splats, _ = reference.project(ActivatedGaussians(*gaussians), view)
     image, _ = reference.blend(three_sigma(splats), window, means.new_zeros(3))
     return image
 

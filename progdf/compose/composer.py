@@ -20,7 +20,7 @@ from torch import Tensor
 
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 
 from .effects import Effects, changed_edits, changed_gains, effects_of
 from .kernel import compose_rows

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.jit import Number, kernel
+from progdf.rasterize.cpu.jit import Number, kernel
 
 BLOCK = 256
 """Rows worked on at once: the sums of a channel stay in the first cache. The kernels spell it out."""

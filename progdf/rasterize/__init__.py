@@ -12,10 +12,7 @@ identity.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
-from functools import cache
-from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -24,15 +21,10 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
 from .conventions import RasterInfo
-from .threads import set_threads
+from .cpu.parallel import set_threads
+from .engines import ENGINES, ActivatedGaussians, Crop, RasterView, get_engine
 
 __all__ = ["ENGINES", "Crop", "RasterInfo", "alpha_weights", "rasterize", "render", "set_threads"]
-
-Crop = tuple[int, int, int, int]
-"""A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
-
-ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu"}
-"""Engine name -> module with `rasterize` and `alpha_weights`, imported when first used."""
 
 
 def rasterize(
@@ -95,11 +87,9 @@ def rasterize(
         background = torch.tensor(background, dtype=means.dtype)
     if tuple(background.shape) != (3,):
         raise ValueError(f"background has shape {list(background.shape)}, expected [3]")
-    image, transmittance, info = _engine(engine).rasterize(
-        means, quats, scales, opacities, colors, viewmat, K, width, height,
-        background, near, sh_degree, antialiased, window, grad_rows,
-    )  # fmt: skip
-    return image, transmittance, info
+    gaussians = ActivatedGaussians(means, quats, scales, opacities, colors)
+    view = RasterView(viewmat, K, width, height, window, near, sh_degree, antialiased)
+    return get_engine(engine).rasterize(gaussians, view, background, grad_rows)
 
 
 def render(
@@ -154,26 +144,15 @@ def alpha_weights(
     """
     if tuple(mask.shape) != (camera.height, camera.width):
         raise ValueError(f"mask has shape {list(mask.shape)}, expected [{camera.height}, {camera.width}]")
+    activated = ActivatedGaussians(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh
+    )
+    window = (0, 0, camera.width, camera.height)
+    view = RasterView(
+        camera.viewmat, camera.K, camera.width, camera.height, window, near, None, gaussians.antialiased
+    )
     with torch.no_grad():
-        weights: Tensor = _engine(engine).alpha_weights(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            camera.viewmat,
-            camera.K,
-            mask,
-            near,
-            gaussians.antialiased,
-        )
-    return weights
-
-
-@cache
-def _engine(name: str) -> ModuleType:
-    if name not in ENGINES:
-        raise ValueError(f"there is no rasteriser '{name}', expected one of {', '.join(ENGINES)}")
-    return importlib.import_module(ENGINES[name])
+        return get_engine(engine).alpha_weights(activated, view, mask)
 
 
 def _check_shapes(

@@ -10,43 +10,38 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .blend_lists import add_gradients, add_pictures, list_weights
-from .cpu import float32, list_view, make_view
-from .jit import running
+from .cpu.engine import bin_view, float32, make_pinhole, share_tiles
+from .cpu.jit import compilation
+from .cpu.weights import Runs, add_gradients, add_images, list_weights
+from .engines import ActivatedGaussians, Crop, RasterView
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class ColorMap:
-    """What each of M Gaussians weighs in each pixel of a window: αT, run by run of one Gaussian in one tile.
+    """What each of M Gaussians weighs in each pixel of a window: αT.
 
     Args:
         count: M
         size: height and width of the window
-        rows: the Gaussian of each run, 0..M−1. [R] int32
-        starts: first entry of each run, and the number of entries. [R+1] int64
-        pixels, weights: of each entry: pixel of the window, row by row; αT. [E] int32, [E] float32
+        runs: the weights
     """
 
     count: int
     size: tuple[int, int]
-    rows: Array
-    starts: Array
-    pixels: Array
-    weights: Array
+    runs: Runs
 
     def picture(self, colors: Tensor) -> Tensor:
         """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
         image = np.zeros((self.size[0] * self.size[1], 3), np.float32)
-        add_pictures(self.rows, self.starts, self.pixels, self.weights, float32(colors).numpy(), image)
+        add_images(self.runs, float32(colors).numpy(), image)
         return torch.from_numpy(image).view(*self.size, 3)
 
     def gradient(self, image: Tensor) -> Tensor:
         """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
         colors = np.zeros((self.count, 3), np.float32)
-        flat = float32(image).numpy().reshape(-1, 3)
-        add_gradients(self.rows, self.starts, self.pixels, self.weights, flat, colors)
+        add_gradients(self.runs, float32(image).numpy().reshape(-1, 3), colors)
         return torch.from_numpy(colors)
 
 
@@ -60,7 +55,7 @@ def color_map(
     width: int,
     height: int,
     near: float,
-    crop: tuple[int, int, int, int],
+    crop: Crop,
     rows: Tensor,
     antialiased: bool = False,
 ) -> ColorMap:
@@ -71,24 +66,20 @@ def color_map(
         crop: x0, y0, x1, y1 of the window
         rows: which of the N Gaussians, distinct. [M] int64
     """
-    view = make_view(viewmat, K, width, height, near, None, antialiased, crop)
-    gaussians = [float32(tensor).detach().numpy() for tensor in (means, quats, scales, opacities)]
-    gaussians.append(np.zeros((len(means), 1, 3), np.float32))
+    camera = make_pinhole(RasterView(viewmat, K, width, height, crop, near, None, antialiased))
     listed = np.full(len(means), -1, np.int32)
     listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
-    with running("weights", 4) as workers:
-        team, lists = list_view(view, gaussians, workers, 2)
-        of_splats = np.empty(len(lists.ids), np.int32)
-        of_splats[lists.ranks] = listed[lists.ids]
-        counts = np.zeros((view.tiles, 2), np.int64)
-        given = (lists.splats, of_splats, view.window, view.grid, lists.tile_starts, lists.members)
-        none, floats = np.empty(0, np.int32), np.empty(0, np.float32)
-        team.share(list_weights, *given, False, counts, none, none.astype(np.int64), none, floats)
-        runs, entries = counts.sum(axis=0).tolist()
+    with compilation("weights", 4):
+        splats, lists = bin_view(ActivatedGaussians(means, quats, scales, opacities, means), camera)
+        counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
+        share_tiles(list_weights, camera, splats, lists, camera, listed, False, counts, _new_runs(0, 0))
+        runs = _new_runs(*counts.sum(axis=0).tolist())
         places = np.cumsum(counts, axis=0) - counts
-        run_rows, starts = np.empty(runs, np.int32), np.empty(runs + 1, np.int64)
-        pixels, weights = np.empty(entries, np.int32), np.empty(entries, np.float32)
-        team.share(list_weights, *given, True, places, run_rows, starts, pixels, weights)
-    starts[-1] = entries
+        share_tiles(list_weights, camera, splats, lists, camera, listed, True, places, runs)
     x0, y0, x1, y1 = crop
-    return ColorMap(len(rows), (y1 - y0, x1 - x0), run_rows, starts, pixels, weights)
+    return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
+
+
+def _new_runs(runs: int, entries: int) -> Runs:
+    starts = np.full(runs + 1, entries, np.int64)
+    return Runs(np.empty(runs, np.int32), starts, np.empty(entries, np.int32), np.empty(entries, np.float32))

@@ -23,6 +23,7 @@ from .conventions import (
     TRANSMITTANCE_MIN,
     RasterInfo,
 )
+from .engines import ActivatedGaussians, Crop, RasterView
 
 TILE = 16
 
@@ -49,36 +50,19 @@ class Splats:
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    background: Tensor,
-    near: float,
-    sh_degree: int | None,
-    antialiased: bool,
-    crop: tuple[int, int, int, int],
-    grad_rows: Tensor | None,
+    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.rasterize`; computed in the type of `means`, projection in float64."""
     if grad_rows is not None:
-        means, quats, scales, opacities, colors = (
-            tensor.detach().index_copy(0, grad_rows, tensor[grad_rows])
-            for tensor in (means, quats, scales, opacities, colors)
+        gaussians = ActivatedGaussians(
+            *(tensor.detach().index_copy(0, grad_rows, tensor[grad_rows]) for tensor in gaussians)
         )
-    splats, info = project(
-        means, quats, scales, opacities, colors, viewmat, K, width, height, near, sh_degree, antialiased, crop
-    )
-    image, transmittance = blend(splats, crop, background)
+    splats, info = project(gaussians, view)
+    image, transmittance = blend(splats, view.crop, background)
     return image, transmittance, info
 
 
-def blend(splats: Splats, crop: tuple[int, int, int, int], background: Tensor) -> tuple[Tensor, Tensor]:
+def blend(splats: Splats, crop: Crop, background: Tensor) -> tuple[Tensor, Tensor]:
     """Blend projected Gaussians tile by tile, front to back.
 
     Returns:
@@ -99,25 +83,12 @@ def blend(splats: Splats, crop: tuple[int, int, int, int], background: Tensor) -
     return window[..., :3] + transmittance[..., None] * background.to(window.dtype), transmittance
 
 
-def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    sh_degree: int | None,
-    antialiased: bool,
-    crop: tuple[int, int, int, int],
-) -> tuple[Splats, RasterInfo]:
-    """Project, cull and sort; arguments as in `rasterize`."""
-    dtype = means.dtype
+def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[Splats, RasterInfo]:
+    """Project, cull and sort."""
+    dtype = gaussians.means.dtype
+    width, height, sh_degree = view.width, view.height, view.sh_degree
     means, quats, scales, opacities, colors, viewmat, K = (
-        tensor.double() for tensor in (means, quats, scales, opacities, colors, viewmat, K)
+        tensor.double() for tensor in (*gaussians, view.viewmat, view.K)
     )
     used = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
     usable = means.isfinite().all(1) & scales.isfinite().all(1)
@@ -127,7 +98,7 @@ def project(
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     rows = usable.nonzero()[:, 0]
     points = means[rows] @ rotation.T + translation
-    front = points[:, 2] > near
+    front = points[:, 2] > view.near
     rows = rows[front]
     x, y, z = points[front].unbind(1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -146,16 +117,16 @@ def project(
     det0 = torch.linalg.cross(p0, p1).square().sum(1)
     det = det0 + DILATION * (a + c) + DILATION**2
     opacity = opacities[rows]
-    if antialiased:
+    if view.antialiased:
         opacity = opacity * (det0 / det).clamp_min(ANTIALIAS_FLOOR).sqrt()
     whitening = torch.stack(
         [((c + DILATION) / det).sqrt(), -b / (det * (c + DILATION)).sqrt(), (c + DILATION).rsqrt()], dim=1
     )
 
-    reach = (2.0 * torch.log(opacity.detach() / ALPHA_MIN).clamp_min(0.0)).sqrt()
-    extents = reach[:, None] * torch.stack([a + DILATION, c + DILATION], dim=1).detach().sqrt()
+    radius = (2.0 * torch.log(opacity.detach() / ALPHA_MIN).clamp_min(0.0)).sqrt()
+    extents = radius[:, None] * torch.stack([a + DILATION, c + DILATION], dim=1).detach().sqrt()
     low, high = (means2d - extents).detach(), (means2d + extents).detach()
-    x0, y0, x1, y1 = crop
+    x0, y0, x1, y1 = view.crop
     shown = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
     shown = shown & (opacity.detach() >= ALPHA_MIN) & colored[rows]
     depths = torch.zeros_like(opacities).index_copy(0, rows, z).detach().float()
@@ -205,24 +176,10 @@ def tile_weights(splats: Splats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor
     return alphas, alphas * before[:, :-1], before[:, -1], members
 
 
-def alpha_weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    mask: Tensor,
-    near: float,
-    antialiased: bool,
-) -> Tensor:
-    """See `progdf.rasterize.alpha_weights`; activated units."""
-    height, width = mask.shape
-    window = (0, 0, width, height)
-    splats, _ = project(
-        means, quats, scales, opacities, means.new_zeros(len(means), 3), viewmat, K, width, height,
-        near, None, antialiased, window,
-    )  # fmt: skip
+def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
+    """See `progdf.rasterize.alpha_weights`."""
+    means, width, height = gaussians.means, view.width, view.height
+    splats, _ = project(gaussians._replace(colors=means.new_zeros(len(means), 3)), view)
     # two channels, zero beyond the image's edge: the mask, and what is image at all
     inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])
     inside = torch.nn.functional.pad(inside, (0, -width % TILE, 0, -height % TILE))

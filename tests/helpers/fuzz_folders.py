@@ -21,7 +21,7 @@ from PIL import Image
 
 from progdf.formats.scene_file import load_scene
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.rasterize import jit
+from progdf.rasterize.cpu import jit
 from progdf.scene.region_spec import parse_region
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_json, changed_parts
 from tests.helpers.hostile import NPY_HEADERS
@@ -51,7 +51,7 @@ COSTLY = ("spz", "splat", "sog", "colmap", "kernels", *FILES_OF_RUNS)
 """A second or so for each input."""
 
 KERNEL = """
-from progdf.rasterize.jit import kernel
+from progdf.rasterize.cpu.jit import kernel
 
 @kernel(cache=True)
 def twice(number):
@@ -144,7 +144,9 @@ def _numbers(spec: str, folder: Path) -> Reader:
 def _kernels(folder: Path) -> Reader:
     """A damaged file of the cache costs a compilation; what is drawn stays right."""
     (folder / "kernels.py").write_text(KERNEL)
-    jit.CACHE = folder / "cache"
+    cache = folder / "cache"
+    cache.mkdir()
+    jit.kernel_cache = lambda: cache
 
     def twice() -> Callable[[int], int]:
         spec = importlib.util.spec_from_file_location("kernels", folder / "kernels.py")
@@ -156,20 +158,20 @@ def _kernels(folder: Path) -> Reader:
         return found
 
     assert twice()(4) == 8
-    jit.record_cache(jit.CACHE)
+    jit.record_cache(cache)
     good = folder / "good"
-    shutil.copytree(jit.CACHE, good)
+    shutil.copytree(cache, good)
     files = [path.relative_to(good) for path in sorted(good.rglob("*")) if path.is_file()]
 
     def change(rng: random.Random, path: Path) -> None:
-        shutil.rmtree(jit.CACHE)
-        shutil.copytree(good, jit.CACHE)
+        shutil.rmtree(cache)
+        shutil.copytree(good, cache)
         name = rng.choice(files)
         changed_bytes((good / name).read_bytes())(rng, path)
-        shutil.copyfile(path, jit.CACHE / name)
+        shutil.copyfile(path, cache / name)
 
     def read(_: Path) -> None:
-        jit.drop_damaged(jit.CACHE)
+        jit.drop_damaged(cache)
         assert twice()(4) == 8
 
     return "x", read, [change]

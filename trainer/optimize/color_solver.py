@@ -20,7 +20,7 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices, unpack
 from progdf.rasterize.color_maps import ColorMap, color_map
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 from progdf.sh import basis
 from trainer.views.crops import CropScene
 

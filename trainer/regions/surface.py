@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 from progdf.scene.bounds import normals_of
 from progdf.scene.neighbors import nearest_rows
 from progdf.sh import sh0_to_rgb

@@ -14,7 +14,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up

@@ -19,7 +19,7 @@ from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import Crop, rasterize
 from progdf.rasterize.color_maps import ColorMap, color_map
-from progdf.rasterize.threads import threads
+from progdf.rasterize.cpu.parallel import threads
 from progdf.sh import C0, basis
 
 from .clamp import clamp_towards

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from progdf.camera import NEAR, Camera
 from progdf.gaussians import Gaussians
-from progdf.pixel_cells import mark_cells, no_cells
 from progdf.rasterize import Crop, rasterize
+from progdf.rasterize.pixel_cells import mark_cells, no_cells
 from progdf.sh import C0
 from viewer.camera.up_axis import Vec3
 from viewer.gl.layout import SPLATS_PER_ROW

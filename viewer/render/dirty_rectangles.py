@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.pixel_cells import CELL
 from progdf.rasterize import Crop
+from progdf.rasterize.pixel_cells import CELL
 
 MOST_BOXES = 6
 
@@ -15,7 +15,7 @@ def boxes(cells: NDArray[np.bool_], size: tuple[int, int], worth: int) -> list[C
     """Boxes that do not overlap and hold all marked cells.
 
     Args:
-        cells: see `progdf.pixel_cells`
+        cells: see `progdf.rasterize.pixel_cells`
         size: of the picture: width, height
         worth: pixels that a further box has to save
 

@@ -17,8 +17,8 @@ from progdf.camera import Camera
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.pixel_cells import CELL, mark_cells, no_cells
 from progdf.rasterize import render
+from progdf.rasterize.pixel_cells import CELL, mark_cells, no_cells
 from progdf.region import Region
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import first_camera, to_camera

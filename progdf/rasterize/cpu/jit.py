@@ -1,4 +1,4 @@
-"""How the kernels are compiled: flags, the cache on disk, the message of a cold start, the lock."""
+"""How the kernels are compiled: flags, the cache on disk, the message of a cold start."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import threading
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import cache as once
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,8 +27,6 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import written_whole
 from progdf.io.user_folders import cache_folder, is_private, temporary_folder
 
-from .threads import threads
-
 log = logging.getLogger("progdf")
 
 FAST = {"nnan", "ninf", "nsz", "contract", "reassoc", "afn"}
@@ -36,19 +36,20 @@ Number = Any
 """A number inside a kernel, of the type numba infers: python's int and float cannot say float32 or uint64."""
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-_lock = threading.RLock()
+_compiling_lock, _building_lock = threading.RLock(), threading.Lock()
 _ready: set[str] = set()  # stages whose marker was seen
 
 
 def _source_version() -> str:
-    """Of all files here: numba's cache notices neither changed constants nor changed imported functions."""
+    """Of all files of the rasteriser: numba's cache notices neither changed constants nor changed imported
+    functions."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def _cache_folder() -> Path:
+def _find_cache_folder() -> Path:
     """A folder that this user may write, for this version of the kernels; never in the source tree."""
     if "NUMBA_CACHE_DIR" in os.environ:
         root = Path(os.environ["NUMBA_CACHE_DIR"])
@@ -132,10 +133,14 @@ def _recorded(folder: Path) -> dict[str, int]:
     return found if isinstance(found, dict) else {}
 
 
-CACHE = _cache_folder()
-if drop_damaged(CACHE):
-    log.warning("kernels kept in %s were damaged and are compiled anew", CACHE)
-atexit.register(record_cache, CACHE)
+@once
+def kernel_cache() -> Path:
+    """The folder of compiled kernels, made and checked when the first kernel is needed."""
+    folder = _find_cache_folder()
+    if drop_damaged(folder):
+        log.warning("kernels kept in %s were damaged and are compiled anew", folder)
+    atexit.register(record_cache, folder)
+    return folder
 
 
 def kernel(
@@ -146,61 +151,81 @@ def kernel(
     inline: bool = False,
     allocates: bool = False,
 ) -> Callable[[_F], _F]:
-    """Compile a function with numba.
+    """Compile a function with numba; it releases the interpreter's lock.
 
     Args:
         fast: with the flags of the pixel loops (`FAST`); otherwise strict IEEE
         contract: strict but for fused multiply-adds
-        cache: keep the machine code on disk; for functions that Python calls
+        cache: for functions that Python calls, not other kernels: the machine code is kept on disk, and the
+            cache is looked for at the first call
         inline: always inline into the calling kernel
-        allocates: may make arrays; one that may not leaves out to count who uses the arrays that it gets, for
-            which threads that share them would wait at each call
+        allocates: may make arrays; one that may not leaves out to count references to those that it gets,
+            for which threads that share them would wait at each call
     """
     flags = FAST if fast else {"contract"} if contract else False
 
-    def decorate(function: _F) -> _F:
-        before = config.CACHE_DIR
-        config.CACHE_DIR = str(
-            CACHE
-        )  # read when the decorator runs; other packages' caches stay where they are
-        try:
-            compiled: _F = numba.njit(
-                fastmath=flags,
-                cache=cache,
-                nogil=True,
-                error_model="numpy",
-                forceinline=inline,
-                _nrt=allocates,
-            )(function)
-        finally:
-            config.CACHE_DIR = before
+    def compile_now(function: _F) -> _F:
+        compiled: _F = numba.njit(
+            fastmath=flags,
+            cache=cache,
+            nogil=True,
+            error_model="numpy",
+            forceinline=inline,
+            _nrt=allocates,
+        )(function)
         return compiled
+
+    return _compile_when_called(compile_now) if cache else compile_now
+
+
+def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
+    def decorate(function: _F) -> _F:
+        compiled: _F | None = None
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:
+            nonlocal compiled
+            if compiled is None:
+                with _building_lock:
+                    compiled = compiled or _with_cache_folder(compile_now, function)
+            return compiled(*arguments)
+
+        return call  # type: ignore[return-value]
 
     return decorate
 
 
-def running(stage: str, seconds: int) -> AbstractContextManager[int]:
-    """Tell of kernels that have yet to be compiled, and give the number of threads to use.
+def _with_cache_folder(compile_now: Callable[[_F], _F], function: _F) -> _F:
+    before = config.CACHE_DIR  # read by the decorator; other packages' caches stay where they are
+    config.CACHE_DIR = str(kernel_cache())
+    try:
+        return compile_now(function)
+    finally:
+        config.CACHE_DIR = before
+
+
+def compilation(stage: str, seconds: int) -> AbstractContextManager[None]:
+    """Say it when the kernels that run in this context have yet to be compiled.
 
     Args:
-        stage: names the kernels that will run, to tell a cold start from a warm one
+        stage: names the kernels, to tell a cold start from a warm one
         seconds: about how long these take to compile
     """
-    return nullcontext(threads()) if stage in _ready else _compiling(stage, seconds)
+    return nullcontext() if stage in _ready else _first_run(stage, seconds)
 
 
 @contextmanager
-def _compiling(stage: str, seconds: int) -> Iterator[int]:
-    marker = CACHE / f"{stage}.ready"
-    with _lock:
+def _first_run(stage: str, seconds: int) -> Iterator[None]:
+    marker = kernel_cache() / f"{stage}.ready"
+    with _compiling_lock:
         cold = not marker.exists()
         if cold:
             log.warning(
                 "compiling the rasteriser's %s kernels (about %d s, once per machine)", stage, seconds
             )
-        yield threads()
+        yield
         if cold:
-            record_cache(CACHE)
+            record_cache(kernel_cache())
             with suppress(OSError):
                 marker.touch()
         _ready.add(stage)

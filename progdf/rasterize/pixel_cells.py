@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.conventions import ALPHA_MIN, DILATION
-from progdf.rasterize.geometry import dot, footprint, make_lens, vec
-from progdf.rasterize.jit import kernel
+from progdf.camera import Camera
 
-from .camera import Camera
+from .conventions import ALPHA_MIN, DILATION
+from .cpu.engine import make_pinhole
+from .cpu.jit import kernel
+from .cpu.project import Pinhole, Scene, footprint, largest_extents
+from .engines import RasterView
 
 Array = NDArray[Any]
 
 CELL = 8
 """Pixels of a cell's side; a cell spans whole rows of the rasteriser's tiles."""
 
-_REACH2 = 1.001 * 2.0 * math.log(1.0 / ALPHA_MIN)  # 1.001: a rotation is one only within rounding
 _MARGIN = 1.0  # px on each side: far more than rounding, far less than a cell
 
 
@@ -47,11 +48,10 @@ def mark_cells(
         camera: the view; antialiasing only makes what is touched smaller
         near: least camera z, world units
     """
-    k = camera.K.double().numpy()
-    intrinsics = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
-    viewmat = np.ascontiguousarray(camera.viewmat.double().numpy())
-    size = np.array([camera.width, camera.height], np.int64)
-    _mark(cells, means, quats, scales, opacities, rows, viewmat, intrinsics, size, near)
+    crop = (0, 0, camera.width, camera.height)
+    pinhole = make_pinhole(RasterView(camera.viewmat, camera.K, camera.width, camera.height, crop, near))
+    no_colors = np.empty((len(means), 1, 3), np.float32)
+    _mark(cells, rows, Scene(means, quats, scales, opacities, no_colors), pinhole)
 
 
 @kernel()
@@ -83,40 +83,20 @@ def _all_marked(cells: Array, x0: int, y0: int, x1: int, y1: int) -> bool:
 
 
 @kernel(contract=True, cache=True)
-def _mark(
-    cells: Array, means: Array, quats: Array, scales: Array, opacities: Array, rows: Array, viewmat: Array,
-    intrinsics: Array, size: Array, near: float,
-) -> None:  # fmt: skip
-    lens = make_lens(viewmat, intrinsics, size)
-    width, height = np.float64(size[0]), np.float64(size[1])
-    for k in range(rows.size):
-        i = rows[k]
-        mean, scale, opacity = vec(means, i), vec(scales, i), np.float64(opacities[i])
-        z = dot(lens.rows[2], mean) + lens.shift[2]
-        total = abs(mean[0]) + abs(mean[1]) + abs(mean[2]) + abs(scale[0]) + abs(scale[1]) + abs(scale[2])
-        if not (z > near and opacity >= ALPHA_MIN and total + opacity < np.inf):
+def _mark(cells: Array, rows: Array, scene: Scene, camera: Pinhole) -> None:
+    width, height = np.float64(camera.x1), np.float64(camera.y1)
+    for i in rows:
+        usable, px, py, _, wide2, high2 = largest_extents(camera, scene, i)
+        if not usable:
             continue
-        inv_z = 1.0 / z
-        px = lens.fx * (dot(lens.rows[0], mean) + lens.shift[0]) * inv_z + lens.cx
-        py = lens.fy * (dot(lens.rows[1], mean) + lens.shift[1]) * inv_z + lens.cy
-        # first a bound that needs no covariance, as in `projection.cull`: most land where others did
-        tan_x = min(max((px - lens.cx) / lens.fx, lens.low_x), lens.high_x)
-        tan_y = min(max((py - lens.cy) / lens.fy, lens.low_y), lens.high_y)
-        largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2]))) * inv_z
-        jx, jy = lens.fx * largest, lens.fy * largest
-        reach2 = _REACH2 if opacity <= 1.0 else 1.001 * 2.0 * math.log(opacity / ALPHA_MIN)
-        wide = math.sqrt(reach2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION))
-        high = math.sqrt(reach2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION))
-        x0, y0, x1, y1 = _cells_of(px, py, wide, high, width, height)
+        # first the bound that needs no covariance: most land where others did
+        x0, y0, x1, y1 = _cells_of(px, py, math.sqrt(wide2), math.sqrt(high2), width, height)
         if _all_marked(cells, x0, y0, x1, y1):
             continue
-        seen = footprint(
-            lens, mean, np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]),
-            np.float64(quats[i, 3]), scale,
-        )  # fmt: skip
-        reach2 = 2.0 * math.log(opacity / ALPHA_MIN)
-        wide = math.sqrt(max(0.0, reach2 * (seen.a + DILATION)))
-        high = math.sqrt(max(0.0, reach2 * (seen.c + DILATION)))
+        seen = footprint(camera, scene, i)
+        radius2 = 2.0 * math.log(np.float64(scene.opacities[i]) / ALPHA_MIN)
+        wide = math.sqrt(max(0.0, radius2 * (seen.a + DILATION)))
+        high = math.sqrt(max(0.0, radius2 * (seen.c + DILATION)))
         x0, y0, x1, y1 = _cells_of(px, py, wide, high, width, height)
         for y in range(y0, y1):
             for x in range(x0, x1):

@@ -1,4 +1,4 @@
-"""Kernels: colour of a Gaussian from spherical harmonics, and back. Signs and order as in `progdf.sh`."""
+"""Kernels: color of a Gaussian from spherical harmonics, and back. Signs and order as in `progdf.sh`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,26 @@ from numpy.typing import NDArray
 
 from progdf.sh import _C1, _C2, _C3, C0
 
-from .geometry import Vec
 from .jit import kernel
 
 Array = NDArray[Any]
+Vec = tuple[float, float, float]
+
+
+@kernel(contract=True, inline=True)
+def dot(a: Vec, b: Vec) -> float:
+    """a·b"""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel(contract=True, inline=True)
+def row_times(a: Vec, rows: tuple[Vec, Vec, Vec]) -> Vec:
+    """aᵀM for a matrix given by rows."""
+    return (
+        a[0] * rows[0][0] + a[1] * rows[1][0] + a[2] * rows[2][0],
+        a[0] * rows[0][1] + a[1] * rows[1][1] + a[2] * rows[2][1],
+        a[0] * rows[0][2] + a[1] * rows[1][2] + a[2] * rows[2][2],
+    )
 
 
 @kernel(inline=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -20,17 +21,19 @@ from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, rando
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 
-@pytest.mark.parametrize("room", [0, 8])
+@pytest.mark.parametrize("room", [0, 1, 8])
 def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_tiles(
     room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from progdf.rasterize import cpu
+    from progdf.rasterize.cpu import bin, engine
 
-    scene, camera = random_gaussians(2000, seed=6, sh_degree=1), orbit_camera(128, 96)
+    scene, camera = random_gaussians(4000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
-    monkeypatch.setattr(cpu, "_ROOM", room)
-    set_threads(1)
-    for again in (draw(scene, camera, "cpu"), draw(scene, camera, "cpu")):
+    monkeypatch.setattr(engine, "_ROOM", room)
+    monkeypatch.setattr(bin, "_WORTH_A_THREAD", 1)
+    for threads in (1, 1, 2, 3, 7):
+        set_threads(threads)
+        again = draw(scene, camera, "cpu")
         assert torch.equal(again.image, first.image)
         for name in INPUTS:
             assert torch.equal(again.gradients[name], first.gradients[name]), name
@@ -64,9 +67,9 @@ def test_camera_gradients_of_some_rows_only_are_refused() -> None:
 
 
 def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    from progdf.rasterize import cpu
+    from progdf.rasterize.cpu import engine
 
-    monkeypatch.setattr(cpu, "MOST_INTERSECTIONS", 100)
+    monkeypatch.setattr(engine, "MOST_INTERSECTIONS", 100)
     with pytest.raises(ProgdfError, match="more than 100; draw a smaller image or a crop") as error:
         render(random_gaussians(200, seed=1), orbit_camera(100, 60))
     assert "\n" not in str(error.value)
@@ -99,6 +102,7 @@ def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
     inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
     camera = front_camera()
+    draw(scene, camera, "cpu")  # so that the kernels are compiled
     monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, 77, dtype))
     image, _, info = rasterize(*leaves, camera.viewmat, camera.K, 40, 24, sh_degree=1)
     image.square().sum().backward()  # type: ignore[no-untyped-call]
@@ -130,13 +134,13 @@ def test_importing_progdf_does_not_load_the_compiler() -> None:
 def test_a_cold_start_says_once_that_it_compiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from progdf.rasterize import jit
+    from progdf.rasterize.cpu import jit
 
-    monkeypatch.setattr(jit, "CACHE", tmp_path)
+    monkeypatch.setattr(jit, "kernel_cache", lambda: tmp_path)
     monkeypatch.setattr(jit, "_ready", set())
     with caplog.at_level(logging.WARNING, logger="progdf"):
         for _ in range(2):
-            with jit.running("forward", 9):
+            with jit.compilation("forward", 9):
                 pass
     assert [record.getMessage() for record in caplog.records] == [
         "compiling the rasteriser's forward kernels (about 9 s, once per machine)"
@@ -144,8 +148,15 @@ def test_a_cold_start_says_once_that_it_compiles(
 
 
 def test_the_kernels_are_cached_outside_the_source_tree() -> None:
-    from progdf.rasterize import jit
+    from progdf.rasterize.cpu.jit import kernel_cache
 
     render(one_gaussian(), front_camera())
-    assert list(jit.CACHE.rglob("*.nbi"))
-    assert Path(__file__).parents[1] not in jit.CACHE.parents
+    assert list(kernel_cache().rglob("*.nbi"))
+    assert Path(__file__).parents[3] not in kernel_cache().parents
+
+
+def test_importing_the_kernels_writes_nothing(tmp_path: Path) -> None:
+    code = "import progdf.rasterize.cpu.engine, progdf.compose.composer, progdf.rasterize.pixel_cells"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+    assert not (tmp_path / "cache").exists()

@@ -1,0 +1,1 @@
+"""The fast engine: numba kernels, tile based, with an analytic backward pass."""

@@ -1,0 +1,244 @@
+"""The fast engine: numba kernels behind one `torch.autograd.Function`.
+
+Projection is computed in float64, pixels in float32, whatever the type of the inputs; results are float32.
+The image and the gradients are the same bits in every run and for every number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.rasterize.conventions import FRUSTUM_MARGIN, RasterInfo
+from progdf.rasterize.engines import ActivatedGaussians, RasterView
+
+from . import weights
+from .bin import TILE_H, TILE_W, TileLists, bin_splats, find_tiles
+from .blend import Picture, blend
+from .blend_backward import SUMS, blend_backward
+from .jit import compilation
+from .parallel import run_chunks, threads
+from .project import Pinhole, Scene, Splats, project
+from .project_backward import BLOCK, CAMERA, project_backward
+from .project_backward import new_scratch as project_backward_scratch
+from .sort import depth_order
+from .spans import new_scratch
+
+Array = NDArray[Any]
+_T = TypeVar("_T")
+
+MOST_INTERSECTIONS = 100_000_000
+"""(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
+
+_LEAST_TILES = 4  # fewer are not worth a call
+_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
+_ALL = np.empty(0, np.bool_)
+
+
+def rasterize(
+    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """See `progdf.rasterize.rasterize`."""
+    inputs = [float32(tensor) for tensor in (*gaussians, background)]
+    found: list[Array] = []
+    image, transmittance = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        make_pinhole(view), grad_rows, found, *inputs, view.viewmat, view.K
+    )
+    return image, transmittance, RasterInfo(*map(torch.from_numpy, found))
+
+
+def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
+    """See `progdf.rasterize.alpha_weights`."""
+    with compilation("weights", 4):
+        camera = make_pinhole(view)
+        splats, lists = bin_view(gaussians, camera)
+        sums = np.zeros((len(lists.members), weights.SUMS))
+        inside = float32(mask).numpy()
+        share_tiles(weights.accumulate_weights, camera, splats, lists, camera, inside, sums)
+        totals = np.zeros((len(gaussians.means), weights.SUMS))
+        weights.sum_slots(lists.offsets, sums, totals)
+    return torch.from_numpy(totals.astype(np.float32))
+
+
+def make_pinhole(view: RasterView) -> Pinhole:
+    """The view as kernels take it."""
+    rotation = view.viewmat.tolist()
+    (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
+    x0, y0, x1, y1 = view.crop
+    column, row = x0 // TILE_W, y0 // TILE_H
+    # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian;
+    # limits as in gsplat
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * view.width / fx, FRUSTUM_MARGIN * 0.5 * view.height / fy
+    return Pinhole(
+        rows=(tuple(rotation[0][:3]), tuple(rotation[1][:3]), tuple(rotation[2][:3])),
+        shift=(rotation[0][3], rotation[1][3], rotation[2][3]),
+        fx=fx, fy=fy, cx=cx, cy=cy,
+        low_x=-(cx / fx + margin_x), high_x=(view.width - cx) / fx + margin_x,
+        low_y=-(cy / fy + margin_y), high_y=(view.height - cy) / fy + margin_y,
+        near=float(view.near),
+        x0=x0, y0=y0, x1=x1, y1=y1,
+        column=column, row=row, columns=-(-x1 // TILE_W) - column, tile_rows=-(-y1 // TILE_H) - row,
+        degree=-1 if view.sh_degree is None else view.sh_degree,
+        antialiased=view.antialiased,
+    )  # fmt: skip
+
+
+def float32(tensor: Tensor) -> Tensor:
+    """As the kernels want it."""
+    if tensor.dtype is torch.float32 and tensor.is_cpu and tensor.is_contiguous():
+        return tensor
+    return tensor.to("cpu", torch.float32).contiguous()
+
+
+def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, TileLists]:
+    """The splats and the tiles' lists of a view without an image; colors are not read."""
+    arrays = [float32(tensor).detach().numpy() for tensor in gaussians[:4]]
+    arrays.append(np.zeros((len(gaussians.means), 1, 3), np.float32))
+    return _project_and_bin(Scene(*arrays), camera._replace(degree=-1), with_slots=True)
+
+
+def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
+    """Run `kernel(first, step, scratch, *arguments)` so that every tile is one kernel's."""
+    tiles = camera.columns * camera.tile_rows
+    # odd, so that one kernel's tiles are not those of one column
+    chunks = 1 if threads() == 1 else min(-(-tiles // _LEAST_TILES), 8 * threads() + 1)
+    run_chunks(lambda chunk: kernel(chunk, chunks, new_scratch(), *arguments), chunks)
+
+
+def _share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
+    """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
+    blocks = max(1, -(-count // BLOCK))
+    chunks = 1 if threads() == 1 else min(blocks, 4 * threads())
+    cuts = [min(count, blocks * chunk // chunks * BLOCK) for chunk in range(chunks + 1)]
+    return run_chunks(lambda chunk: kernel(cuts[chunk], cuts[chunk + 1]), chunks)
+
+
+@cache
+def _keep_freed_memory() -> None:
+    """Free one large block: from then on glibc keeps blocks up to this size, the largest that it ever keeps.
+
+    Otherwise every pass would hand its memory back to the system and take it anew page by page, which was a
+    fifth of the time of 20 000 Gaussians. Nothing touches the block, so it costs nothing, there or elsewhere.
+    """
+    np.empty((32 << 20) - (64 << 10), np.uint8)
+
+
+def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[Splats, TileLists]:
+    _keep_freed_memory()
+    n = len(scene.means)
+    splats = Splats(
+        np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, np.bool_), np.empty((n, 8)),
+        np.empty((n, 4), np.float32),
+    )  # fmt: skip
+    counts = np.empty(n, np.int32)
+
+    def find(begin: int, end: int, room: int) -> Array:
+        tiles = np.empty(room, np.int32)
+        return tiles[: find_tiles(begin, end, splats, camera, tiles, counts)]
+
+    def project_and_find(begin: int, end: int) -> Array:
+        project(begin, end, scene, camera, splats, np.empty(16))
+        return find(begin, end, _ROOM * (end - begin))
+
+    tiles = np.concatenate(_share_gaussians(project_and_find, n))
+    total = int(counts.sum(dtype=np.int64))
+    if total > MOST_INTERSECTIONS:
+        raise ProgdfError(
+            f"{int(splats.visible.sum())} Gaussians meet {total} tiles of the image, more than "
+            f"{MOST_INTERSECTIONS}; draw a smaller image or a crop, or take giant Gaussians out of the scene"
+        )
+    if len(tiles) < total:  # no room for those of some chunk
+        again = _share_gaussians(lambda begin, end: find(begin, end, int(counts[begin:end].sum())), n)
+        tiles = np.concatenate(again)
+    order = depth_order(splats.depths, splats.visible)
+    return splats, bin_splats(order, tiles, counts, camera.columns * camera.tile_rows, with_slots)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, camera: Pinhole, grad_rows: Tensor | None, found: list[Array], *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        *arrays, background = (tensor.numpy(force=True) for tensor in tensors[:6])
+        if camera.degree < 0:
+            arrays[4] = arrays[4].reshape(-1, 1, 3)
+        scene = Scene(*arrays)
+        out = _new_picture(camera)
+        with compilation("forward", 12):
+            splats, lists = _project_and_bin(scene, camera, any(ctx.needs_input_grad))
+            share_tiles(blend, camera, splats, lists, camera, background, out)
+        found[:] = splats.means2d, splats.depths, splats.visible
+        ctx.set_materialize_grads(False)
+        ctx.kept = camera, grad_rows, scene, background, splats, lists, out
+        results = torch.from_numpy(out.image), torch.from_numpy(out.transmittance)
+        ctx.save_for_backward(*tensors, results[1])
+        return results
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        camera, grad_rows, scene, background, splats, lists, out = ctx.kept
+        viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
+        by_out = Picture(_array(grads[0], out.image), _array(grads[1], out.transmittance), out.last)
+        wanted = _wanted(len(scene.means), grad_rows)
+        gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
+        sums = np.empty((len(lists.members), SUMS), np.float32)
+
+        by_camera = np.zeros((-(-len(scene.means) // BLOCK), CAMERA))
+
+        def backward_chunk(begin: int, end: int) -> None:
+            project_backward(
+                begin, end, scene, camera, lists.offsets, sums, wanted, gradients, by_camera,
+                project_backward_scratch(),
+            )  # fmt: skip
+
+        with compilation("backward", 5):
+            share_tiles(blend_backward, camera, splats, lists, camera, background, out, by_out, wanted, sums)
+            _share_gaussians(backward_chunk, len(scene.means))
+        results: list[Tensor | None] = [torch.from_numpy(array) for array in gradients]
+        if camera.degree < 0:
+            results[4] = torch.from_numpy(gradients.colors.reshape(-1, 3))
+        by_background, by_viewmat, by_K = ctx.needs_input_grad[8:]
+        results.append(_background_gradient(out.transmittance, by_out.image) if by_background else None)
+        results += _camera_gradients(by_camera, viewmat, K) if by_viewmat or by_K else (None, None)
+        return None, None, None, *results
+
+
+def _new_picture(camera: Pinhole) -> Picture:
+    height, width = camera.y1 - camera.y0, camera.x1 - camera.x0
+    planes = (np.empty((height, width), np.float32) for _ in range(2))
+    return Picture(np.empty((height, width, 3), np.float32), *planes)
+
+
+def _array(gradient: Tensor | None, like: Array) -> Array:
+    """A gradient; None is zero."""
+    return np.zeros_like(like) if gradient is None else np.ascontiguousarray(gradient.numpy())
+
+
+def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    camera = parts.sum(axis=0)
+    by_viewmat, by_K = np.zeros((4, 4)), np.zeros((3, 3))
+    by_viewmat[:3] = camera[:12].reshape(3, 4)
+    by_K[0, 0], by_K[1, 1], by_K[0, 2], by_K[1, 2] = camera[12:]
+    return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
+
+
+def _wanted(count: int, grad_rows: Tensor | None) -> Array:
+    """Which rows want gradients; [0] where all do. [N] bool"""
+    if grad_rows is None:
+        return _ALL
+    wanted = np.zeros(count, np.bool_)
+    wanted[grad_rows.numpy(force=True)] = True
+    return wanted
+
+
+def _background_gradient(transmittance: Array, grad_image: Array) -> Tensor:
+    per_channel = (grad_image * transmittance[..., None]).astype(np.float64).sum(axis=(0, 1))
+    return torch.from_numpy(per_channel.astype(np.float32))

@@ -1,0 +1,213 @@
+"""Kernel: from the sums of all intersections to gradients of the inputs, in float64, in one fixed order.
+
+With σ = ½|Lᵀd|² and e = Lᵀd (that is u, v), a change δΣ of the 2D covariance changes σ by −½ eᵀ(Lᵀ δΣ L)e
+and a move δm of the center by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ are all that is needed, and Lᵀ meets
+the 2D axes M = J·W·R·S in the product LᵀM, which does not cancel for needles when it is written with a cross
+product.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION
+
+from .blend_backward import SUMS
+from .jit import kernel
+from .project import (
+    UNIT,
+    Footprint,
+    Pinhole,
+    Scene,
+    blend2,
+    camera_center,
+    cross,
+    footprint,
+    times,
+    vec,
+)  # fmt: skip
+from .shading import Vec, dot, row_times, shade_backward
+
+Array = NDArray[Any]
+
+_PER_UNIT, _PER_UNIT2 = 1.0 / UNIT, 1.0 / (UNIT * UNIT)
+
+CAMERA = 16
+"""Numbers of the camera's gradient: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
+
+
+@kernel(contract=True, inline=True)
+def _axes_gradient(seen: Footprint, g: tuple[float, ...], antialiased: bool) -> tuple[float, float, Vec, Vec]:
+    """Gradients to the centre in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
+    # g = −dL/dσ; u and v are in units of their own
+    e0, e1 = -g[1] * _PER_UNIT, -g[2] * _PER_UNIT
+    h00, h01, h11 = -g[3] * _PER_UNIT2, -g[4] * _PER_UNIT2, -g[5] * _PER_UNIT2
+    sigma_y = math.sqrt(seen.c + DILATION)
+    inv_root = 1.0 / (math.sqrt(seen.det) * sigma_y)
+    l11, l21, l22 = sigma_y * sigma_y * inv_root, -seen.b * inv_root, 1.0 / sigma_y
+    # dL/dM = −L H (LᵀM); the first row of LᵀM is (p1 × (p0 × p1) + ε p0) / root
+    along = blend2(inv_root, cross(seen.p1, seen.normal), DILATION * inv_root, seen.p0)
+    d0 = blend2(-l11 * h00, along, -l11 * h01 * l22, seen.p1)
+    d1 = blend2(-(l21 * h00 + l22 * h01), along, -(l21 * h01 + l22 * h11) * l22, seen.p1)
+    if antialiased:
+        # opacity · sqrt(det0 / det): d log = (ddet0 / det0 − ddet / det) / 2, det = det0 + ε (a + c) + ε²
+        by_det0 = by_trace = 0.0
+        if seen.det0 >= ANTIALIAS_FLOOR * seen.det:
+            by_det0 = g[0] * (1.0 / seen.det0 - 1.0 / seen.det)
+            by_trace = -g[0] * DILATION / seen.det
+        d0 = blend2(1.0, d0, by_det0, cross(seen.p1, seen.normal))
+        d0 = blend2(1.0, d0, by_trace, seen.p0)
+        d1 = blend2(1.0, d1, by_det0, cross(seen.normal, seen.p0))
+        d1 = blend2(1.0, d1, by_trace, seen.p1)
+    return -l11 * e0, -(l21 * e0 + l22 * e1), d0, d1
+
+
+@kernel(contract=True, inline=True)
+def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, float, float]:
+    """Gradient to the quaternion as given; d0, d1: gradients to the rows a0ᵀR, a1ᵀR."""
+    q0, q1, q2, q3 = seen.quat
+    v0, v1, v2 = (
+        blend2(seen.a0[0], d0, seen.a1[0], d1),
+        blend2(seen.a0[1], d0, seen.a1[1], d1),
+        blend2(seen.a0[2], d0, seen.a1[2], d1),
+    )
+    sym01, sym02, sym12 = v0[1] + v1[0], v0[2] + v2[0], v1[2] + v2[1]
+    skew01, skew02, skew12 = v1[0] - v0[1], v0[2] - v2[0], v2[1] - v1[2]
+    gw = 2.0 * (q1 * skew12 + q2 * skew02 + q3 * skew01)
+    gx = 2.0 * (q2 * sym01 + q3 * sym02 + q0 * skew12 - 2.0 * q1 * (v1[1] + v2[2]))
+    gy = 2.0 * (q1 * sym01 + q3 * sym12 + q0 * skew02 - 2.0 * q2 * (v0[0] + v2[2]))
+    gz = 2.0 * (q1 * sym02 + q2 * sym12 + q0 * skew01 - 2.0 * q3 * (v0[0] + v1[1]))
+    radial = gw * q0 + gx * q1 + gy * q2 + gz * q3
+    k = seen.inv_length
+    return (gw - radial * q0) * k, (gx - radial * q1) * k, (gy - radial * q2) * k, (gz - radial * q3) * k
+
+
+@kernel(contract=True, inline=True)
+def _point_gradient(
+    camera: Pinhole, seen: Footprint, grad_px: float, grad_py: float, ga: Vec, gb: Vec
+) -> tuple[Vec, tuple[float, float], tuple[float, float]]:
+    """Gradients to the points in camera axes, to fx and fy, and to cx and cy. ga, gb: gradients to a0, a1.
+
+    px = fx x/z + cx; a0 = fx/z (W0 − tan_x W2), where tan_x is x/z or a limit ((width − cx) + half)/fx,
+    −(cx + half)/fx; the same for y.
+    """
+    inv_z = seen.inv_z
+    down_a, down_b = dot(ga, camera.rows[2]), dot(gb, camera.rows[2])
+    grad_jx = dot(ga, camera.rows[0]) - seen.tan_x * down_a
+    grad_jy = dot(gb, camera.rows[1]) - seen.tan_y * down_b
+    by_tan_x, by_tan_y = inv_z * down_a, inv_z * down_b  # over −fx, −fy
+    slope_x = camera.fx * (grad_px - (by_tan_x if seen.free_x else 0.0))
+    slope_y = camera.fy * (grad_py - (by_tan_y if seen.free_y else 0.0))
+    by_limit_x, by_limit_y = 0.0 if seen.free_x else by_tan_x, 0.0 if seen.free_y else by_tan_y
+    towards = slope_x * seen.x + slope_y * seen.y + grad_jx * camera.fx + grad_jy * camera.fy
+    by_focal = (
+        (grad_px * seen.x + grad_jx) * inv_z + by_limit_x * seen.tan_x,
+        (grad_py * seen.y + grad_jy) * inv_z + by_limit_y * seen.tan_y,
+    )
+    by_center = (grad_px + by_limit_x, grad_py + by_limit_y)
+    return (slope_x * inv_z, slope_y * inv_z, -towards * inv_z * inv_z), by_focal, by_center
+
+
+@kernel(contract=True, inline=True)
+def _add_four(by_camera: Array, block: int, row: int, a: Vec, b: float) -> None:
+    """Add to four numbers of the camera's gradient."""
+    by_camera[block, 4 * row] += a[0]
+    by_camera[block, 4 * row + 1] += a[1]
+    by_camera[block, 4 * row + 2] += a[2]
+    by_camera[block, 4 * row + 3] += b
+
+
+@kernel(contract=True, inline=True)
+def _set(rows: Array, i: int, value: Vec) -> None:
+    """Row i of an [N,3] array."""
+    rows[i, 0], rows[i, 1], rows[i, 2] = value
+
+
+BLOCK = 1024
+"""Gaussians whose parts of the camera's gradient are added up first: the same for every number of threads."""
+
+
+class Scratch(NamedTuple):
+    """What a thread works in: see `shading.shade_backward`; sums of a Gaussian's intersections, [9]."""
+
+    basis: Array
+    slopes: Array
+    total: Array
+
+
+def new_scratch() -> Scratch:
+    """For one thread."""
+    return Scratch(np.empty(16), np.zeros((16, 3)), np.empty(SUMS))
+
+
+@kernel(contract=True, cache=True)
+def project_backward(
+    begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, wanted: Array,
+    gradients: Scene, by_camera: Array, scratch: Scratch,
+) -> None:  # fmt: skip
+    """Gradients of `project`, which has the same first arguments.
+
+    Args:
+        offsets: first row of `sums` of each Gaussian. [N+1] int32
+        sums: see `blend_backward`. [I,9] float32
+        wanted: rows whose gradients are filled in, the others' are zero; [0]: all. [N] bool
+        gradients: out
+        by_camera: out, each block's part of the camera's gradient; zero on entry. [blocks,CAMERA] float64
+    """
+    gradients.means[begin:end] = 0.0
+    gradients.quats[begin:end] = 0.0
+    gradients.scales[begin:end] = 0.0
+    gradients.opacities[begin:end] = 0.0
+    gradients.colors[begin:end] = 0.0
+    eye, total = camera_center(camera), scratch.total
+    for i in range(begin, end):
+        if offsets[i] == offsets[i + 1] or (wanted.size > 0 and not wanted[i]):
+            continue
+        total[:] = 0.0
+        for slot in range(offsets[i], offsets[i + 1]):
+            for k in range(SUMS):
+                total[k] += sums[slot, k]
+        by_rgb, by_ray = (total[0], total[1], total[2]), (0.0, 0.0, 0.0)
+        mean, scale = vec(scene.means, i), vec(scene.scales, i)
+        if camera.degree < 0:
+            _set(gradients.colors[i], 0, by_rgb)
+        else:
+            by_ray = shade_backward(
+                i,
+                scene.colors,
+                camera.degree,
+                mean,
+                eye,
+                by_rgb,
+                scratch.basis,
+                scratch.slopes,
+                gradients.colors,
+            )
+        g = (total[3], total[4], total[5], total[6], total[7], total[8])
+        gradients.opacities[i] = g[0] / np.float64(scene.opacities[i])
+        seen = footprint(camera, scene, i)
+        grad_px, grad_py, d0, d1 = _axes_gradient(seen, g, camera.antialiased)
+        _set(gradients.scales, i, blend2(1.0, times(d0, seen.turned0), 1.0, times(d1, seen.turned1)))
+        d0, d1 = times(d0, scale), times(d1, scale)
+        by_quat = _quat_gradient(seen, d0, d1)
+        for k in range(4):
+            gradients.quats[i, k] = by_quat[k]
+        r0, r1, r2 = seen.rotation
+        ga, gb = (dot(r0, d0), dot(r1, d0), dot(r2, d0)), (dot(r0, d1), dot(r1, d1), dot(r2, d1))
+        point, by_focal, by_center = _point_gradient(camera, seen, grad_px, grad_py, ga, gb)
+        _set(gradients.means, i, blend2(1.0, row_times(point, camera.rows), 1.0, by_ray))
+        jx, jy = camera.fx * seen.inv_z, camera.fy * seen.inv_z
+        row0, row1 = blend2(point[0], mean, jx, ga), blend2(point[1], mean, jy, gb)
+        row2 = blend2(point[2], mean, -1.0, blend2(jx * seen.tan_x, ga, jy * seen.tan_y, gb))
+        # and the colors' by the eye, −RᵀT
+        row0 = blend2(1.0, row0, camera.shift[0], by_ray)
+        row1 = blend2(1.0, row1, camera.shift[1], by_ray)
+        row2 = blend2(1.0, row2, camera.shift[2], by_ray)
+        _add_four(by_camera, i // BLOCK, 0, row0, point[0] + dot(by_ray, camera.rows[0]))
+        _add_four(by_camera, i // BLOCK, 1, row1, point[1] + dot(by_ray, camera.rows[1]))
+        _add_four(by_camera, i // BLOCK, 2, row2, point[2] + dot(by_ray, camera.rows[2]))
+        _add_four(by_camera, i // BLOCK, 3, (by_focal[0], by_focal[1], by_center[0]), by_center[1])

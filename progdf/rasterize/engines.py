@@ -1,0 +1,64 @@
+"""The engines: one signature, a line each."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple, Protocol, cast
+
+from torch import Tensor
+
+from .conventions import RasterInfo
+
+Crop = tuple[int, int, int, int]
+"""A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
+
+ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu.engine"}
+"""Engine name -> module that is an `Engine`, imported when first used."""
+
+
+class ActivatedGaussians(NamedTuple):
+    """N Gaussians in activated units; what each is, is told by `progdf.rasterize.rasterize`."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+@dataclass(frozen=True)
+class RasterView:
+    """A camera and what is drawn of its image; see `progdf.rasterize.rasterize`."""
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+    crop: Crop
+    near: float = 0.01
+    sh_degree: int | None = None
+    antialiased: bool = False
+
+
+class Engine(Protocol):
+    """What draws; shapes have been checked."""
+
+    def rasterize(
+        self, gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
+    ) -> tuple[Tensor, Tensor, RasterInfo]:
+        """See `progdf.rasterize.rasterize`."""
+        ...
+
+    def alpha_weights(self, gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
+        """See `progdf.rasterize.alpha_weights`; colors are not read."""
+        ...
+
+
+@cache
+def get_engine(name: str) -> Engine:
+    """The engine of that name."""
+    if name not in ENGINES:
+        raise ValueError(f"there is no rasteriser '{name}', expected one of {', '.join(ENGINES)}")
+    return cast(Engine, importlib.import_module(ENGINES[name]))

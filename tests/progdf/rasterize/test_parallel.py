@@ -1,0 +1,109 @@
+"""Chunks that threads share are each done once, whoever does them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from progdf.rasterize import set_threads
+from progdf.rasterize.cpu.parallel import run_chunks
+from progdf.rasterize.cpu.sort import depth_order
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("chunks", [0, 1, 3, 1000])
+def test_every_chunk_is_done_once_and_results_are_in_order(threads: int, chunks: int) -> None:
+    set_threads(threads)
+    done: list[int] = []
+
+    def square(chunk: int) -> int:
+        done.append(chunk)
+        return chunk * chunk
+
+    assert run_chunks(square, chunks) == [chunk * chunk for chunk in range(chunks)]
+    assert sorted(done) == list(range(chunks))
+
+
+def test_a_thread_of_the_pool_takes_part() -> None:
+    met = threading.Barrier(2, timeout=60)
+    run_chunks(lambda _: met.wait(), 2)
+
+
+def test_many_callers_at_once_each_get_their_own() -> None:
+    with ThreadPoolExecutor(8) as callers:
+        found = list(callers.map(lambda n: run_chunks(lambda chunk: n * chunk, 50), range(40)))
+    assert found == [[n * chunk for chunk in range(50)] for n in range(40)]
+
+
+def test_a_caller_is_not_kept_waiting_by_a_pool_that_is_busy() -> None:
+    release, busy = threading.Event(), threading.Barrier(3, timeout=60)
+
+    def hold(_: int) -> None:
+        busy.wait()
+        release.wait(60)
+
+    holder = threading.Thread(target=run_chunks, args=(hold, 2))
+    holder.start()
+    busy.wait()  # the holder and, on a machine of two cores, the pool's only thread
+    assert run_chunks(lambda chunk: chunk, 10) == list(range(10))
+    release.set()
+    holder.join()
+
+
+def test_an_error_in_any_thread_reaches_the_caller_when_all_are_done() -> None:
+    met, done = threading.Barrier(2, timeout=60), []
+
+    def fail(chunk: int) -> None:
+        if chunk < 2:
+            met.wait()
+            if threading.current_thread() is not threading.main_thread():
+                raise MemoryError("none left")
+        done.append(chunk)
+
+    with pytest.raises(MemoryError, match="none left"):
+        run_chunks(fail, 20)
+    assert len(done) == 19
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_process_gets_threads_of_its_own() -> None:
+    run_chunks(lambda chunk: chunk, 2)
+    child = os.fork()
+    if child == 0:
+        try:
+            met = threading.Barrier(2, timeout=60)
+            os._exit(0 if len(run_chunks(lambda _: met.wait(), 2)) == 2 else 1)
+        finally:
+            os._exit(1)
+    _, status = os.waitpid(child, 0)
+    assert status == 0
+
+
+def test_python_ends_after_threads_have_drawn() -> None:
+    code = "from progdf.rasterize.cpu.parallel import *; set_threads(2); run_chunks(print, 4)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=600, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000, 200_000])
+@pytest.mark.parametrize("values", ["equal", "many", "of all sizes"])
+def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
+    rng = np.random.default_rng(0)
+    kinds = {
+        "equal": [3.0],
+        "many": np.linspace(0.02, 90.0, 5000),
+        "of all sizes": np.geomspace(1e-38, 3e38, 999),
+    }
+    depths = rng.choice(np.asarray(kinds[values], np.float32), count)
+    visible = rng.random(count) < 0.9
+    rows = np.flatnonzero(visible)
+    expected = rows[np.argsort(depths[visible], kind="stable")]
+    np.testing.assert_array_equal(depth_order(depths, visible), expected)

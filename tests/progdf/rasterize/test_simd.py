@@ -1,0 +1,139 @@
+"""Eight numbers at once inside kernels do what numpy does to arrays of eight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from progdf.rasterize.cpu.jit import Number, kernel
+from progdf.rasterize.cpu.simd import (
+    WIDTH,
+    Vector,
+    broadcast,
+    lane_indices,
+    lane_sum,
+    lane_sums,
+    ldexp,
+    load,
+    select,
+    store,
+    truncate,
+)
+from progdf.rasterize.cpu.spans import exp2
+
+Array = NDArray[Any]
+
+
+def numbers(seed: int, rows: int = 1) -> Array:
+    return np.random.default_rng(seed).normal(size=(rows, WIDTH)).astype(np.float32) * 3
+
+
+@kernel(fast=True)
+def _arithmetic(a: Array, b: Array, single: Number, out: Array) -> None:
+    x, y = load(a, np.uint64(0)), load(b, np.uint64(0))
+    store(out, np.uint64(0), x + y)
+    store(out, np.uint64(8), x - y)
+    store(out, np.uint64(16), single * x)
+    store(out, np.uint64(24), x / y)
+    added = x
+    added += single
+    store(out, np.uint64(32), added)
+
+
+def test_arithmetic_is_lane_by_lane_and_a_single_number_stands_for_eight() -> None:
+    a, b = numbers(0)[0], numbers(1)[0]
+    out = np.zeros(40, np.float32)
+    _arithmetic(a, b, np.float32(1.5), out)
+    expected = [a + b, a - b, np.float32(1.5) * a, a / b, a + np.float32(1.5)]
+    np.testing.assert_allclose(out.reshape(5, 8), expected, rtol=2e-7)
+
+
+@kernel(fast=True)
+def _comparisons(a: Array, b: Array, out: Array) -> None:
+    x, y, one, zero = load(a, np.uint64(0)), load(b, np.uint64(0)), np.float32(1.0), np.float32(0.0)
+    store(out, np.uint64(0), select(x < y, broadcast(one), broadcast(zero)))
+    store(out, np.uint64(8), select(x <= y, one, zero))
+    store(out, np.uint64(16), select(x > y, one, zero))
+    store(out, np.uint64(24), select((zero < x) & (x < y), x, y))
+
+
+def test_comparisons_choose_lane_by_lane_and_tell_less_from_equal() -> None:
+    a, b = numbers(2)[0], numbers(3)[0]
+    b[:3] = a[:3]
+    out = np.zeros(32, np.float32)
+    _comparisons(a, b, out)
+    expected = [a < b, a <= b, a > b, np.where((a > 0) & (a < b), a, b)]
+    np.testing.assert_array_equal(out.reshape(4, 8), np.array(expected, np.float32))
+
+
+@kernel(fast=True)
+def _at(source: Array, start: Number, out: Array) -> None:
+    store(out, start, load(source, start) + lane_indices())
+
+
+def test_loads_and_stores_begin_at_any_place_and_leave_the_rest_alone() -> None:
+    source, out = np.arange(20, dtype=np.float32), np.full(20, -1, np.float32)
+    _at(source, np.uint64(5), out)
+    np.testing.assert_array_equal(out[5:13], np.arange(5, 13) + np.arange(8))
+    assert (out[:5] == -1).all()
+    assert (out[13:] == -1).all()
+
+
+@kernel(fast=True)
+def _sums(rows: Array, out: Array) -> None:
+    flat = rows.reshape(-1)
+    r = (
+        load(flat, np.uint64(0)), load(flat, np.uint64(8)), load(flat, np.uint64(16)),
+        load(flat, np.uint64(24)), load(flat, np.uint64(32)), load(flat, np.uint64(40)),
+        load(flat, np.uint64(48)), load(flat, np.uint64(56)),
+    )  # fmt: skip
+    store(out, np.uint64(0), lane_sums(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7]))
+    for k in range(8):
+        out[8 + k] = lane_sum(load(flat, np.uint64(8 * k)))
+
+
+def test_eight_sums_at_once_are_eight_sums_one_by_one() -> None:
+    rows, out = numbers(4, rows=8), np.zeros(16, np.float32)
+    _sums(rows, out)
+    np.testing.assert_allclose(out[:8], rows.sum(axis=1, dtype=np.float64), rtol=1e-5)
+    np.testing.assert_allclose(out[8:], rows.sum(axis=1, dtype=np.float64), rtol=1e-5)
+
+
+@kernel(fast=True)
+def _wholes(a: Array, out: Array) -> None:
+    x = load(a, np.uint64(0))
+    store(out, np.uint64(0), truncate(x))
+    store(out, np.uint64(8), ldexp(broadcast(np.float32(0.75)), truncate(x)))
+
+
+def test_whole_numbers_are_cut_towards_zero_and_scale_by_powers_of_two() -> None:
+    a, out = np.array([-125.5, -3.999, -1, -0.5, 0, 0.5, 3.999, 100], np.float32), np.zeros(16, np.float32)
+    _wholes(a, out)
+    np.testing.assert_array_equal(out[:8], np.trunc(a))
+    np.testing.assert_array_equal(out[8:], 0.75 * 2.0 ** np.trunc(a))
+
+
+@kernel(fast=True)
+def _exp2(a: Array, out: Array) -> None:
+    for k in range(a.size // 8):
+        at = np.uint64(8 * k)
+        powers: Vector = exp2(load(a, at))
+        store(out, at, powers)
+
+
+def test_powers_of_two_are_right_to_the_last_bits_and_exact_at_whole_numbers() -> None:
+    a = np.concatenate([np.linspace(-20, 0, 4000), -np.arange(120.0), np.zeros(8)]).astype(np.float32)
+    out = np.empty_like(a)
+    _exp2(a, out)
+    np.testing.assert_allclose(out, np.exp2(a.astype(np.float64)), rtol=2.5e-7)
+    np.testing.assert_array_equal(out[4000:4120], np.exp2(-np.arange(120.0)))
+
+
+def test_vectors_of_another_type_are_refused_when_the_kernel_is_compiled() -> None:
+    from numba.core.errors import TypingError
+
+    with pytest.raises(TypingError):
+        _arithmetic(numbers(0)[0], numbers(1)[0], "one", np.zeros(40, np.float32))
