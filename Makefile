@@ -53,9 +53,9 @@ lint: setup extras
 bench: setup
 	$(BIN)/python -m benchmarks
 
-# Everything the README shows that a command made.
+# Everything the README and the documents show that a command made.
 pictures: setup window
 	$(BIN)/progdf demo --out demo --no-window
 	cp demo/hero.png demo/two-sliders.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
-	$(BIN)/python -m benchmarks --readme README.md
+	$(BIN)/python -m benchmarks --markdown docs/benchmarks.md

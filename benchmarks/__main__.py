@@ -42,7 +42,7 @@ class Options:
     Args:
         what: rasterize, field, viewer, frames, window; all of them when none is named
         json: also write the tables to this JSON file
-        readme: also put the tables between their markers in this Markdown file
+        markdown: also put the tables between their markers in this Markdown file
         runs: finished run folders whose recorded edits `field` measures beside the bear's
         plot: `field` also draws its errors into this PNG file
         scenes: .ply files that viewer, frames and window draw in place of the bears
@@ -51,7 +51,7 @@ class Options:
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     json: Path | None = None
-    readme: Path | None = None
+    markdown: Path | None = None
     runs: tuple[Path, ...] = ()
     plot: Path | None = None
     scenes: tuple[Path, ...] = ()
@@ -76,8 +76,8 @@ def main(argv: Sequence[str]) -> int:
     for output in (options.json, options.plot):  # told now, not when an hour has been measured
         if output is not None and not output.parent.is_dir():
             raise ProgdfError(f"the folder {output.parent} does not exist; make it first")
-    if options.readme is not None and not options.readme.is_file():
-        raise ProgdfError(f"{options.readme} does not exist; check the name and the folder")
+    if options.markdown is not None and not options.markdown.is_file():
+        raise ProgdfError(f"{options.markdown} does not exist; check the name and the folder")
     given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
     if options.runs:
         given["field"]["recorded"] = [_function(RECORDED)(run) for run in options.runs]
@@ -101,9 +101,9 @@ def main(argv: Sequence[str]) -> int:
         written = {"machine": machine(), "tables": [asdict(table) for table in tables]}
         with written_whole(options.json) as beside:
             beside.write_text(json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    if options.readme:
-        filled = put_tables(options.readme.read_text(encoding="utf-8"), tables)
-        with written_whole(options.readme) as beside:
+    if options.markdown:
+        filled = put_tables(options.markdown.read_text(encoding="utf-8"), tables)
+        with written_whole(options.markdown) as beside:
             beside.write_text(filled, encoding="utf-8")
     return 0
 

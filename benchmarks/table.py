@@ -16,7 +16,7 @@ class Table:
     """One benchmark's result.
 
     Args:
-        name: short, for the README's markers and the JSON file
+        name: short, for the markers and the JSON file
         title: one line
         columns: headings, with units
         rows: one text a column

@@ -92,7 +92,7 @@ class Start:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for the README and for `python -m benchmarks`.
+    """Measure, for docs/benchmarks.md.
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is also laid over itself four times

@@ -107,7 +107,7 @@ class Result:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for the README and for `python -m benchmarks`.
+    """Measure, for docs/benchmarks.md.
 
     Args:
         scenes: .ply files that take the place of the bears

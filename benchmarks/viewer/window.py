@@ -76,7 +76,7 @@ class Dragging:
 
 
 def tables(scenes: Sequence[Path] = (), seconds: float = DRAG_S) -> list[Table]:
-    """Measure, for the README and for `python -m benchmarks`.
+    """Measure, for docs/benchmarks.md.
 
     Args:
         scenes: .ply files of which the smallest takes the place of the bear

@@ -1,4 +1,4 @@
-"""Several edits on one scene: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s) (method.md 6).
+"""Several edits on one scene: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s) (docs/method.md 6).
 
 `compose` is the plain form that states the rules. `progdf.compose.composer.Composer` gives the same numbers
 while a slider is dragged, in buffers that are made once.

@@ -1,4 +1,4 @@
-"""Baking: a network becomes the separable field that the viewer runs (method.md 5).
+"""Baking: a network becomes the separable field that the viewer runs (docs/method.md 5).
 
 The field is asked at nodes, both ends are pinned to what they must be, and the course between is factored.
 Nodes and factors are chosen when the edit is made and kept in its file, with the error that they cost.

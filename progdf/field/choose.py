@@ -1,5 +1,5 @@
 """Which field to ship: ranks by rendered error per byte, kinds by the fewest bytes that meet the target
-(method.md 5).
+(docs/method.md 5).
 
 Nothing is fitted and rendered only to be thrown away: `rendered_courses` looks at the trajectory once,
 ranks are grown on what that predicts, and the pictures have the last word.

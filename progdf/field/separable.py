@@ -1,5 +1,5 @@
 """The separable field: Δ_i(s) = Σ_k B_ik a_k(s), one small sum per attribute, fitted by weighted SVD
-(method.md 5).
+(docs/method.md 5).
 
 Basis 0 is the recorded end in float32, so that s = 1 has no error. What it leaves is a matrix of snapshots
 × numbers whose leading singular vectors are bases 1..R; those are kept as int8, and the coefficients are

@@ -1,4 +1,4 @@
-"""How a slider feels: does every step show, do they show equally, does anything jump (method.md 7)."""
+"""How a slider feels: does every step show, do they show equally, does anything jump (docs/method.md 7)."""
 
 from __future__ import annotations
 

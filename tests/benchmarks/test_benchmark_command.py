@@ -10,7 +10,7 @@ from benchmarks.__main__ import main
 from progdf.errors import ProgdfError
 
 
-@pytest.mark.parametrize("option", ["--json", "--plot", "--readme"])
+@pytest.mark.parametrize("option", ["--json", "--plot", "--markdown"])
 def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
     option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

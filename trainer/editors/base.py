@@ -11,7 +11,7 @@ from torch import Tensor
 from trainer.views.view import View
 
 EditKind = Literal["colour", "style", "geometry"]
-"""What an edit moves, which chooses learning rates and loss weights (method.md 3)."""
+"""What an edit moves, which chooses learning rates and loss weights (docs/method.md 3)."""
 
 Confine = Literal["auto", "yes", "no"]
 """Whether what changed outside the region is put back; auto: unless the edit moves parts."""

@@ -1,7 +1,7 @@
 """What is measured of an edit, on views that training has not seen and on the region's own pixels.
 
 A whole picture of which the region is 3 % would flatter every figure; so errors are taken over the pixels
-that show the region or that the edit changes (method.md 7).
+that show the region or that the edit changes (docs/method.md 7).
 """
 
 from __future__ import annotations

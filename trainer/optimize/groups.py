@@ -2,7 +2,7 @@
 
 Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever colour
 it lies on. So the parts' motions are found first, and the members' own offsets live in the frames of their
-parts from then on: what is learnt of a hand moves, turns and grows with the hand (method.md 3, large moves).
+parts from then on: what is learnt of a hand moves, turns and grows with the hand (docs/method.md 3, large moves).
 The way between two strengths is the parts' way, not the optimiser's: a slider shows the hand in motion.
 """
 

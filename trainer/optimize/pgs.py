@@ -1,7 +1,7 @@
 """PGS, progressive Gaussian splatting (ProGDF, AAAI 2025): the edit optimisation that records its own way.
 
 The paper lets one optimisation run towards the edited views and keeps its path. Its own in-betweens look
-worse than a straight line (method.md 3), so the targets are staged here: the editor pictures the edit at
+worse than a straight line (docs/method.md 3), so the targets are staged here: the editor pictures the edit at
 several strengths and the members are optimised towards each in turn. Within a stage the target moves too,
 from the last stage's pictures to its own, so that the way between them is short and straight.
 
@@ -40,7 +40,7 @@ _RATES_3DGS = {
     "sh0": 2.5e-3,
     "shN": 1.25e-4,
 }
-# How many times those an edit needs to arrive within a few hundred steps (method.md 3). A colour edit leaves
+# How many times those an edit needs to arrive within a few hundred steps (docs/method.md 3). A colour edit leaves
 # the geometry alone: moving it too costs 1.4 dB on held-out views (30.6, not 32.0) and 11 floats a Gaussian.
 _MULTIPLES: dict[EditKind, dict[str, float]] = {
     "colour": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},

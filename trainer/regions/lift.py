@@ -1,4 +1,4 @@
-"""From 2D masks to Gaussians: which of them the masks of several views mean (method.md 4)."""
+"""From 2D masks to Gaussians: which of them the masks of several views mean (docs/method.md 4)."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def lift_masks(
     threshold: float | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Region:
-    """The Gaussians that the masks select (ProGDF appendix, region extraction; see method.md 4).
+    """The Gaussians that the masks select (ProGDF appendix, region extraction; see docs/method.md 4).
 
     Args:
         scene: N Gaussians

@@ -1,0 +1,162 @@
+"""The documents: links lead somewhere, command lines can be typed as written, every option is told."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.__main__ import BENCHES
+from benchmarks.__main__ import main as benchmarks
+from progdf.__main__ import COMMANDS
+from progdf.__main__ import main as progdf
+from progdf.compose.reference import Layer, compose
+from progdf.field import fit_separable
+from progdf.gdf.file import save_gdf
+from tests.helpers.edits import curved_trajectory, edit_of, some_rows
+from tests.helpers.scenes import ball
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+MOST_README_LINES = 150
+
+
+def blocks(text: str, language: str = "") -> list[str]:
+    """The fenced blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def anchors(text: str) -> set[str]:
+    """What the headings of a document are linked by."""
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def command_lines(begin: str) -> list[str]:
+    """The command lines in the fenced blocks of the documents that begin like this, comments left out."""
+    lines = [line for path in DOCUMENTS for block in blocks(path.read_text()) for line in block.splitlines()]
+    typed = (line.removeprefix(".venv/bin/") for line in lines)
+    return sorted({shlex.join(shlex.split(line, comments=True)) for line in typed if line.startswith(begin)})
+
+
+def help_of(run: Callable[[Sequence[str]], int], *command: str) -> str:
+    """What `--help` prints."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        run([*command, "--help"])
+    return printed.getvalue()
+
+
+@cache
+def mentioned_options(command: str) -> frozenset[str]:
+    """All that a command's help mentions."""
+    text = help_of(progdf, command) if command in COMMANDS else help_of(benchmarks, *command.split()[1:])
+    return frozenset(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text))
+
+
+def own_options(command: str) -> set[str]:
+    """The options that a command's help explains, without their opposites."""
+    heads = re.findall(r"^\W*?(-.*?)(?:  |$)", help_of(progdf, command).replace("│", " "), re.MULTILINE)
+    found = {option for head in heads for option in re.findall(r"--[a-z][a-z-]*", head)}
+    return found - {"--help"}
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_to_files_and_headings_that_exist(path: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        if target.startswith("https://"):
+            continue
+        file, _, heading = target.partition("#")
+        linked = (path.parent / file).resolve() if file else path
+        assert linked.exists(), f"{path.name} links to {target}"
+        if heading:
+            assert heading in anchors(linked.read_text()), f"{path.name} links to {target}"
+
+
+@pytest.mark.parametrize("line", command_lines("progdf "))
+def test_a_documented_command_has_the_options_it_is_given(line: str) -> None:
+    _, command, *arguments = shlex.split(line)
+    if command.startswith("-"):
+        return
+    assert command in COMMANDS
+    given = {a.partition("=")[0] for a in arguments if re.match(r"--?[a-z]", a)}
+    assert given <= mentioned_options(command), line
+
+
+@pytest.mark.parametrize("line", command_lines("python -m benchmarks"))
+def test_a_documented_benchmark_has_the_options_it_is_given(line: str) -> None:
+    arguments = shlex.split(line)[3:]
+    command = "benchmarks ablate" if arguments[:1] == ["ablate"] else "benchmarks"
+    assert {a for a in arguments if a.startswith("--")} <= mentioned_options(command), line
+    assert not arguments or arguments[0].startswith("--") or arguments[0] in {*BENCHES, "ablate"}
+
+
+def test_a_documented_target_is_one_of_the_makefile() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert {line.split()[1] for line in command_lines("make ")} <= targets
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_option_of_a_command_is_documented(command: str) -> None:
+    text = (ROOT / "docs" / "cli.md").read_text()
+    documented = set(re.findall(r"--[a-z][a-z-]*", text))
+    documented |= {"--" + option.removeprefix("--no-") for option in documented}
+    missing = {o for o in own_options(command) if o not in documented and not o.startswith("--no-")}
+    assert not missing
+
+
+def test_every_option_that_is_documented_exists() -> None:
+    known = {option for command in COMMANDS for option in mentioned_options(command)} | {
+        "--version",
+        "--no-deps",
+        "--regenerate-screenshots",
+    }
+    known |= mentioned_options("benchmarks") | mentioned_options("benchmarks ablate")
+    told = {o for path in DOCUMENTS for o in re.findall(r"`(--[a-z][a-z-]*)", path.read_text())}
+    assert told <= known
+
+
+def test_the_readme_is_a_page_and_documents_are_in_the_sdist() -> None:
+    assert (ROOT / "README.md").read_text().count("\n") <= MOST_README_LINES
+    assert '"docs"' in (ROOT / "pyproject.toml").read_text()
+
+
+def test_docstrings_cite_only_documents_that_are_here() -> None:
+    for package in ("progdf", "trainer", "viewer", "shaders", "benchmarks"):
+        for path in [
+            p for p in (ROOT / package).rglob("*.*") if p.suffix in (".py", ".vert", ".frag", ".glsl")
+        ]:
+            for cited, section in re.findall(r"\b(\w+/[\w-]+\.md)(?: (\d))?", path.read_text()):
+                assert (ROOT / cited).is_file(), f"{path.relative_to(ROOT)} cites {cited}"
+                if section:
+                    assert f"\n## {section}. " in (ROOT / cited).read_text(), (
+                        f"{path.name} cites {cited} {section}"
+                    )
+
+
+def test_the_documented_reader_reads_what_is_written(tmp_path: Path) -> None:
+    scene = ball(60)
+    members = some_rows(scene, 20)
+    s, offsets = curved_trajectory(20)
+    gdf = edit_of(scene, members, fit_separable(s, offsets, {"means": 1, "sh0": 2}))
+    save_gdf(tmp_path / "edit.gdf", gdf)
+    reader: dict[str, Any] = {}
+    (code,) = blocks((ROOT / "docs" / "file-format.md").read_text(), "python")
+    exec(code, reader)
+    header, rows, tensors = reader["read_gdf"](tmp_path / "edit.gdf")
+    assert header["scene"]["count"] == 60
+    assert rows.tolist() == members.tolist()
+    for strength in (0.0, 0.37, 1.0):
+        edited = compose(scene, [Layer(gdf, strength)])
+        for name in header["field"]["attributes"]:
+            before, after = getattr(scene, name)[members], getattr(edited, name)[members]
+            found = before.numpy() + reader["offsets"](tensors, name, strength).reshape(before.shape)
+            np.testing.assert_allclose(found, after.numpy(), atol=1e-6)
