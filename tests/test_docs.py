@@ -129,17 +129,23 @@ def test_the_readme_is_a_page_and_documents_are_in_the_sdist() -> None:
     assert '"docs"' in (ROOT / "pyproject.toml").read_text()
 
 
-def test_docstrings_cite_only_documents_that_are_here() -> None:
+def test_docstrings_cite_only_documents_and_sections_that_are_here() -> None:
     for package in ("progdf", "trainer", "viewer", "shaders", "benchmarks"):
-        for path in [
-            p for p in (ROOT / package).rglob("*.*") if p.suffix in (".py", ".vert", ".frag", ".glsl")
-        ]:
-            for cited, section in re.findall(r"\b(\w+/[\w-]+\.md)(?: (\d))?", path.read_text()):
-                assert (ROOT / cited).is_file(), f"{path.relative_to(ROOT)} cites {cited}"
-                if section:
-                    assert f"\n## {section}. " in (ROOT / cited).read_text(), (
-                        f"{path.name} cites {cited} {section}"
-                    )
+        for path in sorted((ROOT / package).rglob("*")):
+            if path.suffix not in (".py", ".vert", ".frag", ".glsl"):
+                continue
+            source = " ".join(path.read_text().replace("#", " ").split())
+            for cited, rest in re.findall(r"(\w[\w/.-]*\.md\b)(.{0,60})", source):
+                if cited in ("ablation.md", "docs/benchmarks.md"):  # what a command writes
+                    continue
+                assert (ROOT / cited).is_file(), f"{path.name} cites {cited}"
+                headings = re.findall(r"^##+ (.*)$", (ROOT / cited).read_text(), re.MULTILINE)
+                wanted = rest.removeprefix(",").strip()
+                assert any(wanted.startswith((h, h.partition(".")[0])) for h in headings), (
+                    path.name,
+                    cited,
+                    rest,
+                )
 
 
 def test_the_documented_reader_reads_what_is_written(tmp_path: Path) -> None:

@@ -1,17 +1,7 @@
 """The keyframe field: K snapshots, and a line or a curve through them: what anyone would do first, and must
 be beaten.
 
-Worst PSNR over the slider of float32 keyframes on recorded edits, dB:
-
-| keyframes | robot, even / bending | a bear's scarf | hands moved |
-| --------: | --------------------: | -------------: | ----------: |
-|         3 |           22.0 / 23.1 |    29.7 / 32.5 | 43.8 / 44.8 |
-|         4 |           27.9 / 28.7 |    31.9 / 38.6 | 46.5 / 46.3 |
-|         6 |           29.4 / 33.1 |    36.5 / 42.2 | 47.7 / 47.7 |
-|         9 |           34.2 / 35.7 |    42.3 / 44.9 | 48.7 / 48.7 |
-
-A cubic costs no byte more and gains up to 2 dB with three keyframes of a smooth way, but loses as much with
-many: recorded ways have corners where the strengths of an edit meet.
+What even, bending and cubic keyframes give is in docs/experiments.md, Keyframes.
 """
 
 from __future__ import annotations

@@ -5,10 +5,8 @@ Basis 0 is the recorded end in float32, so that s = 1 has no error. What it leav
 × numbers whose leading singular vectors are bases 1..R; those are kept as int8, and the coefficients are
 solved again for the bases as stored.
 
-a_k(s) is linear between the snapshots. Against the true courses of a bear's edits a cubic through the
-coefficients gains 2 to 3 dB at worst with 5 snapshots (turned gold 53.6 dB instead of 50.5, ears tilted 57.5
-instead of 54.2) and nothing with 17 or 33 (68.4 and 67.9, 70.7 and 70.6; 70.3 and 70.5, 69.7 and 71.0), which
-is what a run records; the snapshots' table is 4·(1 + R) bytes each for all members together.
+a_k(s) is linear between the snapshots; a cubic gains nothing with as many as a run records
+(docs/experiments.md, Separable fields).
 """
 
 from __future__ import annotations

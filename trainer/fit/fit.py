@@ -143,9 +143,7 @@ def visibility(
 ) -> Tensor:
     """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]
 
-    Members are weighted by it, numbers by nothing: bases are mixed from the snapshots by what pictures show,
-    and weighting each number by the gradient of pictures on top of that costs up to 3 dB (scarf at 72 bytes
-    46.8 dB instead of 48.9, hands at 65 bytes 52.8 instead of 56.2; a robot at 162 bytes 38.5 both ways).
+    Members are weighted by it, numbers by nothing (docs/experiments.md, Separable fields).
 
     Members that no picture shows stay in the region: leaving them out saves 0 to 6 % of the bytes.
     """

@@ -1,10 +1,6 @@
 """A run's neural field: begun while PGS runs or after it, finished on the recorded trajectory, baked.
 
-`--field auto` does not try it. Measured on playbot_31k, its robot recoloured (a draft's recording, 27 numbers
-move, 108 bytes a member for their end alone), worst / mean dB on held-out views: separable 132 bytes 34.3 /
-38.0, 150 bytes 37.0 / 41.7, 159 bytes 40.1 / 43.1, in two seconds; a tiny network with codes of 8 125 bytes
-37.0 / 41.2, in a minute, and codes of 16 gain nothing. At few bytes the network is ahead by 3 dB, at the
-default target of 40 dB it does not arrive.
+`--field auto` does not try it: at the default target it does not arrive (docs/experiments.md, Networks).
 """
 
 from __future__ import annotations

@@ -52,9 +52,8 @@ class GroupSearch:
         """The motion of the parts that brings the views closest to their targets.
 
         A near search starts at full sharpness. Where it leaves a quarter of the distance, a wide one is tried
-        too. On playbot_31k's hands the near one arrives from twice a part's size away (52 dB after
-        120 steps, 2 s), the wide one from three times (45 dB where the near one has 17), but it can overlook
-        what is close.
+        too. The wide one arrives from farther away, but it can overlook what is close
+        (docs/experiments.md, Parts that move).
 
         Args:
             targets: the edited box of each view. [h,w,3] each

@@ -2,7 +2,7 @@
 
 Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever colour
 it lies on. So the parts' motions are found first, and the members' own offsets live in the frames of their
-parts from then on: what is learnt of a hand moves, turns and grows with the hand (docs/method.md 3, large moves).
+parts from then on: what is learnt of a hand moves, turns and grows with the hand (docs/method.md 3).
 The way between two strengths is the parts' way, not the optimiser's: a slider shows the hand in motion.
 """
 
@@ -29,14 +29,7 @@ GROWTH = 2.0
 
 # The members' own learning rate is a share of so many part sizes; shorter steps where the parts' motion has
 # left less than `_LEFT` to do, a mean over the pixels that still change, and less than `_REST` of what there
-# was. Held-out PSNR, 240 steps, of the toy robot's hands and of a bear's ears stretched to a bent point, no
-# similarity, and both where each edited view has a shade of its own; then of all four strengths, the worst:
-#                                            hands  ears   hands, shades  ears, shades   hands   ears
-#   the group stage alone                     44.6  16.6           42.1          16.8     49.9   17.4
-#   then rates for the whole region's size    26.2  37.7           23.1          33.9
-#   2.5 part sizes and `_LEFT`                47.7  32.3           34.2          29.0
-#   7 part sizes and `_LEFT`                  42.0  36.8           32.7          33.3     31.5
-#   7 part sizes, `_LEFT` and `_REST`         48.7  36.7           32.6          33.2     42.3   37.4
+# was (docs/experiments.md, Parts that move).
 _EXTENT, _LEFT, _REST = 7.0, 0.065, 0.28
 
 

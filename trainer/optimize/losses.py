@@ -1,6 +1,6 @@
 """What the optimiser minimises: L1, a perceptual term, and the clamp whose gradient is not lost.
 
-L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view; docs/method.md 3 has the weights.
+L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md 3).
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) 
     """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
 
     The paper penalises every parameter's step with α·β^(t/s) (eq. 5), which freezes the edit at its weights;
-    what helps is that early steps are short (docs/method.md 3, L_prog).
+    what helps is that early steps are short (docs/method.md 3).
     """
     return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
 

@@ -8,9 +8,7 @@ from the last stage's pictures to its own, so that the way between them is short
 Edits of colours alone are solved for instead, all views at once (`color_solver`), unless something is asked
 for that only a descent view by view has (`settings.solves_colors`).
 
-Measured on playbot_31k, its robot recoloured by such a descent, 600 steps, held-out views, PSNR to the
-editor's picture: with 4 stages 29.3 dB at the stages and 27.4 (worst 24.2) half way between them, with 8
-stages 30.4 and 30.8 (27.9).
+What stages bring is in docs/experiments.md, Stages.
 """
 
 from __future__ import annotations
@@ -40,8 +38,8 @@ _RATES_3DGS = {
     "sh0": 2.5e-3,
     "shN": 1.25e-4,
 }
-# How many times those an edit needs to arrive within a few hundred steps (docs/method.md 3). A colour edit leaves
-# the geometry alone: moving it too costs 1.4 dB on held-out views (30.6, not 32.0) and 11 floats a Gaussian.
+# How many times those an edit needs to arrive within a few hundred steps (docs/method.md 3). A color edit
+# leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
 _MULTIPLES: dict[EditKind, dict[str, float]] = {
     "colour": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},
     "style": {"means": 2, "log_scales": 2, "quats": 2, "logit_opacities": 0.4, "sh0": 24, "shN": 24},
@@ -266,8 +264,7 @@ def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
     """The change of a channel that 95 % of the pixels that change at all stay below; 0 where none does.
 
     By this, not by the mean, steps are sized: a few saturated pixels need long ones, a wide even change does
-    not, and long ones make it noisy (240 steps, unseen views: room at night 35.5 dB, by the mean 29.9; bear
-    at night 37.8 and 37.0; robot recoloured 29.8 and 29.7).
+    not, and long ones make it noisy (docs/experiments.md, Rates and steps).
     """
     changes = [(target - start).abs().amax(dim=2) for target, start in zip(targets, before, strict=True)]
     changing = torch.cat([change[change > 1 / 255] for change in changes])

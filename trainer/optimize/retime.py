@@ -1,6 +1,6 @@
 """Recording a trajectory: which snapshots stay, and at which slider value each of them lies.
 
-The slider is visible change, not time (docs/method.md 3, recording): equal steps of it change the pictures
+The slider is visible change, not time (docs/method.md 3): equal steps of it change the pictures
 equally, over the whole slider or between two stages that are pinned.
 """
 

@@ -1,37 +1,6 @@
 """What the options mean for the optimiser, given what the edit moves; 0 and "auto" are decided here.
 
-Measured on held-out views: PSNR and LPIPS of the finished edit, PSNR to the editor's own pictures at
-strengths .25, .5 and .75, sharpness over that of the editor's picture, evenness of the slider (its smallest
-step over its largest).
-
-A colour edit is solved for (`color_solver`) and has none of these terms, unless one is asked for. What a
-descent view by view gives instead: the robot of playbot_31k recoloured (before: 9.4 dB, .305), 13 views of
-160 pixels, 240 steps in 4 stages
-    LPIPS of weight .1            30.8 dB  .007   30.9 25.3 27.5   sharp  .91   even .14
-    no LPIPS                      30.8     .008   31.0 25.4 27.5   sharp  .90   even .16
-    LPIPS of weight 1             25.7     .024   27.8 19.8 22.9   sharp  .94   even .14
-    LPIPS at every step           30.7     .008   30.8 25.1 27.6   sharp  .92   even .10
-    LPIPS through VGG16           30.5     .008   30.8 25.0 27.3   sharp  .91   even .17   2.1 times as long
-    plainly clamped colours       19.9     .062   31.6 21.4 21.0   sharp  .96   even .32
-    progressive warmup            24.2     .027   28.0 15.4 16.8   sharp  .91   even .37
-    progressive decay              9.2     .311   and growth alike: frozen
-    sharpness paper               30.8     .007   the same pictures
-    sharpness hinge .3            30.1     .008   30.6 24.9 27.2   sharp 1.06   even .10
-    recording raw                 30.8     .008   31.0 25.4 27.3   sharp  .91   even .01
-    one target                    30.9     .007   19.0 14.9 17.6   sharp  .91   even .67
-    rates of 3DGS                 13.6     .163   21.5 12.6 12.1   sharp 1.14   even .27
-    preset paper, 1500 steps       9.4     .301   frozen, in six times the time
-    the same, progressive off     22.5     .034   14.7 14.4 16.9   sharp  .89   even .01
-
-Painted in style 14 in the region's box (editors/style.py), one target, 24 views of 256 pixels, 480 steps
-    bear's body, no hinge         27.9 dB  .107   clean and soft
-    bear's body, hinge .1         27.6     .103   clean
-    bear's body, hinge .3         26.8     .118   coloured needles all over the fur
-    robot, no hinge; .1; .3       23.6 .081 ; 23.2 .085 ; 23.2 .089   sharp  .78; .82; .86
-
-A painting differs from view to view, and what one stage makes of that the next has to undo: staged, a style
-gets dirty half way. Its strengths are cross-fades, which one straight way meets by itself (a robot
-whose views disagreed, 800 steps: 8 stages 25.0 20.5 18.1, even .00; one target 26.4 21.7 18.6, even .61).
+What each of them gives, alone, is in docs/experiments.md, Terms and options of a descent.
 """
 
 from __future__ import annotations

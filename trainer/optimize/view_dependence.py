@@ -4,13 +4,7 @@ Bands beyond DC let a colour change with the view. Where the original's hardly d
 follow, and what they learn is the noise of the training views: unseen views come out worse for it. Asking
 afterwards (train them, take them out, compare) says the opposite, as DC has leaned on them by then.
 
-Measured: colour edits, 240 steps, 12 views of 160 px, PSNR on unseen views to the editor's picture, dB:
-
-    region                    view dependence   with bands   without   taken out afterwards
-    robot (trained, SH 2)          .127           30.0         27.7       24.0
-    bear's coat (gold)             .048           35.2         34.9       33.7
-    bear's scarf                   .031           36.8         39.2       33.4
-    room's walls                   .000           39.9         41.3       32.1
+Both are measured in docs/experiments.md, Higher bands of spherical harmonics.
 """
 
 from __future__ import annotations

@@ -118,26 +118,7 @@ def lift_masks(
         around them belongs to the members (see `surface.surface_vote`), half of it being the threshold.
         Where the views decide on no member there is none.
 
-    Intersection over union with the exact labels, mean and worst of the seven parts of the demo bear (24 000
-    Gaussians) that have at least 500, masks from 32 views of 512 pixels around the scene; in brackets the
-    mean if hidden Gaussians went by the rule as well, as they do in the paper:
-
-        threshold      share               count               paper
-        .01                                                    .76  .62  (.72)
-        .03                                                    .45  .30  (.45)
-        .1                                                     0    0    (0)
-        .3             .989 .978 (.86)     .88  .78  (.83)     0    0    (0)
-        .4             .990 .981 (.88)     .92  .86  (.84)
-        .5             .991 .982 (.89)     .94  .88  (.85)
-        .6             .990 .981 (.88)     .92  .84  (.85)
-        .7             .987 .977 (.86)     .86  .74  (.82)
-        .8             .973 .959 (.82)     .79  .64  (.74)     0    0    (0)
-        .9             .881 .685 (.73)     .54  .27  (.55)
-
-    At 256 pixels, or from 12 views, `share` at .7 is as good (worst .975, .978). 15 % of the bear are in no
-    view's sight, inside the scarf and under the plinth; of a trained scene (a toy robot, 31 000) few are, and
-    its parts come back with .998 to 1. Masks drawn a pixel too wide or too narrow cost far more than any rule
-    does: a splat is only a few pixels across.
+    How the rules and thresholds do against exact labels is in docs/experiments.md, Regions from masks.
     """
     least = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)

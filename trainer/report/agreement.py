@@ -6,20 +6,8 @@ before training starts. The geometry stays and the members' colours are fitted t
 views by least squares: a render is linear in colours, so there is one answer, found in a few seconds. What
 the fit leaves of the change on held-out views tells whether the views agree.
 
-Measured at half size, 20 training views of 256 px, six rounds; unexplained share (PSNR, dB):
-
-    edit                             bear's body        robot of playbot_31k
-    recolor, night, stripes in 3D    .01-.04 (31-34)    .03-.07 (24-26)
-    style 14, 23, 20, 7              .03-.14 (21-27)    .06-.18 (16-22)
-    style 12, 0                      .11-.21 (20-22)    .22-.36 (18-20)
-    style 1, 2, 4, 5                 .43-.61 (14-19)
-    style 3                          .78     (13)
-    other stripes in every view      .47-.60 (17-18)    .54-.59 (14-15)
-    another hue in every view        .60     (16)
-
-PSNR alone does not tell the two apart, the share does: the robot in style 7, which is fine, has 16 dB, other
-stripes in every view of the bear have 17. SH bands in the fit raise both alike, a quarter of the size hides
-fine strokes but not views that differ. Where parts move, colours cannot follow, and nothing is measured.
+PSNR alone does not tell the two apart, the share does (docs/experiments.md, Editors that agree, or do not).
+Where parts move, colours cannot follow, and nothing is measured.
 """
 
 from __future__ import annotations

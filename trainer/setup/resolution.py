@@ -56,9 +56,8 @@ def sized(
 
     `--views` and `--image-size` are kept to. Else there are more and larger views where members are dense,
     and only larger ones where the cameras are given and few. What is painted or given picture by picture
-    stays as small as can be, as does a draft. Of the same number of pixels, 40 views of 320 are .3 dB nearer
-    to the editor's picture from elsewhere than 30 of 384 (67 000 and 83 000 members), and up to 1.2 nearer
-    than 48 of 256.
+    stays as small as can be, as does a draft. Why 40 of 320 and not 30 of 384:
+    docs/experiments.md, Views.
 
     Args:
         options: see `TrainOptions`

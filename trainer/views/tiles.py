@@ -5,19 +5,8 @@ contributes keeps its colour. So only the tiles with a pixel to which one does a
 Gaussians that reach into them; the others are the original picture. In the drawn tiles the same Gaussians
 are blended in the same order, so picture and gradients are the same bits (tests/trainer/views/test_tiles.py).
 
-Measured, render + L1 + backward at 256 px, one thread, median over views; error 0 throughout:
-
-    region (views)               share of the picture: region, box, tiles   ms: full, box, tiles   full/tiles
-    bear's ears (whole scene)                          .002  .062  .020      7.3   3.5   1.6       4.5
-    robot's hand (whole scene)                         .003  .062  .019      8.3   3.7   1.9       4.5
-    robot's hands (aimed)                              .009  .078  .031      9.4   3.6   2.7       3.5
-    room: lamp (inside)                                .001  .178  .021      9.2   2.7   2.5       3.8
-    room: stool, ball, picture                         .070  .293  .154      9.6   4.2   3.9       2.5
-    bear's scarf (aimed)                               .102  .176  .162     10.0   4.6   4.9       2.1
-    robot (aimed)                                      .122  .221  .200      9.8   5.0   5.2       1.9
-    room: walls (inside)                               .534  .724  .634     11.5   9.1   8.5       1.3
-
-The box brings most of it; tiles help where a region is small or scattered, and cost a twentieth elsewhere.
+The box around the region brings most of it; tiles help where a region is small or scattered, and cost a
+twentieth elsewhere (docs/experiments.md, Views).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """On how many threads torch works: on one, but where it has much to do at once.
 
 The viewer asks torch for hundreds of small things a second. Its threads wait for each other at every one, and
-spin against the rasteriser's: the first camera of 31k Gaussians took 0.6 to 0.8 s of processor time on two
-cores that others use too, on one thread 0.04 s.
+spin against the rasterizer's (docs/experiments.md, The viewer).
 """
 
 from __future__ import annotations
