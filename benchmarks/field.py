@@ -18,7 +18,7 @@ from torch import Tensor
 
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
-from progdf.compose.reference import compose
+from progdf.compose.reference import compose_layers
 from progdf.demo_scenes import bear, bear_edits
 from progdf.field import fit_separable
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
@@ -171,7 +171,7 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
             s = 0.03 + 0.9 * i / 50
             layer = Layer(edit, s)
             if i % 10 == 0:
-                times["plain"].append(milliseconds(partial(compose, scene, [layer])))
+                times["plain"].append(milliseconds(partial(compose_layers, scene, [layer])))
             for count in (1, 2):
                 set_threads(count)
                 composer.update([])
@@ -179,7 +179,7 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
             times["one"].append(milliseconds(partial(alone.update, [Layer(single, s)])))
             times["copy"].append(milliseconds(partial(np.copyto, target, source)))
             if i % 10 == 0:
-                plain = pack(compose(scene, [layer]))
+                plain = pack(compose_layers(scene, [layer]))
                 difference = max(difference, float((pack(composer.gaussians) - plain).abs().max()))
     finally:
         set_threads(before)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from progdf.compose.reference import Layer, compose
-from progdf.formats.ply import load_ply, save_ply
-from progdf.formats.scene_file import load_scene
-from progdf.gdf.file import Gdf, load_gdf, save_gdf
-from progdf.io.cameras import load_cameras
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from .camera import Camera
-from .gaussians import Gaussians
-from .rasterize import rasterize, render
+if TYPE_CHECKING:
+    from progdf.compose.layers import Layer
+    from progdf.compose.reference import compose_layers
+    from progdf.formats.ply import load_ply, save_ply
+    from progdf.formats.scene_file import load_scene
+    from progdf.gdf.file import Gdf, load_gdf, save_gdf
+    from progdf.io.cameras import load_cameras
+
+    from .camera import Camera
+    from .gaussians import Gaussians
+    from .rasterize import render
 
 __version__ = "0.1.0"
 
@@ -20,13 +25,34 @@ __all__ = [
     "Gdf",
     "Layer",
     "__version__",
-    "compose",
+    "compose_layers",
     "load_cameras",
     "load_gdf",
     "load_ply",
     "load_scene",
-    "rasterize",
     "render",
     "save_gdf",
     "save_ply",
 ]
+
+_MODULES = {
+    "Camera": "camera",
+    "Gaussians": "gaussians",
+    "Gdf": "gdf.file",
+    "Layer": "compose.layers",
+    "compose_layers": "compose.reference",
+    "load_cameras": "io.cameras",
+    "load_gdf": "gdf.file",
+    "load_ply": "formats.ply",
+    "load_scene": "formats.scene_file",
+    "render": "rasterize",
+    "save_gdf": "gdf.file",
+    "save_ply": "formats.ply",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is first asked for: `progdf --help` does not wait for torch."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -18,7 +18,7 @@ from benchmarks.__main__ import BENCHES
 from benchmarks.__main__ import main as benchmarks
 from progdf.__main__ import COMMANDS
 from progdf.__main__ import main as progdf
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.field import fit_separable
 from progdf.gdf.file import save_gdf
 from tests.helpers.edits import curved_trajectory, edit_of, some_rows
@@ -161,7 +161,7 @@ def test_the_documented_reader_reads_what_is_written(tmp_path: Path) -> None:
     assert header["scene"]["count"] == 60
     assert rows.tolist() == members.tolist()
     for strength in (0.0, 0.37, 1.0):
-        edited = compose(scene, [Layer(gdf, strength)])
+        edited = compose_layers(scene, [Layer(gdf, strength)])
         for name in header["field"]["attributes"]:
             before, after = getattr(scene, name)[members], getattr(edited, name)[members]
             found = before.numpy() + reader["offsets"](tensors, name, strength).reshape(before.shape)

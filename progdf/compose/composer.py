@@ -1,4 +1,4 @@
-"""`compose` while a slider is dragged: the same numbers, written in place, members only.
+"""`compose_layers` while a slider is dragged: the same numbers, written in place, members only.
 
 Bases are kept as they are stored (int8): a new slider value reads about 84 bytes a member, writes its
 14 numbers, and allocates nothing that grows with the scene.
@@ -91,7 +91,7 @@ class Composer:
         self._weights: tuple[list[Tensor], list[int], NDArray[np.float32]] = ([], [], np.zeros(0, np.float32))
 
     def update(self, layers: Sequence[Layer], blend: str = "normalised") -> Change:
-        """Make `gaussians` the scene under `layers`: what `compose(scene, layers, blend)` gives.
+        """Make `gaussians` the scene under `layers`: what `compose_layers(scene, layers, blend)` gives.
 
         Args:
             layers: the stack, lowest first; every gdf is one of those given at the start (the same object).

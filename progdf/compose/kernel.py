@@ -61,7 +61,7 @@ def compose_rows(
     first_block: int,
     last_block: int,
 ) -> float:
-    """Write base + blend of the layers' offsets into `out`, for blocks of `rows`, as `compose` does.
+    """Write base + blend of the layers' offsets into `out`, for blocks of `rows`, as `compose_layers` does.
 
     Args:
         base: the scene's numbers of all rows that any edit may change, in blocks of 256

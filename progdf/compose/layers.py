@@ -12,7 +12,7 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 
 BLENDS = ("normalised", "sum", "over")
-"""How layers that share a Gaussian go together; see `progdf.compose.reference.compose`."""
+"""How layers that share a Gaussian go together; see `progdf.compose.reference.compose_layers`."""
 
 KINDS = {
     "means": "geometry",

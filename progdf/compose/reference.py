@@ -1,7 +1,7 @@
 """Several edits on one scene: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s) (docs/method.md 6).
 
-`compose` is the plain form that states the rules. `progdf.compose.composer.Composer` gives the same numbers
-while a slider is dragged, in buffers that are made once.
+`compose_layers` is the plain form that states the rules. `progdf.compose.composer.Composer` gives the same
+numbers while a slider is dragged, in buffers that are made once.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from progdf.gdf.file import verify
 from .coverage import coverage
 from .layers import BLENDS, KINDS, Gains, Layer, check_layers
 
-__all__ = ["BLENDS", "Gains", "Layer", "compose"]
+__all__ = ["BLENDS", "Gains", "Layer", "compose_layers"]
 
 NEGATIVE_ZERO = -0.0
 """The number that added to any other, −0.0 included, leaves every bit as it was."""
 _ALL = slice(None)
 
 
-def compose(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised") -> Gaussians:
+def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised") -> Gaussians:
     """The scene under a stack of edits.
 
     With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:

@@ -155,7 +155,7 @@ class BakedField:
     def offsets(self, s: float) -> Tensor:
         """Offsets of the raw parameters at strength `s`, packed as in `gaussians.pack`. [M,C] float32
 
-        This is the plain form; `compose` runs the same sum without building the packed rows.
+        This is the plain form; `compose_layers` runs the same sum without building the packed rows.
         """
         packed = torch.zeros(self.members, self.channels)
         slices = attribute_slices(self.channels)

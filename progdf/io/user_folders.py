@@ -8,15 +8,17 @@ import sys
 import tempfile
 from pathlib import Path
 
+from platformdirs import user_cache_path, user_state_path
+
 
 def cache_folder() -> Path:
     """For what can be made again: %LOCALAPPDATA%, ~/Library/Caches or $XDG_CACHE_HOME."""
-    return _folder("XDG_CACHE_HOME", ".cache", "Caches")
+    return _folder(user_cache_path("progdf", appauthor=False, opinion=False))
 
 
 def state_folder() -> Path:
     """For what is remembered from one time to the next: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
-    return _folder("XDG_STATE_HOME", ".local/state", "Application Support")
+    return _folder(user_state_path("progdf", appauthor=False))
 
 
 def temporary_folder() -> Path:
@@ -33,13 +35,9 @@ def is_private(folder: Path) -> bool:
     return found.st_uid == os.getuid() and not folder.is_symlink() and not found.st_mode & 0o022
 
 
-def _folder(variable: str, unix: str, mac: str) -> Path:
+def _folder(found: Path) -> Path:
     try:
-        home = Path.home()
+        Path.home()
     except RuntimeError:  # no HOME, and the system does not know the user
         return temporary_folder()
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local") / "progdf"
-    if sys.platform == "darwin":
-        return home / "Library" / mac / "progdf"
-    return Path(os.environ.get(variable) or home / unix) / "progdf"
+    return found

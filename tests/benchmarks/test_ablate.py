@@ -18,7 +18,7 @@ from benchmarks.ablation.options import AblateOptions
 from benchmarks.ablation.setup import run_options
 from benchmarks.ablation.table import Outcome, table_of
 from benchmarks.ablation.variants import chosen, sensible
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import load_ply
@@ -112,7 +112,7 @@ def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to
     scene = load_ply(options.scene)
     for name in ONLY.split(","):
         gdf = load_gdf(run / "ablation" / name / f"{name}.gdf", scene)
-        assert not torch.equal(compose(scene, [Layer(gdf, 1.0)]).sh0, scene.sh0)
+        assert not torch.equal(compose_layers(scene, [Layer(gdf, 1.0)]).sh0, scene.sh0)
     assert not list((run / "ablation").glob("*/state"))
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from progdf.__main__ import main
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
 from progdf.formats.ply_header import read_header
 from progdf.gaussians import Gaussians, pack
@@ -102,7 +102,7 @@ def test_rows_types_and_edits_keep_it(stack: Stack) -> None:
     assert scene[rows].antialiased
     assert scene.to(dtype=torch.float64).antialiased
     assert scene.replace_rows(rows, pack(scene[rows])).antialiased
-    assert compose(scene, [Layer(stack.gdfs[0], 0.5)]).antialiased
+    assert compose_layers(scene, [Layer(stack.gdfs[0], 0.5)]).antialiased
 
 
 def test_an_exported_edit_still_says_it(stack: Stack, tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_the_window_draws_it_as_the_rasteriser_does(ctx: moderngl.Context, stack
         found = torch.from_numpy(engine.image(view, SIZE))
     finally:
         engine.release()
-    edited = compose(stack.scene, [Layer(stack.gdfs[0], 0.7)])
+    edited = compose_layers(stack.scene, [Layer(stack.gdfs[0], 0.7)])
     expected = render(edited, to_camera(view.camera, *SIZE), view.background)
     fat = render(replace(edited, antialiased=False), to_camera(view.camera, *SIZE), view.background)
     assert float((found - expected).abs().max()) < 1 / 255  # a rim at the 1/255 cut, as in test_gl_parity

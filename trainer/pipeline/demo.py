@@ -18,7 +18,7 @@ import tyro
 from torch import Tensor
 
 from progdf.cli.options import parsed
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.demo_scenes import DemoScene, bear, room
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, save_ply
@@ -198,7 +198,7 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
         layers = [Layer(gdfs[name], strength) for name, strength in strengths.items()]
         sized = camera.resized(round(height * camera.width / camera.height), height)
         with torch.no_grad():
-            return render(compose(gaussians, layers), sized, background=scene.background)
+            return render(compose_layers(gaussians, layers), sized, background=scene.background)
 
     names = list(gdfs)
     first, second, third = names

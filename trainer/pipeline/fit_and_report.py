@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.field.remap import same
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
@@ -180,12 +180,12 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
     outside = torch.ones(len(scene), dtype=torch.bool)
     outside[gdf.region.members] = False
-    finished = compose(scene, [Layer(gdf, 1.0)])
+    finished = compose_layers(scene, [Layer(gdf, 1.0)])
     packed = pack(finished[gdf.region.members], with_shN=end.shape[1] > BASE_CHANNELS)
     endpoint = float((packed - end).abs().max())
     change = 0.0
     for s in (0.3, 1.0):
-        edited = compose(scene, [Layer(gdf, s)])
+        edited = compose_layers(scene, [Layer(gdf, s)])
         for name in ATTRIBUTES:
             before, after = getattr(scene, name)[outside], getattr(edited, name)[outside]
             if before.numel() and not torch.equal(before, after):

@@ -11,7 +11,7 @@ import torch
 from plyfile import PlyData
 
 from progdf.cli.options import parsed
-from progdf.compose.reference import compose
+from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import counted
 from progdf.formats.ply import GEOMETRY, load_ply, save_ply
@@ -57,7 +57,7 @@ def export(argv: Sequence[str]) -> int:
     arguments.check_not_an_input(options.out, found.files)
     gdfs, states = found.document.gdfs, shown(found.view)
     layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
-    edited = compose(found.document.scene, layers, found.view.blend)
+    edited = compose_layers(found.document.scene, layers, found.view.blend)
     with written_whole(options.out) as beside:
         save_ply(beside, edited)
         _check_reloaded(edited, load_ply(beside))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.compose.layers import Layer
-from progdf.compose.reference import compose
+from progdf.compose.reference import compose_layers
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.region import Region
@@ -43,7 +43,7 @@ class EditSample:
         self._gdfs = [_cut(gdf, chosen, self._rows, self._scene) for gdf, chosen in pairs]
 
     def error(self, edit_pass: EditPass, stack: Sequence[tuple[int, Layer]], blend: str) -> float:
-        """The largest difference of a raw number from `compose`, relative to it where it is larger than 1.
+        """The largest difference of a raw number from `compose_layers`, relative where that is larger than 1.
 
         Args:
             edit_pass: has run with `stack` and `blend`
@@ -56,7 +56,7 @@ class EditSample:
             replace(layer, gdf=self._gdfs[edit], weights=_some(layer.weights, self._chosen[edit]))
             for edit, layer in stack
         ]
-        expected = compose(self._scene, layers, blend)
+        expected = compose_layers(self._scene, layers, blend)
         places = {texture_row: at for at, texture_row in enumerate(self._texture_rows)}
         at = np.array([places[row] for row in (self._rows // SPLATS_PER_ROW).tolist()], np.int64)
         worst = 0.0

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import progdf
 from progdf.__main__ import COMMANDS, main
 from progdf.formats.ply import save_ply
 from progdf.io.atomic import written_whole
@@ -30,6 +31,17 @@ def test_without_a_command_it_lists_them_all(capsys: pytest.CaptureFixture[str])
     assert main([]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in COMMANDS)
+
+
+def test_help_does_not_wait_for_torch() -> None:
+    code = "import sys; from progdf.__main__ import main; main(['--help']); print('torch' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines()[-1] == "False"
+
+
+def test_every_public_name_is_found() -> None:
+    assert all(hasattr(progdf, name) for name in progdf.__all__)
+    assert not hasattr(progdf, "undo_everything")
 
 
 def test_an_unknown_command_is_one_line_that_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from progdf.compose.composer import Composer
 from progdf.compose.coverage import coverage
-from progdf.compose.reference import BLENDS, Gains, Layer, compose
+from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field import fit_keyframes
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
@@ -52,14 +52,14 @@ def change(scene: Gaussians, edited: Gaussians) -> torch.Tensor:
 def test_strength_zero_is_the_original_bit_for_bit(
     scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str
 ) -> None:
-    assert bits(compose(scene, [Layer(shirt, 0.0), Layer(hat, -0.0)], blend)) == bits(scene)
+    assert bits(compose_layers(scene, [Layer(shirt, 0.0), Layer(hat, -0.0)], blend)) == bits(scene)
 
 
 @pytest.mark.parametrize("blend", BLENDS)
 def test_one_layer_at_full_strength_is_the_recorded_end_exactly(
     scene: Gaussians, shirt: Gdf, blend: str
 ) -> None:
-    edited = compose(scene, [Layer(shirt, 1.0)], blend)
+    edited = compose_layers(scene, [Layer(shirt, 1.0)], blend)
     full = torch.cat([bases.full for bases in shirt.field.attributes.values()], dim=1)
     expected = scene.replace_rows(shirt.region.members, pack(scene)[shirt.region.members] + full)
     assert bits(edited) == bits(expected)
@@ -72,12 +72,12 @@ def test_rows_outside_all_members_keep_their_bytes(
     outside = torch.ones(len(scene), dtype=torch.bool)
     outside[shirt.region.members] = False
     outside[hat.region.members] = False
-    edited = compose(scene, [Layer(shirt, 0.7), Layer(hat, 0.9)], blend)
+    edited = compose_layers(scene, [Layer(shirt, 0.7), Layer(hat, 0.9)], blend)
     assert bits(edited[outside]) == bits(scene[outside])
 
 
 def test_attributes_that_no_layer_moves_are_the_scenes_own(scene: Gaussians, hat: Gdf) -> None:
-    edited = compose(scene, [Layer(hat, 0.5)])
+    edited = compose_layers(scene, [Layer(hat, 0.5)])
     assert edited.means is scene.means
     assert edited.shN is scene.shN
 
@@ -85,21 +85,21 @@ def test_attributes_that_no_layer_moves_are_the_scenes_own(scene: Gaussians, hat
 def test_rows_of_weight_zero_keep_their_bytes(scene: Gaussians, shirt: Gdf) -> None:
     weights = torch.ones(150)
     weights[::2] = 0.0
-    edited = compose(scene, [Layer(shirt, 0.6, weights=weights)])
+    edited = compose_layers(scene, [Layer(shirt, 0.6, weights=weights)])
     untouched = shirt.region.members[::2]
     assert bits(edited[untouched]) == bits(scene[untouched])
 
 
 def test_weights_scale_the_change(scene: Gaussians, shirt: Gdf) -> None:
-    whole = change(scene, compose(scene, [Layer(shirt, 0.6)]))
-    half = change(scene, compose(scene, [Layer(shirt, 0.6, weights=torch.full((150,), 0.5))]))
+    whole = change(scene, compose_layers(scene, [Layer(shirt, 0.6)]))
+    half = change(scene, compose_layers(scene, [Layer(shirt, 0.6, weights=torch.full((150,), 0.5))]))
     assert torch.allclose(half, whole / 2, atol=1e-6)
 
 
 def test_gains_scale_their_own_kind_of_attribute_only(scene: Gaussians, shirt: Gdf) -> None:
-    whole = change(scene, compose(scene, [Layer(shirt, 0.6)]))
+    whole = change(scene, compose_layers(scene, [Layer(shirt, 0.6)]))
     found = change(
-        scene, compose(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, colour=2.0))])
+        scene, compose_layers(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, colour=2.0))])
     )
     slices = attribute_slices(whole.shape[1])
     for names, gain in ((("means", "log_scales", "quats"), 0.5), (("logit_opacities",), 0.0), (COLOUR, 2.0)):
@@ -108,15 +108,15 @@ def test_gains_scale_their_own_kind_of_attribute_only(scene: Gaussians, shirt: G
 
 
 def test_disabled_layers_do_nothing(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
-    assert bits(compose(scene, [Layer(shirt, 0.8), Layer(hat, 1.0, enabled=False)])) == bits(
-        compose(scene, [Layer(shirt, 0.8)])
+    assert bits(compose_layers(scene, [Layer(shirt, 0.8), Layer(hat, 1.0, enabled=False)])) == bits(
+        compose_layers(scene, [Layer(shirt, 0.8)])
     )
 
 
 @pytest.mark.parametrize("blend", ["normalised", "sum"])
 def test_the_order_of_layers_does_not_matter(scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str) -> None:
     layers = [Layer(shirt, 0.8), Layer(hat, 0.9)]
-    a, b = (change(scene, compose(scene, order, blend)) for order in (layers, layers[::-1]))
+    a, b = (change(scene, compose_layers(scene, order, blend)) for order in (layers, layers[::-1]))
     assert torch.allclose(a, b, atol=1e-6)
 
 
@@ -124,15 +124,15 @@ def test_normalised_is_the_plain_sum_while_strengths_add_up_to_one(
     scene: Gaussians, shirt: Gdf, hat: Gdf
 ) -> None:
     layers = [Layer(shirt, 0.5), Layer(hat, 0.5)]
-    assert bits(compose(scene, layers, "normalised")) == bits(compose(scene, layers, "sum"))
+    assert bits(compose_layers(scene, layers, "normalised")) == bits(compose_layers(scene, layers, "sum"))
 
 
 def test_normalised_shares_where_strengths_add_up_to_more(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     layers = [Layer(shirt, 1.0), Layer(hat, 0.5)]
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
     assert len(both) > 10
-    summed = change(scene, compose(scene, layers, "sum"))[both]
-    shared = change(scene, compose(scene, layers, "normalised"))[both]
+    summed = change(scene, compose_layers(scene, layers, "sum"))[both]
+    shared = change(scene, compose_layers(scene, layers, "normalised"))[both]
     assert torch.allclose(shared, summed / 1.5, atol=1e-6)
 
 
@@ -140,15 +140,15 @@ def test_over_puts_what_the_last_layer_changes_on_top(scene: Gaussians, shirt: G
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
     hidden = both[coverage(scene, hat)["colour"][torch.searchsorted(hat.region.members, both)] == 1]
     assert len(hidden) > 10
-    stacked = compose(scene, [Layer(shirt, 1.0), Layer(hat, 1.0)], "over")
-    alone = compose(scene, [Layer(hat, 1.0)])
+    stacked = compose_layers(scene, [Layer(shirt, 1.0), Layer(hat, 1.0)], "over")
+    alone = compose_layers(scene, [Layer(hat, 1.0)])
     assert torch.allclose(stacked.sh0[hidden], alone.sh0[hidden], atol=1e-6)
 
 
 def test_over_shows_the_layers_below_where_the_last_one_changes_nothing(scene: Gaussians, shirt: Gdf) -> None:
-    gold = compose(scene, [Layer(shirt, 0.8)])
+    gold = compose_layers(scene, [Layer(shirt, 0.8)])
     for s in (0.3, 1.0):
-        stacked = compose(scene, [Layer(shirt, 0.8), Layer(striped(scene, shirt), s)], "over")
+        stacked = compose_layers(scene, [Layer(shirt, 0.8), Layer(striped(scene, shirt), s)], "over")
         between = shirt.region.members[::2]
         assert bits(stacked[between]) == bits(gold[between]), "between the stripes"
         for name in ATTRIBUTES:
@@ -174,7 +174,7 @@ def test_over_moves_continuously_with_either_slider(scene: Gaussians, shirt: Gdf
         strengths = [0.7, 0.7]
         strengths[dragged] = s
         layers = [Layer(gdf, own) for gdf, own in zip((shirt, stripes), strengths, strict=True)]
-        return pack(compose(scene, layers, "over"))
+        return pack(compose_layers(scene, layers, "over"))
 
     largest = float((at(1.0) - at(0.0)).abs().max())
     steps = [float((at(s) - at(s - 0.01)).abs().max()) for s in (0.01, 0.02, 0.35, 0.7, 0.71, 1.0)]
@@ -184,9 +184,11 @@ def test_over_moves_continuously_with_either_slider(scene: Gaussians, shirt: Gdf
 
 def test_over_hides_as_much_of_a_kind_as_its_gain_lets_through(scene: Gaussians, shirt: Gdf) -> None:
     top = striped(scene, shirt)
-    below = compose(scene, [Layer(shirt, 1.0)])
+    below = compose_layers(scene, [Layer(shirt, 1.0)])
     for gain in (0.0, 0.5):
-        stacked = compose(scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(colour=gain))], "over")
+        stacked = compose_layers(
+            scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(colour=gain))], "over"
+        )
         stripe = shirt.region.members[1::2]
         expected = torch.lerp(below.sh0[stripe], scene.sh0[stripe] + 1.0, gain)
         assert torch.allclose(stacked.sh0[stripe], expected, atol=1e-6)
@@ -206,18 +208,20 @@ def test_coverage_rises_with_the_change_of_each_kind_and_ends_at_one(scene: Gaus
 
 
 def test_an_overshooting_layer_alone_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:
-    assert bits(compose(scene, [Layer(shirt, 1.2)])) == bits(compose(scene, [Layer(shirt, 1.2)], "sum"))
+    assert bits(compose_layers(scene, [Layer(shirt, 1.2)])) == bits(
+        compose_layers(scene, [Layer(shirt, 1.2)], "sum")
+    )
 
 
 @pytest.mark.parametrize("strength", [float("nan"), float("inf")])
 def test_strengths_that_are_no_numbers_are_refused(scene: Gaussians, shirt: Gdf, strength: float) -> None:
     with pytest.raises(ProgdfError, match="the strength of shirt is"):
-        compose(scene, [Layer(shirt, strength)])
+        compose_layers(scene, [Layer(shirt, strength)])
 
 
 def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
     with pytest.raises(ProgdfError, match="normalised, sum, over"):
-        compose(scene, [Layer(shirt)], "multiply")
+        compose_layers(scene, [Layer(shirt)], "multiply")
 
 
 @pytest.mark.parametrize(
@@ -225,20 +229,20 @@ def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
 )
 def test_weights_that_do_not_fit_are_refused(scene: Gaussians, shirt: Gdf, weights: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="weights of shirt"):
-        compose(scene, [Layer(shirt, 0.5, weights=weights)])
+        compose_layers(scene, [Layer(shirt, 0.5, weights=weights)])
 
 
 def test_a_scene_written_to_in_place_is_another_scene(scene: Gaussians, shirt: Gdf) -> None:
     own = replace(scene, means=scene.means.clone())
-    compose(own, [Layer(shirt)])
+    compose_layers(own, [Layer(shirt)])
     own.means[0] += 1.0
     with pytest.raises(ProgdfError, match="shirt was made for another scene"):
-        compose(own, [Layer(shirt)])
+        compose_layers(own, [Layer(shirt)])
 
 
 def test_an_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> None:
     with pytest.raises(ProgdfError, match="shirt was made for another scene: it has 400 Gaussians"):
-        compose(random_gaussians(30), [Layer(shirt)])
+        compose_layers(random_gaussians(30), [Layer(shirt)])
 
 
 # ---- the fast twin
@@ -282,7 +286,7 @@ def test_the_composer_gives_the_bits_of_compose_through_a_random_session(
             order = rng.permutation(4)[: rng.integers(0, 5)]
         layers = random_stack(rng, wardrobe, order)
         told = composer.update(layers, blend)
-        assert bits(composer.gaussians) == bits(compose(scene, layers, blend))
+        assert bits(composer.gaussians) == bits(compose_layers(scene, layers, blend))
         now = pack(composer.gaussians, True).clone()
         moved = (now != before).any(dim=1).nonzero()[:, 0].numpy()
         assert np.isin(moved, told.rows).all()
@@ -307,7 +311,7 @@ def test_edits_that_overlap_the_dragged_one_keep_their_part(
             Layer(wardrobe[2], 0.8),
         ]
         composer.update(layers, blend)
-        assert bits(composer.gaussians) == bits(compose(scene, layers, blend))
+        assert bits(composer.gaussians) == bits(compose_layers(scene, layers, blend))
 
 
 def test_the_composer_leaves_the_scene_alone(scene: Gaussians, shirt: Gdf) -> None:
@@ -355,7 +359,7 @@ def test_blocks_of_any_length_give_the_bits_of_compose(count: int) -> None:
     composer = Composer(scene, edits)
     for layers in ([Layer(edits[0], 0.3)], [Layer(edits[0], 0.3), Layer(edits[1], 0.4)]):
         composer.update(layers)
-        assert bits(composer.gaussians) == bits(compose(scene, layers))
+        assert bits(composer.gaussians) == bits(compose_layers(scene, layers))
 
 
 def test_rows_that_begin_within_a_block_give_the_bits_of_compose() -> None:
@@ -367,7 +371,7 @@ def test_rows_that_begin_within_a_block_give_the_bits_of_compose() -> None:
     composer.update([Layer(low, 0.3)])
     layers = [Layer(low, 0.3), Layer(high, 0.4)]
     composer.update(layers)  # rewrites rows 300 to 599 alone
-    assert bits(composer.gaussians) == bits(compose(scene, layers))
+    assert bits(composer.gaussians) == bits(compose_layers(scene, layers))
 
 
 def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt: Gdf) -> None:
@@ -379,7 +383,7 @@ def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt:
     layers = [Layer(edit, 0.5)]
     composer = Composer(scene, [edit])
     composer.update(layers)
-    assert bits(composer.gaussians) == bits(compose(scene, layers))
+    assert bits(composer.gaussians) == bits(compose_layers(scene, layers))
 
 
 def test_weights_outside_their_range_are_refused_while_painting(scene: Gaussians, shirt: Gdf) -> None:
@@ -397,7 +401,7 @@ def test_weights_painted_in_place_are_seen(scene: Gaussians, shirt: Gdf) -> None
     composer.update([Layer(shirt, 0.5, weights=weights)])
     weights[:75] = 0.25
     composer.update([Layer(shirt, 0.5, weights=weights)])
-    assert bits(composer.gaussians) == bits(compose(scene, [Layer(shirt, 0.5, weights=weights)]))
+    assert bits(composer.gaussians) == bits(compose_layers(scene, [Layer(shirt, 0.5, weights=weights)]))
 
 
 def test_one_thread_and_two_give_the_same_bits() -> None:
@@ -426,7 +430,7 @@ def test_an_edit_without_any_change_is_an_edit(scene: Gaussians) -> None:
     still = edit_of(scene, some_rows(scene, 7), curved_field(7, moving=()))
     composer = Composer(scene, [still])
     composer.update([Layer(still, 0.5)])
-    assert bits(composer.gaussians) == bits(compose(scene, [Layer(still, 0.5)])) == bits(scene)
+    assert bits(composer.gaussians) == bits(compose_layers(scene, [Layer(still, 0.5)])) == bits(scene)
 
 
 def test_a_stranger_is_refused_by_the_composer(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
@@ -437,6 +441,6 @@ def test_a_stranger_is_refused_by_the_composer(scene: Gaussians, shirt: Gdf, hat
 def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
     everything = curved_field(len(scene), 1, 14 + 9)
     edit = edit_of(scene, torch.arange(len(scene)), everything)
-    mute = compose(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0))])
+    mute = compose_layers(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0))])
     assert set(everything.attributes) == set(ATTRIBUTES)
     assert bits(mute) == bits(scene)

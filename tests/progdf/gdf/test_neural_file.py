@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from progdf.compose.layers import Layer
-from progdf.compose.reference import compose
+from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import Gdf, _checksum, load_gdf, open_gdf, save_gdf
@@ -49,9 +49,9 @@ def test_a_network_comes_back_and_is_written_to_the_same_bytes(tmp_path: Path, f
 def test_a_baked_network_is_composed_as_any_field(saved: Path) -> None:
     gdf = load_gdf(saved, scene())
     assert gdf.field.kind == "neural"
-    start = compose(scene(), [Layer(gdf, 0.0)])
+    start = compose_layers(scene(), [Layer(gdf, 0.0)])
     assert all(torch.equal(getattr(start, name), getattr(scene(), name)) for name in ATTRIBUTES)
-    end = compose(scene(), [Layer(gdf, 1.0)])
+    end = compose_layers(scene(), [Layer(gdf, 1.0)])
     assert torch.equal(pack(end[members()]), rows() + gdf.field.offsets(1.0))
 
 

@@ -11,7 +11,7 @@ import torch
 
 from progdf.__main__ import main
 from progdf.cli.rebind import match_scenes, rebound
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import save_ply
 from progdf.formats.scene_file import load_scene, turned_about_x
 from progdf.gaussians import Gaussians
@@ -46,8 +46,8 @@ def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:
     assert np.array_equal(match.rows, order.numpy())
     assert (match.matched, match.once, match.p95) == (1.0, 1.0, 0.0)
     for gdf in stack.gdfs:
-        found = compose(other, [Layer(rebound(gdf, stack.scene, other, match), 0.6)])
-        expected = compose(stack.scene, [Layer(gdf, 0.6)])[order]
+        found = compose_layers(other, [Layer(rebound(gdf, stack.scene, other, match), 0.6)])
+        expected = compose_layers(stack.scene, [Layer(gdf, 0.6)])[order]
         for name in ("means", "log_scales", "logit_opacities", "sh0"):
             assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
@@ -64,8 +64,8 @@ def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
     )
     gdf = replace(gdf, field=replace(gdf.field, attributes={"quats": turning}))
     other, order = shuffled(scene)
-    found = compose(other, [Layer(rebound(gdf, scene, other, match_scenes(scene, other)), 1.0)])
-    expected = compose(scene, [Layer(gdf, 1.0)])[order]
+    found = compose_layers(other, [Layer(rebound(gdf, scene, other, match_scenes(scene, other)), 1.0)])
+    expected = compose_layers(scene, [Layer(gdf, 1.0)])[order]
     same = (found.unit_quats * expected.unit_quats).sum(dim=1).abs()
     torch.testing.assert_close(same, torch.ones(len(scene)))
 
@@ -99,7 +99,11 @@ def test_an_edit_is_carried_to_another_format(
     assert gdf.report["rebound"]["matched"] > 0.99
     # the edit loses no more than the format itself has lost
     before = psnr(scene, stack.scene, stack)
-    after = psnr(compose(scene, [Layer(gdf, 1.0)]), compose(stack.scene, [Layer(stack.gdfs[0], 1.0)]), stack)
+    after = psnr(
+        compose_layers(scene, [Layer(gdf, 1.0)]),
+        compose_layers(stack.scene, [Layer(stack.gdfs[0], 1.0)]),
+        stack,
+    )
     assert after > before - 1.0
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 import trainer.pipeline.training
 from progdf.cli.options import parsed
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
@@ -89,13 +89,13 @@ def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_exactly_the_recorded_
 ) -> None:
     scene = load_ply(folder / "scene.ply")
     gdf = load_gdf(done.gdf, scene)
-    at_zero = compose(scene, [Layer(gdf, 0.0)])
+    at_zero = compose_layers(scene, [Layer(gdf, 0.0)])
     assert all(torch.equal(getattr(at_zero, name), getattr(scene, name)) for name in ATTRIBUTES)
     trajectory, extra, _ = load_trajectory(done.folder.trajectory)
     members = extra["members"]
     with_sh = trajectory.end.shape[1] > 14
     recorded = pack(scene[members], with_shN=with_sh) + trajectory.end
-    at_one = compose(scene, [Layer(gdf, 1.0)])
+    at_one = compose_layers(scene, [Layer(gdf, 1.0)])
     assert torch.equal(pack(at_one[members], with_shN=with_sh), recorded)
     assert done.report["field"]["endpoint_error"] == 0.0
 
@@ -106,7 +106,7 @@ def test_rows_outside_the_region_are_byte_identical_at_any_strength(folder: Path
     outside = torch.ones(len(scene), dtype=torch.bool)
     outside[gdf.region.members] = False
     for strength in (0.1, 0.5, 1.0):
-        edited = compose(scene, [Layer(gdf, strength)])
+        edited = compose_layers(scene, [Layer(gdf, strength)])
         for name in ATTRIBUTES:
             assert torch.equal(getattr(edited, name)[outside], getattr(scene, name)[outside])
     assert done.report["field"]["outside_change"] == 0.0

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import NEAR
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.demo_scenes import bear
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
@@ -64,7 +64,7 @@ def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: 
         threads=1,
     )
     train(options, quiet=True)
-    return compose(scene, [Layer(load_gdf(folder / "edit/edit.gdf", scene), 1.0)])
+    return compose_layers(scene, [Layer(load_gdf(folder / "edit/edit.gdf", scene), 1.0)])
 
 
 @pytest.mark.parametrize(("editor", "kind"), [("recolor:#3060d0", "colour"), ("darken:0.6", "style")])

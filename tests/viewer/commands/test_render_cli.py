@@ -14,7 +14,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.camera import Camera
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES
 from progdf.gdf.file import save_gdf
@@ -55,7 +55,7 @@ def pixels(path: Path | str) -> np.ndarray:
 
 def edited_by(stack: Stack, camera: Camera, scarf: float, ears: float) -> np.ndarray:
     layers = [Layer(stack.gdfs[0], scarf), Layer(stack.gdfs[1], ears)]
-    return film.to_pixels(render(compose(stack.scene, layers), camera).numpy())
+    return film.to_pixels(render(compose_layers(stack.scene, layers), camera).numpy())
 
 
 def test_a_camera_file_and_strengths_give_the_composed_picture(run: Run, stack: Stack) -> None:
@@ -268,7 +268,7 @@ def test_an_exported_scene_is_the_composed_one(
     settings = ("--set", "ears=0.5", "--set", "scarf=1")
     assert run("export", "bear.ply", "scarf.gdf", "ears.gdf", *settings, "-o", "edited.ply") == 0
     assert "read back and compared" in capsys.readouterr().out
-    expected = compose(load_ply("bear.ply"), [Layer(stack.gdfs[0], 1.0), Layer(stack.gdfs[1], 0.5)])
+    expected = compose_layers(load_ply("bear.ply"), [Layer(stack.gdfs[0], 1.0), Layer(stack.gdfs[1], 0.5)])
     found = load_ply("edited.ply")
     for name in ATTRIBUTES:
         tolerance = 1e-6 if name == "quats" else 0.0

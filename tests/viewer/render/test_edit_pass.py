@@ -1,4 +1,4 @@
-"""The GPU's edit pass against `compose`: blend rules, forms of field, weights, gains; the ends to the bit."""
+"""The GPU's edit pass against `compose_layers`: blend rules, kinds of field, weights, gains; exact ends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from progdf.compose.reference import BLENDS, Gains, Layer, compose
+from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import ATTRIBUTES, Gaussians
@@ -137,7 +137,7 @@ def painted(members: int, seed: int = 0) -> torch.Tensor:
 def test_overlapping_layers_are_what_compose_gives(edited: Edited, blend: str) -> None:
     layers = [Layer(gdf, s) for gdf, s in zip(edited.gdfs, (0.7, 0.4, 1.0, 0.55), strict=True)]
     edited.bring(list(enumerate(layers)), blend)
-    assert edited.apart(compose(edited.scene, layers, blend)) <= FEW_ULPS
+    assert edited.apart(compose_layers(edited.scene, layers, blend)) <= FEW_ULPS
 
 
 @pytest.mark.parametrize("blend", BLENDS)
@@ -148,7 +148,7 @@ def test_painted_weights_gains_and_overshoot_are_what_compose_gives(edited: Edit
         Layer(edited.gdfs[3], 0.9, gains=Gains(colour=0.0), weights=painted(200, 1)),
     ]
     edited.bring(list(zip((2, 0, 3), layers, strict=True)), blend)
-    assert edited.apart(compose(edited.scene, layers, blend)) <= FEW_ULPS
+    assert edited.apart(compose_layers(edited.scene, layers, blend)) <= FEW_ULPS
 
 
 @settings(max_examples=25, deadline=None)
@@ -172,7 +172,7 @@ def test_any_stack_is_what_compose_gives(
         for edit, s, gain, paints in path
     ]
     edited.bring(stack, blend)
-    assert edited.apart(compose(edited.scene, [layer for _, layer in stack], blend)) <= FEW_ULPS
+    assert edited.apart(compose_layers(edited.scene, [layer for _, layer in stack], blend)) <= FEW_ULPS
 
 
 def _weights(edited: Edited, edit: int, paints: bool) -> torch.Tensor | None:
@@ -193,7 +193,7 @@ def test_one_layer_at_full_strength_is_the_recorded_end_bit_for_bit(
     edited: Edited, edit: int, blend: str
 ) -> None:
     edited.bring([(edit, Layer(edited.gdfs[edit], 1.0))], blend)
-    assert edited.same_bits(compose(edited.scene, [Layer(edited.gdfs[edit], 1.0)], blend))
+    assert edited.same_bits(compose_layers(edited.scene, [Layer(edited.gdfs[edit], 1.0)], blend))
 
 
 def test_rows_of_weight_zero_and_kinds_of_gain_zero_keep_their_bits(edited: Edited) -> None:
@@ -209,7 +209,7 @@ def test_rows_of_weight_zero_and_kinds_of_gain_zero_keep_their_bits(edited: Edit
 def test_a_layer_leaves_the_members_of_others_alone(edited: Edited) -> None:
     edited.bring([])
     edited.bring([(1, Layer(edited.gdfs[1], 0.5))], changed=[1])
-    assert edited.apart(compose(edited.scene, [Layer(edited.gdfs[1], 0.5)])) <= FEW_ULPS
+    assert edited.apart(compose_layers(edited.scene, [Layer(edited.gdfs[1], 0.5)])) <= FEW_ULPS
     outside = np.setdiff1d(np.arange(COUNT), edited.gdfs[1].region.members.numpy())
     for name, got in edited.found().items():
         original = rows_of(edited.scene, name)
@@ -223,7 +223,7 @@ def test_weights_that_torch_writes_into_are_seen(edited: Edited) -> None:
     edited.bring([(0, layer)])
     weights[:200] = 0.25
     edited.bring([(0, layer)])
-    assert edited.apart(compose(edited.scene, [layer])) <= FEW_ULPS
+    assert edited.apart(compose_layers(edited.scene, [layer])) <= FEW_ULPS
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
@@ -232,7 +232,7 @@ def test_every_band_of_spherical_harmonics_is_edited(ctx: moderngl.Context, degr
     made = Edited(ctx, scene, [gdf_of(scene, 120, 1)])
     layer = Layer(made.gdfs[0], 0.6)
     made.bring([(0, layer)])
-    assert made.apart(compose(scene, [layer])) <= FEW_ULPS
+    assert made.apart(compose_layers(scene, [layer])) <= FEW_ULPS
     assert made.apart(scene) > 0.1
     made.release()
 
@@ -259,9 +259,9 @@ def test_every_form_of_field_is_what_compose_gives(ctx: moderngl.Context, kind: 
     made = Edited(ctx, scene, [gdf])
     for s in (0.013, 0.5, 0.77, 1.2):
         made.bring([(0, Layer(gdf, s))])
-        assert made.apart(compose(scene, [Layer(gdf, s)])) <= FEW_ULPS, s
+        assert made.apart(compose_layers(scene, [Layer(gdf, s)])) <= FEW_ULPS, s
     made.bring([(0, Layer(gdf, 1.0))])
-    assert made.same_bits(compose(scene, [Layer(gdf, 1.0)]))
+    assert made.same_bits(compose_layers(scene, [Layer(gdf, 1.0)]))
     made.release()
 
 
@@ -272,7 +272,7 @@ def test_edits_without_members_and_tiny_scenes_are_survived(ctx: moderngl.Contex
     made = Edited(ctx, scene, gdfs)
     layers = [Layer(gdf, 0.5) for gdf in gdfs]
     made.bring(list(enumerate(layers)))
-    assert made.apart(compose(scene, layers)) <= FEW_ULPS
+    assert made.apart(compose_layers(scene, layers)) <= FEW_ULPS
     assert EditSample(scene, gdfs).error(made.edit_pass, list(enumerate(layers)), "normalised") <= FEW_ULPS
     assert ctx.error == "GL_NO_ERROR"
     made.release()
@@ -292,7 +292,7 @@ def test_huge_offsets_overflow_as_they_do_on_the_cpu(ctx: moderngl.Context) -> N
     made = Edited(ctx, scene, [gdf])
     for s in (0.3, 1.0, 1.2):
         made.bring([(0, Layer(gdf, s))])
-        assert made.apart(compose(scene, [Layer(gdf, s)])) <= FEW_ULPS, s
+        assert made.apart(compose_layers(scene, [Layer(gdf, s)])) <= FEW_ULPS, s
     made.release()
 
 

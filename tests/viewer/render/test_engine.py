@@ -13,7 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from progdf.compose.reference import BLENDS, Gains, Layer, compose
+from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import render
@@ -78,7 +78,7 @@ class Count:
 def test_the_picture_is_the_composed_scene_drawn(engine: Engine, stack: Stack) -> None:
     view = view_of(stack, 0.7, 0.4)
     layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
-    expected = render(compose(stack.scene, layers), to_camera(view.camera, *SIZE)).numpy()
+    expected = render(compose_layers(stack.scene, layers), to_camera(view.camera, *SIZE)).numpy()
     image = engine.image(view, SIZE)
     assert image.shape == (72, 96, 3)
     assert image.dtype == np.float32
@@ -271,7 +271,7 @@ def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: Engine, stack
     for ears in (0.0, 0.3, 0.7, 1.0):
         view = view_of(stack, ears=ears)
         gl_engine.image(view, SIZE)
-        means = compose(stack.scene, [Layer(stack.gdfs[EARS], ears)]).means.numpy()
+        means = compose_layers(stack.scene, [Layer(stack.gdfs[EARS], ears)]).means.numpy()
         order = engine_module.back_to_front(means, to_camera(view.camera, *SIZE))
         assert np.array_equal(gl_engine._order, order)
 

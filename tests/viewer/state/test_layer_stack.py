@@ -13,7 +13,7 @@ from imgui_bundle import imgui
 
 from progdf.__main__ import main
 from progdf.compose.layers import BLENDS
-from progdf.compose.reference import Gains, Layer, compose
+from progdf.compose.reference import Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES
@@ -353,7 +353,7 @@ def test_export_and_render_take_gains_solo_and_overshoot(
     options = ("--set", "scarf=1", "--set", "ears=1.1", "--overshoot", "--gain", "ears:geometry=0.5")
     edits = ("bear.ply", "scarf.gdf", "ears.gdf", *options)
     assert main(["export", *edits, "--solo", "ears", "-o", "a.ply"]) == 0
-    expected = compose(made.scene, [Layer(made.gdfs[1], 1.1, gains=Gains(geometry=0.5))])
+    expected = compose_layers(made.scene, [Layer(made.gdfs[1], 1.1, gains=Gains(geometry=0.5))])
     read = load_ply("a.ply")
     for name in set(ATTRIBUTES) - {"quats"}:
         assert torch.equal(getattr(read, name), getattr(expected, name))

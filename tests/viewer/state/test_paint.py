@@ -12,7 +12,7 @@ import torch
 from imgui_bundle import imgui
 
 from progdf.camera import Camera
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from tests.helpers.hostile import NPY_HEADERS, npy
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
@@ -207,7 +207,7 @@ def test_a_stroke_on_the_picture_takes_the_edit_away_there_as_one_undo_entry(han
     assert weights(hand).min() < 0.02
     assert weights(hand, 1).min() == 1.0, "only the focused layer"
     assert len(hand.stage.work.past.past) == 1
-    expected = compose(
+    expected = compose_layers(
         bear().scene,
         [Layer(bear().gdfs[0], 1.0, weights=torch.from_numpy(weights(hand))), Layer(bear().gdfs[1], 1.0)],
     )

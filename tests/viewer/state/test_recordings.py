@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from progdf.__main__ import main
-from progdf.compose.reference import Layer, compose
+from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME, save_trajectory
 from progdf.gaussians import pack
@@ -71,7 +71,7 @@ def test_between_two_snapshots_the_recording_goes_straight_as_the_runs_own_error
     trajectory = recording_of(scarf)
     members = scarf.region.members
     for s in (0.0, 0.31, AT, 0.9, 1.0):
-        shown = pack(compose(bear().scene, [Layer(found, s)])[members])
+        shown = pack(compose_layers(bear().scene, [Layer(found, s)])[members])
         expected = pack(bear().scene[members]) + trajectory.at(s)
         assert torch.allclose(shown, expected, atol=1e-5)
 
