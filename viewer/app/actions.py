@@ -131,7 +131,7 @@ class Desk:
         """
         path = session_file(path)
         if path != self.path and path.is_file() and kind_of(path) != "session":
-            raise ProgdfError(f"{path} is another file, no session; choose another name")
+            raise ProgdfError(f"{path} is not a session; choose another name")
         self._write(path)
         self._autosave.drop()
         self.path = path
@@ -156,7 +156,7 @@ class Desk:
         try:
             wait = self._autosave.wait(now, kept, self._beside, self._write)
         except (ProgdfError, OSError) as error:
-            self._app.stage.tell(f"there is no autosave: {error}", error=True)
+            self._app.stage.tell(f"Autosave failed: {error}", error=True)
             return None
         if self._autosave.path is not None and self._autosave.path != before:
             self._app.stage.recent = self._remember(self._autosave.path)
@@ -194,7 +194,7 @@ class Desk:
         view = stage.work.view
         stage.change(replace(view, timeline=timeline_file.load(path, view.layers)))
         stage.work = replace(stage.work, player=Player(shown=True))
-        stage.tell(f"Opened {path.name}; Space plays it")
+        stage.tell(f"Opened {path.name}; press Space to play it")
 
     def _open_session(self, path: Path) -> None:
         opened = session.open_session(path)
@@ -236,7 +236,7 @@ class Desk:
     def _discard_autosave(self, path: Path) -> None:
         aside = autosaves.put_aside(path)
         self._app.stage.recent = self._remember(aside)
-        self._app.stage.tell(f"Discarded; it stays in {aside.name} for a while")
+        self._app.stage.tell(f"Discarded; a copy is kept in {aside.name}")
         self.offer_autosave()
 
     def _open_scene(self, path: Path) -> None:
@@ -309,7 +309,9 @@ class Desk:
         stage = self._app.stage
         place = self.path or self._app.document.path or stage.pictures / self._app.document.title
         path, count = saved_files.camera(place, to_camera(stage.work.view.camera, *stage.picture_size))
-        stage.tell(f"Kept as camera {count} of {path.resolve()}; progdf train … --cameras {path.name}")
+        stage.tell(
+            f"Saved as camera {count} in {path.resolve()}; use it with progdf train … --cameras {path.name}"
+        )
 
     def _write(self, path: Path) -> None:
         session.save(path, self._session())

@@ -13,17 +13,17 @@ from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 MOUSE_HELP = (
     ("Left drag", "orbit"),
     ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
-    ("Right drag", "pan; look around while flying"),
+    ("Right drag", "pan; in fly mode look around"),
     ("Wheel", "zoom"),
-    ("Click", "focus the layer under the cursor"),
-    ("Double click", "turn around the surface there"),
-    ("W A S D Q E", "fly; Shift ten times faster, Alt slower"),
-    ("Shift on a slider", "ten times finer"),
+    ("Click", "select the layer under the cursor"),
+    ("Double-click", "set the orbit pivot"),
+    ("W A S D Q E", "fly; Shift faster, Alt slower"),
+    ("Shift on a slider", "fine adjustment"),
     ("Ctrl+click a slider", "type a value"),
-    ("Double click a slider", "back to its default"),
-    ("Right click", "menu of a layer or a snapshot"),
-    ("Esc, right click", "while dragging: take it back"),
-    ("\\ held", "the original"),
+    ("Double-click a slider", "reset it"),
+    ("Right-click", "menu of a layer or snapshot"),
+    ("Esc, right-click", "cancel a drag"),
+    ("Hold \\", "show the original"),
 )
 
 TOPICS = (

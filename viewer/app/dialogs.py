@@ -21,20 +21,20 @@ from viewer.ui.widgets import elided, section, small, tip
 WIDTH_PX = 520.0  # at 1×
 _POPUP = "##dialog"
 TITLES = {
-    "save": "Save the session",
+    "save": "Save session",
     "open": "Open",
     "replace": "Replace the layer's edit",
-    "leave": "There are unsaved changes",
-    "overwrite": "This file already exists",
-    "restore": "Unsaved work was found",
+    "leave": "Unsaved changes",
+    "overwrite": "File already exists",
+    "restore": "Recover unsaved work?",
 }
 _HINTS = {
-    "save": "A .session.json file; the scene and its edits stay where they are.",
-    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a session or cameras, told apart by content.",
-    "replace": "An edit (.gdf) of this scene; the layer keeps its place, strength and gains.",
-    "leave": "Save them in {} first?",
+    "save": "A .session.json file. The scene and its edits stay where they are.",
+    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a session or cameras.",
+    "replace": "An edit (.gdf) of this scene. The layer keeps its position, strength and gains.",
+    "leave": "Save changes to {}?",
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
-    "restore": "The last session was not closed properly. Its unsaved work is in {}.",
+    "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
 }
 _SUBMIT = {"save": "Save", "open": "Open", "replace": "Replace"}
 """The button of each question that has a path field."""
@@ -123,7 +123,7 @@ def _content(
     imgui.begin_disabled(dialog.choosing)
     browse = imgui.button("…", imgui.ImVec2(more, 0.0))
     imgui.end_disabled()
-    tip("Choose in the desktop's own dialog (Ctrl+B)")
+    tip("Browse with the system file dialog (Ctrl+B)")
     if browse or ("Ctrl+B" in pressed and not dialog.choosing):
         return Answer(dialog, ("browse",))
     if dialog.notice:

@@ -138,7 +138,7 @@ def _stroke_begun(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Work
     """The brush comes down on the focused layer, or says why it cannot."""
     reason = brush.obstacle(work.view, work.focus)
     if reason or work.focus is None:
-        return hand, workspace.told(work, f"Nothing to paint: {reason}", sight.now, error=True)
+        return hand, workspace.told(work, f"Cannot paint: {reason}", sight.now, error=True)
     layer, camera = work.view.layers[work.focus], sight.camera(work.view.camera)
     scene, held = sight.engine.gaussians(work.view), work.view.brush
     mode = paint.mode_while(held.mode, inputs.modifier())

@@ -36,7 +36,7 @@ def obstacle() -> str:
     """Why no dialog can be shown, in one line; "" where one can."""
     if sys.platform in ("win32", "darwin") or any(shutil.which(program) for program in PROGRAMS):
         return ""
-    return f"No program that shows file dialogs is installed ({PROGRAMS[0]} or {PROGRAMS[1]}); type the path"
+    return f"No file dialog is installed ({PROGRAMS[0]} or {PROGRAMS[1]}); type the path"
 
 
 class Browser:
@@ -66,8 +66,10 @@ class Browser:
             folder = path if path.is_dir() else path.parent
             self._shown = dialogs.open_file("Open", printable(f"{folder}/"), _OPEN)
         else:
-            self._shown = dialogs.save_file("Save the session", printable(str(path)), _SAVE)
-        return replace(dialog, choosing=True, notice="Choose in the desktop's dialog, or type the path here")
+            self._shown = dialogs.save_file("Save session", printable(str(path)), _SAVE)
+        return replace(
+            dialog, choosing=True, notice="Choose a file in the system dialog, or type a path here"
+        )
 
     def looked(self, dialog: Dialog | None) -> Dialog | None:
         """The question after a look at the dialog: with the file, if one was chosen. Does not wait."""

@@ -48,7 +48,7 @@ def timeline(folder: Path, title: str, view: ViewState) -> str:
 
     def save() -> str:
         timeline_file.save(path, view.timeline, view.layers)
-        return f"Saved {path.resolve()}; progdf render … --timeline {path.name} makes a film of it"
+        return f"Saved {path.resolve()}; render it with progdf render … --timeline {path.name}"
 
     return _saved("timeline", folder, save)
 

@@ -20,9 +20,9 @@ DRAG = "brush"
 
 NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
 WHOLE = (
-    ("None", "paint_clear", "Paint none of it (Backspace)"),
-    ("Full", "paint_fill", "Paint all of it (Shift+Backspace)"),
-    ("Feather", "paint_feather", "Soften the edges of its paint; again, more (Shift+X)"),
+    ("Clear", "paint_clear", "Set all weights to 0 (Backspace)"),
+    ("Fill", "paint_fill", "Set all weights to 1 (Shift+Backspace)"),
+    ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more (Shift+X)"),
 )
 """Buttons for all of a layer's paint: name, action of `controls.KEYS`, tip."""
 
@@ -30,12 +30,12 @@ WHOLE = (
 def obstacle(view: ViewState, focus: int | None) -> str:
     """Why the brush cannot paint now, one line; empty where it can."""
     if focus is None or focus >= len(view.layers):
-        return "no layer is focused; click the one to paint, or press 1–9"
+        return "no layer is selected; click one, or press 1–9"
     layer = view.layers[focus]
     if layer.locked:
-        return f"{layer.name} is locked; L unlocks it"
+        return f"{layer.name} is locked; press L to unlock it"
     if layer not in stack.shown(view):
-        return f"{layer.name} is hidden; H shows it"
+        return f"{layer.name} is hidden; press H to show it"
     return ""
 
 
@@ -46,31 +46,31 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     heading("Paint", ui)
     label("Brush", column)
     mode = choice("brush mode", tuple(NAMES[m] for m in paint.MODES), paint.MODES.index(brush.mode), ui)
-    tip("X; while painting, Ctrl does the opposite and Shift smooths")
+    tip("Brush mode (X). While painting, Ctrl inverts and Shift smooths")
     if mode is not None:
         brush = replace(brush, mode=paint.MODES[mode])
     label("Radius", column)
     radius = value_slider(
         "##radius", brush.radius, (paint.SMALLEST_PX, paint.LARGEST_PX), "%.0f px", Brush.radius, ui
     )
-    tip("[ ]")
+    tip("Brush radius ([ and ])")
     label("Softness", column)
     softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", Brush.softness, ui)
-    tip("Shift+[ ]")
+    tip("Brush softness (Shift+[ and ])")
     brush = replace(brush, radius=radius, softness=softness)
-    label("Acts on", column)
+    label("Depth", column)
     depth = choice("depth", ("Front", "Through"), int(brush.through), ui)
-    tip("The front surface only, or all that lies under the brush (Shift+B)")
+    tip("Paint only the front surface, or everything under the brush (Shift+B)")
     if depth is not None:
         brush = replace(brush, through=bool(depth))
     label("Weights", column)
-    colours = choice("weights", ("Colours", "Hidden"), int(not brush.weights), ui)
-    tip("The weights as colours on the layer's splats, blue for none of the edit, yellow for all of it (C)")
+    colours = choice("weights", ("Shown", "Hidden"), int(not brush.weights), ui)
+    tip("Show the weights as colors, from blue (0) to yellow (1) (C)")
     if colours is not None:
         brush = replace(brush, weights=not colours)
     if brush.weights:
         _legend(column, ui)
-    label("All of it", column)
+    label("Layer", column)
     imgui.begin_disabled(focus is None or view.layers[focus].locked)
     each = (imgui.get_content_region_avail().x - 12.0 * ui.scale) / 3
     for text, asks, keys in WHOLE:
@@ -94,9 +94,9 @@ def _legend(column: float, ui: UiContext) -> None:
         corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
         canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
     imgui.push_font(None, SMALL_PX)
-    wide = imgui.calc_text_size("all").x
+    wide = imgui.calc_text_size("1").x
     imgui.pop_font()
-    for x, text in ((left, "none"), (left + width - wide, "all")):
+    for x, text in ((left, "0"), (left + width - wide, "1")):
         at = imgui.ImVec2(round(x), round(top + height + 2.0 * ui.scale))
         canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.dim), text)
     imgui.dummy(imgui.ImVec2(width, height + size + 2.0 * ui.scale))
@@ -105,7 +105,7 @@ def _legend(column: float, ui: UiContext) -> None:
 def toggle(view: ViewState, ui: UiContext) -> bool:
     """The button that takes the brush up and puts it down; True when pressed."""
     pressed = icon_button("brush", Icon.BRUSH, ui, dim=not view.brush.active)
-    tip("Paint the strength of the focused layer (B)")
+    tip("Paint the strength of the selected layer (B)")
     return pressed
 
 

@@ -33,9 +33,9 @@ from . import layer_details as layer_fold
 from . import strength_slider
 
 BLEND_HELP = {
-    "normalised": "Overlapping edits share a Gaussian by their weights; never more than a full edit.",
+    "normalised": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
-    "over": "An edit covers those below it in the list, where and as far as it changes something.",
+    "over": "An edit covers those below it, where and as far as it changes something.",
 }
 TOGGLE_PX, GRIP_PX = 24.0, 4.0
 _MENU = "menu of a layer"
@@ -129,7 +129,7 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
         state = stack.with_overshoot(state, not on)
     imgui.pop_style_var()
     imgui.pop_style_color(2)
-    tip(f"Sliders to {stack.OVERSHOOT:g} (O). Beyond 1 the edit is extrapolated: nothing was learned there.")
+    tip(f"Overshoot to {stack.OVERSHOOT:g} (O): extrapolates past the trained range")
     return state
 
 
@@ -137,7 +137,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> Drawn:
     """All cards."""
     if not state.layers:
         imgui.push_text_wrap_pos(0.0)
-        imgui.text_disabled("No edits are loaded. Drop a .gdf file on the window.")
+        imgui.text_disabled("No edits loaded. Drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
     focus, renaming, overlap = cards.focus, None, None
     actions: list[str] = []
@@ -279,7 +279,7 @@ def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, 
             state = stack.soloed(state, index)
         else:
             state = stack.changed(state, index, lambda old: replace(old, enabled=not old.enabled))
-    tip("Show or hide this edit (H); Alt+click: show it alone")
+    tip("Show or hide (H). Alt+click: solo")
     imgui.same_line()
     _swatch(row.swatch, active, ui)
     imgui.same_line()
@@ -290,7 +290,7 @@ def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, 
     imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
         strength_slider.start_typing("##strength")
-    tip("Locked (L)" if layer.locked else "Click, or Ctrl+click the slider, to type a value")
+    tip("Locked (L)" if layer.locked else "Click to type a value")
     return card
 
 
@@ -312,7 +312,7 @@ def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     colour = PALETTE.text if active else PALETTE.dim
     imgui.get_window_draw_list().add_text(at, u32(colour), elided(layer.name, room))
-    tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double click to rename (Enter)")
+    tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename (Enter)")
     if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
         return replace(card, renaming=True, touched=True)
     threshold = GRIP_PX * ui.scale
@@ -345,12 +345,12 @@ def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
     small(note, PALETTE.dim, right - left - 4 * wide - 6.0 * ui.scale)
     asked = bool(overlaps) and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
     shared = [f"{grouped(count)} of its splats are also in {name}" for name, count in overlaps]
-    shared += ["The picture shows them in pink"] if overlaps else []
+    shared += ["Highlighted in pink"] if overlaps else []
     tip("\n".join((f"{grouped(row.count)} splats", *filter(None, [row.instruction]), *shared)))
     imgui.same_line(right - 4 * wide)
     if small_toggle("solo", "S", layer.solo, wide, ui):
         state = stack.soloed(state, index)
-    tip("Show this edit alone, and others that are alone (Shift+H)")
+    tip("Solo: show only soloed layers (Shift+H)")
     imgui.same_line(right - 3 * wide)
     if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
         state = stack.changed(state, index, lambda old: replace(old, locked=not old.locked))
@@ -358,11 +358,11 @@ def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
     imgui.same_line(right - 2 * wide)
     if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
         state = stack.folded(state, index)
-    tip("Gains, and the curve of visible change (G)")
+    tip("Show gains and the curve of visible change (G)")
     imgui.same_line(right - wide)
     if small_toggle("menu", Icon.MENU, False, wide, ui):
         imgui.open_popup(_MENU)
-    tip("Rename, duplicate, replace or delete this edit (right click)")
+    tip("Rename, duplicate, replace or delete (right-click)")
     return replace(card, state=state, overlap=asked)
 
 

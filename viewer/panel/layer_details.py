@@ -47,7 +47,7 @@ def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContex
     new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
     imgui.end_disabled()
     if moves:
-        tip(f"How much of the change of {kind} comes through (Tab, then arrows). Double click: all of it")
+        tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
     else:
         tip(f"This edit does not change the {kind}")
     return layer if new == value else stack.dialled(layer, kind, new)
@@ -71,8 +71,8 @@ def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
     width, height = imgui.get_content_region_avail().x, CURVE_PX * scale
     imgui.dummy(imgui.ImVec2(width, height))
     tip(
-        "Visible change over the strength, in small renders of this region alone, as a share of the full "
-        f"edit.\nLines: {len(row.recorded)} recorded snapshots."
+        "Visible change against strength, measured in small renders of this region; 1 is the full edit."
+        f"\nTicks: {len(row.recorded)} recorded snapshots."
     )
     canvas, radius = imgui.get_window_draw_list(), 7.0 * scale
     start, span = left + radius, (width - 2 * radius) / most

@@ -166,25 +166,25 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     section("View", ui)
     column = 82.0 * ui.scale
     camera = state.camera
-    label("Move", column)
+    label("Navigate", column)
     mode = choice("mode", ("Orbit", "Fly"), ("orbit", "fly").index(camera.mode), ui)
-    tip("V")
+    tip("Orbit around a pivot, or fly (V)")
     if mode is not None:
         camera = replace(camera, mode=("orbit", "fly")[mode])
     label("Up axis", column)
     ups = (*UPS, ("View", turntable.axes(camera).up))
     current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
     chosen = choice("up", tuple(name for name, _ in ups), current, ui)
-    tip("The axis of the scene that is up; View takes what is up in the picture now")
+    tip("Up axis of the scene. View: use the current view's up direction")
     if chosen is not None:
         camera = turntable.with_up(camera, ups[chosen][1])
-    label("Lens", column)
+    label("FOV", column)
     imgui.set_next_item_width(-1.0)
     changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
     if double_clicked():
         changed, fov_y = True, ViewCamera.fov_y
     camera = replace(camera, fov_y=fov_y) if changed else camera  # unchanged, imgui still rounds to float32
-    tip(f"Vertical field of view. Double click: back to {ViewCamera.fov_y:g}°")
+    tip(f"Vertical field of view. Double-click: reset to {ViewCamera.fov_y:g}°")
     label("Background", column)
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
@@ -194,11 +194,11 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
         actions.append("frame")
-    tip("Frame the focused layer, or the scene (F)")
+    tip("Frame the selected layer, or the scene (F)")
     imgui.same_line(0.0, 6.0 * ui.scale)
     if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
         actions.append("home")
-    tip("Back to the first view (Shift+F)")
+    tip("Reset the view (Shift+F)")
     return replace(state, camera=camera, background=background, compare=comparison)
 
 
@@ -206,16 +206,16 @@ def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext
     """Off, beside each other or subtracted; with the original, or with what was recorded."""
     label("Compare", column)
     chosen = choice("compare", ("Off", "Split", "Diff"), compare.MODES.index(shown.mode), ui)
-    tip("Beside each other (Y), or what differs (Shift+Y)")
+    tip("Split view (Y) or amplified difference (Shift+Y)")
     if chosen is not None:
         shown = replace(shown, mode=compare.MODES[chosen])
     if shown.mode == "off":
         return shown
-    label("With", column)
+    label("Against", column)
     against = 0 if unrecorded else compare.AGAINST.index(shown.against)
     chosen = choice("against", ("Original", "Recorded"), against, ui, usable=1 if unrecorded else 2)
-    told = f"\nNothing was recorded: {unrecorded}" if unrecorded else ""
-    tip(f"The original, or the same strengths as training recorded them (Alt+Y){told}")
+    told = f"\nNo recording: {unrecorded}" if unrecorded else ""
+    tip(f"Compare with the original, or with the snapshots recorded in training (Alt+Y){told}")
     if chosen is not None:
         shown = replace(shown, against=compare.AGAINST[chosen])
     if shown.mode == "difference":
@@ -227,7 +227,7 @@ def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext
         if double_clicked():
             changed, times = True, Comparison.amplify
         shown = replace(shown, amplify=float(round(times))) if changed else shown
-        tip(f"What the difference is multiplied by. Double click: back to × {Comparison.amplify:g}")
+        tip(f"Gain of the difference. Double-click: reset to × {Comparison.amplify:g}")
     return shown
 
 
@@ -239,8 +239,8 @@ def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[st
     imgui.separator()
     right = right_edge()
     for action, icon, help_, usable in (
-        ("undo", Icon.UNDO, f"Undo (Ctrl+Z), {shown.undos} to go", shown.undos > 0),
-        ("redo", Icon.REDO, f"Redo (Ctrl+Shift+Z), {shown.redos} to go", shown.redos > 0),
+        ("undo", Icon.UNDO, f"Undo (Ctrl+Z), {shown.undos} available", shown.undos > 0),
+        ("redo", Icon.REDO, f"Redo (Ctrl+Shift+Z), {shown.redos} available", shown.redos > 0),
     ):
         imgui.begin_disabled(not usable)
         if icon_button(action, icon, ui):
@@ -254,12 +254,12 @@ def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[st
     imgui.same_line(right - 3 * side - 12.0 * ui.scale)
     if icon_button("timeline", Icon.FILM, ui):
         actions.append("timeline")
-    tip("The timeline: keys of camera and strengths, played and filmed (T)")
+    tip("Timeline: animate the camera and the strengths (T)")
     imgui.same_line(0.0, 6.0 * ui.scale)
     if icon_button("picture", Icon.PICTURE, ui):
         actions.append("picture")
-    tip("Save the picture as PNG (F2)")
+    tip("Save the image as PNG (F2)")
     imgui.same_line(0.0, 6.0 * ui.scale)
     if icon_button("help", Icon.HELP, ui):
         actions.append("help")
-    tip("Keys and mouse (F1)")
+    tip("Keyboard and mouse shortcuts (F1)")

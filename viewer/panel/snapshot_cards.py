@@ -27,12 +27,12 @@ def draw(cards: tuple[SnapshotCard, ...], ui: UiContext, actions: list[str]) -> 
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     right = right_edge()
     section("Snapshots", ui)
-    name = "Take"
+    name = "Add"
     wide = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide)
     if imgui.button(f"{name}##snapshot"):
         actions.append("snapshot")
-    tip("Keep the sliders as they are now (F3); a click on a picture goes back to it")
+    tip("Save the current sliders as a snapshot (F3); click a snapshot to restore it")
     gap = 6.0 * ui.scale
     each = (imgui.get_content_region_avail().x - (COLUMNS - 1) * gap) / COLUMNS
     for i, card in enumerate(cards if len(cards) > 1 else ()):
@@ -49,7 +49,7 @@ def _card(index: int, card: SnapshotCard, wide: float, ui: UiContext, actions: l
     if imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall)):
         actions.append(f"restore:{index}")
     hovered = imgui.is_item_hovered()
-    tip("Back to this (right click: rename, delete)" if index else "Back to the original, all sliders at 0")
+    tip("Restore (right-click: rename, delete)" if index else "Restore the original: all sliders at 0")
     if index and imgui.is_item_clicked(imgui.MouseButton_.right.value):
         imgui.open_popup(_MENU)
     item, renaming = _menu(ui), imgui.get_id("renaming")

@@ -18,7 +18,7 @@ HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one type
 FINE = 0.1
 DEFAULT = 0.0
 """The original; where a double click goes."""
-TIP = "Double click: back to 0, the original. Ctrl+click: type a value. Shift: drag ten times finer."
+TIP = "Double-click: reset to 0. Ctrl+click: type a value. Shift+drag: fine adjustment."
 
 
 def parse_strength(text: str, most: float = 1.0) -> float | None:

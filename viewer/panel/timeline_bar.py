@@ -82,18 +82,18 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
     if icon_button("play", icon, ui):
         actions.append("play")
     imgui.end_disabled()
-    tip("Play or pause (Space)" if len(timeline.keys) > 1 else "Two keys make a film")
+    tip("Play or pause (Space)" if len(timeline.keys) > 1 else "Set at least two keyframes to play")
     imgui.same_line(0.0, gap)
     on_key = tl.key_at(timeline, frame) is not None
     if icon_button("key", icons.ICON_FA_DIAMOND, ui):
         actions.append("key")
-    tip("Set this key anew (K)" if on_key else "Set a key: the camera and every strength (K)")
+    tip("Update keyframe (K)" if on_key else "Insert keyframe: camera and all strengths (K)")
     imgui.same_line(0.0, gap)
     imgui.begin_disabled(not on_key)
     if icon_button("drop_key", icons.ICON_FA_TRASH_CAN, ui, dim=not on_key):
         actions.append("drop_key")
     imgui.end_disabled()
-    tip("Delete the key at the playhead (Del)")
+    tip("Delete keyframe (Del)")
     imgui.same_line(0.0, 10.0 * ui.scale)
 
 
@@ -104,14 +104,14 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
-    tip("How it goes on from the key before the playhead: smooth, linear or hold (Shift+K)")
+    tip("Interpolation after the keyframe at or before the playhead: smooth, linear or hold (Shift+K)")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append("ping_pong")
-    tip("There and back again (Alt+K): " + ("on" if timeline.ping_pong else "off"))
+    tip("Ping-pong (Alt+K): " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     for name, now, most, unit, what in (
-        ("length", timeline.length, tl.LONGEST, "f", "The last frame"),
+        ("length", timeline.length, tl.LONGEST, "f", "Length in frames"),
         ("fps", timeline.fps, tl.FASTEST, "fps", "Frames per second"),
     ):
         imgui.set_next_item_width(58.0 * ui.scale)
@@ -186,7 +186,7 @@ def _paint(
         colour = u32(p.handle if key.frame in (frame, under) else p.dim)
         _paint_key(canvas, x, line, size, colour, key.easing)
     if not timeline.keys:
-        hint = "K sets a key at the playhead; two make a film"
+        hint = "Press K to insert a keyframe"
         size = SMALL_PX * scale
         at = imgui.ImVec2(round(start + 40.0 * scale), round(line - size - 3.0 * scale))
         canvas.add_text(ui.fonts.regular, size, at, u32(p.dim), hint)

@@ -46,7 +46,7 @@ def found(gdf: Gdf, path: Path) -> Recording:
         return Recording(reason=str(error))
     same_way = torch.equal(s, torch.tensor(gdf.field.recorded, dtype=s.dtype))
     if not same_way or not torch.equal(members, gdf.region.members):
-        return Recording(reason=f"the {FILE_NAME} beside {path.name} is of another edit")
+        return Recording(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
     return Recording(beside)
 
 
@@ -60,7 +60,7 @@ def recorded(gdf: Gdf, recording: Recording) -> Gdf:
         return gdf
     field = recorded_field(load_trajectory(recording.path)[0])
     if field.attributes and field.members != len(gdf.region):
-        raise ProgdfError(f"{recording.path} is of another edit; train again")
+        raise ProgdfError(f"{recording.path} belongs to another edit; train again")
     return replace(gdf, field=field)
 
 

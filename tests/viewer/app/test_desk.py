@@ -354,7 +354,7 @@ def test_saving_never_writes_over_another_kind_of_file(window: application.App, 
     before = (folder / "cameras.json").read_bytes()
     window.desk.serve(f"save_to:{folder / 'cameras.json'}")
     assert (folder / "cameras.json").read_bytes() == before
-    assert "no session" in question(window).error
+    assert "is not a session" in question(window).error
 
 
 def by_hand(window: application.App, *keys: imgui.Key, text: str = "") -> None:

@@ -87,7 +87,7 @@ def test_the_recording_of_another_edit_is_not_taken_for_this_ones(runs: list[Pat
     save_gdf(runs[1].with_name("ears.gdf"), ears)
     found = recordings.found(ears, runs[1].with_name("ears.gdf"))
     assert found.path is None
-    assert "is of another edit" in found.reason
+    assert "belongs to another edit" in found.reason
 
 
 def test_a_damaged_recording_is_no_recording_and_says_why(runs: list[Path]) -> None:
@@ -253,7 +253,7 @@ def test_a_recording_that_does_not_fit_its_edit_is_one_line(runs: list[Path]) ->
     scarf, ears = bear().gdfs
     extra = {"members": scarf.region.members}
     save_trajectory(runs[1].with_name(FILE_NAME), recording_of(ears), extra, {})
-    with pytest.raises(ProgdfError, match="is of another edit"):
+    with pytest.raises(ProgdfError, match="belongs to another edit"):
         recordings.recorded(scarf, recordings.found(scarf, runs[1]))
 
 
