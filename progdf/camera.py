@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from .errors import ProgdfError
 from .lens import Lens
 
 NEAR = 0.01
@@ -97,20 +95,3 @@ def intrinsics(fov_y: float, width: int, height: int) -> Tensor:
     """Intrinsics of a centred camera with square pixels; `fov_y` in radians. [3,3] float32"""
     focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * fov_y, dtype=torch.float64)))
     return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-
-
-def split_held_out(cameras: Sequence[Camera], count: int) -> tuple[list[Camera], list[Camera]]:
-    """Cameras to train with and `count` to measure with, the latter spread evenly over the list.
-
-    Raises:
-        ProgdfError: fewer cameras than one to train with and `count` to hold out.
-    """
-    if not 0 <= count < len(cameras):
-        raise ProgdfError(
-            f"{count} of {len(cameras)} cameras cannot be held out; 0 to {len(cameras) - 1} would be right"
-        )
-    chosen = {int((i + 0.5) * len(cameras) / count) for i in range(count)}
-    return (
-        [camera for i, camera in enumerate(cameras) if i not in chosen],
-        [camera for i, camera in enumerate(cameras) if i in chosen],
-    )

@@ -14,8 +14,7 @@ import tyro
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import counted, file_size, grouped
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
-from progdf.gdf.file import open_gdf
-from progdf.gdf.header import GdfHead
+from progdf.gdf.header import GdfHead, read_head
 from progdf.io import session as session_file
 from progdf.io.atomic import check_regular, open_failure
 from progdf.io.cameras import load_cameras
@@ -83,8 +82,8 @@ def _scene_lines(path: Path) -> Iterator[str]:
 
 
 def _edit_lines(path: Path) -> Iterator[str]:
-    gdf = open_gdf(path)
-    members, count = gdf.members or 0, gdf.scene.count
+    gdf = read_head(path)
+    members, count = gdf.members, gdf.scene.count
     yield f"{path.name}: the edit '{gdf.name}', {file_size(gdf.size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"

@@ -50,11 +50,6 @@ class Change:
         """Whether the depth order may have changed."""
         return self.largest_move > 0
 
-    @property
-    def covariance_moved(self) -> bool:
-        """Whether scales or rotations may have changed."""
-        return "log_scales" in self.attributes or "quats" in self.attributes
-
 
 class Composer:
     """Keeps one scene under a changing stack of edits.

@@ -141,7 +141,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = json.dumps(
         {
-            "format": 1 if gdf.field.origin is None else FORMAT,
+            "format": FORMAT,
             "name": gdf.name,
             "instruction": gdf.instruction,
             "scene": {"count": gdf.scene.count, "means_sha256": gdf.scene.means_sha256},
@@ -154,18 +154,22 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ensure_ascii=False,
         allow_nan=False,
     )
-    metadata = {
-        "progdf": header,
-        "header_sha256": head_checksum(header, table_of(tensors)),
-        "sha256": _checksum(header, tensors),
-    }
     try:
         with written_whole(path) as beside:
-            write_tensors(beside, tensors, metadata)
+            write_tensors(beside, tensors, file_metadata(header, tensors))
     except OSError as error:
         raise ProgdfError(
             f"{path} cannot be written ({error.strerror or error}); choose another place"
         ) from error
+
+
+def file_metadata(header: str, tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """The metadata of a .gdf file with this JSON header and these tensors: the header, and both checksums."""
+    return {
+        "progdf": header,
+        "header_sha256": head_checksum(header, table_of(tensors)),
+        "sha256": _checksum(header, tensors),
+    }
 
 
 def load_gdf(
@@ -206,20 +210,6 @@ def load_gdf(
         raise contradiction(name, error) from error
 
 
-def open_gdf(path: str | os.PathLike[str]) -> GdfHead:
-    """What a file holds, to be told and not to be run: reads its header only.
-
-    Files from before headers had a checksum of their own are read and checked as a whole.
-
-    Raises:
-        ProgdfError: it is no .gdf, from a newer version, or what was read of it is damaged.
-    """
-    head = read_head(path)
-    if head.verified and head.members is not None:
-        return head
-    return replace(head, verified=True, members=len(_read(head).region))
-
-
 def _read(head: GdfHead) -> Gdf:
     """The whole edit, every byte checked; a network stays as it is and moves nothing."""
     try:
@@ -245,8 +235,8 @@ def _assembled(head: GdfHead, tensors: dict[str, Tensor]) -> Gdf:
     field, form = unpacked_field(head.field, tensors)
     region = unpacked_region(head.region, tensors, head.scene.count, head.members)
     _check_reach(field)
-    if head.members is not None and head.members != len(region):
-        raise ValueError(f"the header tells of {head.members} members, the region has {len(region)}")
+    if head.members != len(region):
+        raise ValueError(f"the header has {head.members} members, the region {len(region)}")
     if form is not None and form.network.members != len(region):
         raise ValueError(f"the network has {form.network.members} members, the region {len(region)}")
     return Gdf(

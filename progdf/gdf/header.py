@@ -21,9 +21,8 @@ from progdf.field.neural import NeuralShape
 from progdf.io.atomic import check_regular, open_failure
 from progdf.io.json_values import decode_json, typed
 
-FORMAT = 2
-"""Newest version of the file format; those down to 1 are read. A file states the oldest that can hold it: 1,
-or 2 where it keeps a network."""
+FORMAT = 1
+"""The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
 """A header that claims a larger scene is not believed: the score would take gigabytes."""
@@ -83,7 +82,7 @@ class _Header(msgspec.Struct, frozen=True):
     field: FieldTable
     options: dict[str, Any]
     report: dict[str, Any]
-    members: Annotated[int, msgspec.Meta(ge=0)] | None = None
+    members: Annotated[int, msgspec.Meta(ge=0)]
 
 
 class _Tensor(msgspec.Struct, frozen=True):
@@ -105,13 +104,11 @@ class GdfHead:
 
     Args:
         path, size: the file, and its bytes
-        verified: the header is what was saved; of files from before it had a checksum of its own, that is
-            not known until the whole is read
         text: the JSON header as it stands in the file
         sha256: of the whole: header and tensors
         tensors: shape and type of each, as safetensors calls it
         name, region, instruction: the layer's, the region's, and what was asked for
-        members: Gaussians of the region; None where an old file does not say
+        members: Gaussians of the region
         scene: the scene it was made for
         field: kind, channels, attributes …, see `field_packing.packed_field`
         options, report: of the training, JSON values
@@ -119,14 +116,13 @@ class GdfHead:
 
     path: Path
     size: int
-    verified: bool
     text: str
     sha256: str
     tensors: Mapping[str, tuple[tuple[int, ...], _Type]]
     name: str
     region: str
     instruction: str
-    members: int | None
+    members: int
     scene: SceneFingerprint
     field: FieldTable
     options: Mapping[str, Any]
@@ -140,7 +136,7 @@ class GdfHead:
         else:
             kept = [name for name in self.tensors if name.endswith((".full", ".rest"))]
         stored = sum(self.numbers(name) * _BYTES[self.tensors[name][1]] for name in kept)
-        return stored / max(1, self.members or 0)
+        return stored / max(1, self.members)
 
     @property
     def parameters(self) -> int:
@@ -214,15 +210,14 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
     except (ValueError, KeyError, TypeError):
         raise damaged(name) from None
     if version > FORMAT:
-        raise ProgdfError(f"{name} has format {version}, this progdf reads up to {FORMAT}; update progdf")
+        raise ProgdfError(f"{name} has format {version}, this progdf reads format {FORMAT}; update progdf")
     needed = 8 + len(header) + max((tensor.data_offsets[1] for tensor in table.values()), default=0)
     if needed > length:
         raise ProgdfError(
             f"{name} is cut short: it has {length} of {needed} bytes; copy it again or make it again"
         )
     tensors = {key: (tuple(tensor.shape), tensor.dtype) for key, tensor in table.items()}
-    own = metadata.get("header_sha256")
-    if version < 1 or (own is not None and own != head_checksum(text, tensors)):
+    if version < FORMAT or metadata.get("header_sha256") != head_checksum(text, tensors):
         raise damaged(name)
     try:
         found = typed(content, _Header)
@@ -236,7 +231,6 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
     return GdfHead(
         path=path,
         size=length,
-        verified=own is not None,
         text=text,
         sha256=metadata.get("sha256", ""),
         tensors=tensors,
@@ -265,10 +259,9 @@ def _check(header: _Header, tensors: Mapping[str, tuple[tuple[int, ...], _Type]]
         if name not in tensors or len(tensors[name][0]) != count:
             raise ValueError(f"it has no tensor {name} of {count} sides")
     rows = {tensors[name][0][0] for name in sides if name.endswith((".full", "end"))}
-    members = header.members if header.members is not None else max(rows, default=0)
-    if any(count != members for count in rows) or members > header.scene.count:
+    if any(count != header.members for count in rows) or header.members > header.scene.count:
         raise ValueError(
-            f"the header tells of {members} members of {header.scene.count}, the tensors of {sorted(rows)}"
+            f"the header has {header.members} members of {header.scene.count}, the tensors {sorted(rows)}"
         )
 
 

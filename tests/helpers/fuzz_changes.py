@@ -12,9 +12,8 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from progdf.gdf.file import _checksum
-from progdf.gdf.header import head_checksum
-from progdf.io.tensors import table_of, write_tensors
+from progdf.gdf.file import file_metadata
+from progdf.io.tensors import write_tensors
 from tests.helpers.hostile import JSON_TEXTS
 
 VALUES: list[Any] = [
@@ -150,9 +149,7 @@ def changed_gdf(content: bytes) -> Change:
         text = json.dumps(changed_value(rng, header) if rng.random() < 0.7 else header)
         found = changed_tensors(rng, tensors) if rng.random() < 0.5 else tensors
         found = {name: tensor.contiguous() for name, tensor in found.items()}
-        metadata = {"progdf": text, "sha256": _checksum(text, found)}
-        if rng.random() < 0.7:
-            metadata["header_sha256"] = head_checksum(text, table_of(found))
+        metadata = file_metadata(text, found)
         path.write_bytes(safetensors.torch.save(found, metadata))
 
     return change

@@ -17,7 +17,8 @@ from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, pack
-from progdf.gdf.file import Gdf, _checksum, load_gdf, open_gdf, save_gdf
+from progdf.gdf.file import Gdf, file_metadata, load_gdf, save_gdf
+from progdf.gdf.header import read_head
 from tests.helpers.edits import edit_of
 from tests.helpers.networks import FORMS, MEMBERS, baked, members, rows, scene
 
@@ -66,7 +67,7 @@ def test_the_file_holds_the_network_and_not_what_is_baked_of_it(saved: Path, edi
 def test_a_network_needs_its_scene(saved: Path) -> None:
     with pytest.raises(ProgdfError, match=r"shirt\.gdf keeps a neural field, .*; load it with the scene"):
         load_gdf(saved)
-    assert open_gdf(saved).field.network is not None
+    assert read_head(saved).field.network is not None
 
 
 def test_another_scene_is_refused_before_anything_is_baked(saved: Path) -> None:
@@ -84,12 +85,6 @@ def test_a_network_that_looks_at_colours_refuses_a_scene_of_other_colours(saved:
 def test_a_network_that_sees_places_alone_does_not_mind_other_colours(tmp_path: Path) -> None:
     save_gdf(tmp_path / "a.gdf", edit_of(scene(), members(), baked("position")))
     load_gdf(tmp_path / "a.gdf", replace(scene(), sh0=scene().sh0 + 1))
-
-
-def test_a_file_without_a_network_stays_readable_for_older_programs(saved: Path, tmp_path: Path) -> None:
-    plain = replace(baked(), origin=None, kind="separable")
-    save_gdf(tmp_path / "plain.gdf", edit_of(scene(), members(), plain))
-    assert [_header(path)["format"] for path in (tmp_path / "plain.gdf", saved)] == [1, 2]
 
 
 def _header(path: Path) -> dict[str, object]:
@@ -115,7 +110,7 @@ def rewritten(
             kept[name] = tensor
     text = json.dumps(header)
     path = tmp_path / "shirt.gdf"
-    path.write_bytes(safetensors.torch.save(kept, {"progdf": text, "sha256": _checksum(text, kept)}))
+    path.write_bytes(safetensors.torch.save(kept, file_metadata(text, kept)))
     return path
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.camera import Camera, split_held_out
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.scene.bounds import front, scene_sphere
@@ -96,14 +96,3 @@ def test_a_single_gaussian_is_framed_by_its_own_size() -> None:
 def test_an_impossible_rig_is_one_line(count: int, elevations: tuple[float, float]) -> None:
     with pytest.raises(ProgdfError, match="the rig"):
         orbit_rig(ball(), count, 64, 64, elevations=elevations)
-
-
-def test_held_out_cameras_are_spread_over_the_list_and_never_trained_with() -> None:
-    cameras = orbit_rig(ball(), 30, 64, 64, up=Y_UP)
-    train, held = split_held_out(cameras, 6)
-    assert [camera.name for camera in held] == [f"orbit_{i:03d}" for i in (2, 7, 12, 17, 22, 27)]
-    assert len(train) == 24
-    assert not {camera.name for camera in train} & {camera.name for camera in held}
-    assert split_held_out(cameras, 0) == (cameras, [])
-    with pytest.raises(ProgdfError, match="held out"):
-        split_held_out(cameras, 30)
