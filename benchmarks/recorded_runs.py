@@ -8,8 +8,8 @@ import torch
 
 from progdf.field import FieldJudge
 from trainer.fit.fit import visibility
-from trainer.pipeline.fit_and_report import kept_judge
-from trainer.pipeline.reopen import its_views, reopened
+from trainer.pipeline.fit_and_report import load_evaluator
+from trainer.pipeline.reopen import render_run_views, reopen_run
 
 from .courses import KnownCourse
 
@@ -23,11 +23,12 @@ def recorded_course(root: Path) -> KnownCourse:
     Raises:
         ProgdfError: the folder is no finished run, or its scene is gone or another.
     """
-    run = reopened(root)
-    stand, trajectory = its_views(run), run.trajectory
-    few = stand.train[:: max(1, len(stand.train) // LOOKED)][:LOOKED]
-    look, judge = (
-        kept_judge(run.folder, stand, views, trajectory).counted for views in (few, stand.held_out[:JUDGED])
+    run = reopen_run(root)
+    setup, trajectory = render_run_views(run), run.trajectory
+    few = setup.train[:: max(1, len(setup.train) // LOOKED)][:LOOKED]
+    look, evaluator = (
+        load_evaluator(run.folder, setup, views, trajectory).counted_pixels
+        for views in (few, setup.held_out[:JUDGED])
     )
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     return KnownCourse(
@@ -37,8 +38,8 @@ def recorded_course(root: Path) -> KnownCourse:
         trajectory.s,
         offsets,
         trajectory.at,
-        FieldJudge(trajectory.s, offsets, judge),
+        FieldJudge(trajectory.s, offsets, evaluator),
         look,
-        visibility(run.scene, run.region.members, stand.train),
-        judge,
+        visibility(run.scene, run.region.members, setup.train),
+        evaluator,
     )

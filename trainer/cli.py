@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from progdf.cli.options import parsed
-from trainer.regions.options import RegionOptions, ViewsOptions, joined
+from trainer.regions.options import RegionOptions, ViewsOptions, join_negative_values
 
 from .options import FitOptions, TrainOptions
 from .presets import under_preset
@@ -39,7 +39,7 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
 
 def region(argv: Sequence[str]) -> int:
     """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
-    options = parsed(RegionOptions, joined(argv), "progdf region")
+    options = parsed(RegionOptions, join_negative_values(argv), "progdf region")
     from trainer.regions.command import show
 
     print(show(options))

@@ -1,4 +1,4 @@
-"""What a training run can be told. Each option changes something one can see or measure."""
+"""The options of `progdf train` and `progdf fit`, as typed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from progdf.metrics.lpips import Net
 from progdf.scene.up_axis import UpChoice
 
 Slider = Literal["auto", "even", "stages", "time"]
-"""How a slider is laid over what was recorded; auto becomes one of the others (`settings.slider_meant`)."""
+"""What slider values mean; auto becomes one of the others (`settings.resolve_slider`)."""
 
 
 Rates = Literal["kind", "3dgs"]
@@ -29,7 +29,7 @@ Progressive = Literal["warmup", "decay", "growth", "off"]
 Preset = Literal["default", "paper"]
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
-DETECTOR, OUTLINER = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
+DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
 
 NETWORK_OPTIONS: Mapping[str, Any] = {
@@ -81,16 +81,16 @@ class TrainOptions:
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     photographs:EDITED,ORIGINALS (of what the cameras took), style:N (a painting, N from 0 to 25),
     instruct:"turn him into Batman"."""
-    lift: Literal["share", "count", "paper"] = "share"
+    lift_rule: Literal["share", "count", "paper"] = "share"
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
     lift_threshold: float | None = None
     """masks, text: least score of a member; by default .7 for share, .8 for count and paper."""
     detector: str = DETECTOR
     """text: id or folder of the GroundingDINO that finds things, downloaded before."""
-    outliner: str = OUTLINER
+    sam_model: str = SAM_MODEL
     """text: id or folder of the SAM that outlines them, downloaded before."""
-    detect_least: float = 0.3
+    box_threshold: float = 0.3
     """text: confidence that a find needs, 0 to 1; lower finds more, also what is not meant."""
     model: str = ""
     """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
@@ -175,7 +175,7 @@ class TrainOptions:
     field: FieldKind = "auto"
     """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
     keeps every recording."""
-    fit: Literal["after", "alongside"] = NETWORK_OPTIONS["fit"]
+    fit: Literal["after", "joint"] = NETWORK_OPTIONS["fit"]
     """neural: trained on the finished recording, or step by step while it is made (paper); what it sees is
     then --inputs position."""
     size: Size = NETWORK_OPTIONS["size"]
@@ -250,7 +250,7 @@ class FitOptions:
     """CPU threads; 0 takes all cores."""
 
 
-def settled(options: TrainOptions) -> TrainOptions:
+def resolve_options(options: TrainOptions) -> TrainOptions:
     """The options with `quick` and the name worked in, and checked.
 
     Raises:
@@ -278,22 +278,23 @@ def settled(options: TrainOptions) -> TrainOptions:
         ("--edit-steps", options.edit_steps, 1, 1000),
         ("--edit-size", options.edit_size, 32, 4096),
         ("--lift-threshold", options.lift_threshold, 0, 1),
-        ("--detect-least", options.detect_least, 0, 1),
+        ("--box-threshold", options.box_threshold, 0, 1),
         ("--reedit-every", options.reedit_every, 0, 100_000),
     )
     stages = options.stages or MOST_STAGES
     if not 4 * stages <= options.steps <= MOST_STEPS:
-        right = f"{4 * stages} to {MOST_STEPS} would be right for {stages} stages"
-        raise ProgdfError(f"--steps is {options.steps}; {right}")
+        raise ProgdfError(
+            f"--steps must be between {4 * stages} and {MOST_STEPS} for {stages} stages, got {options.steps}"
+        )
     for what, weight in (
         ("--perceptual-weight", options.perceptual_weight),
         ("--progressive-weight", options.progressive_weight),
         ("--sharpness-weight", options.sharpness_weight),
     ):
         if weight is not None and not 0 <= weight < math.inf:
-            raise ProgdfError(f"{what} is {weight}; 0 or more would be right")
+            raise ProgdfError(f"{what} must be 0 or more, got {weight}")
     if not 0 <= options.save_every < math.inf:
-        raise ProgdfError(f"--save-every is {options.save_every}; 0 or more seconds would be right")
+        raise ProgdfError(f"--save-every must be 0 or more seconds, got {options.save_every}")
     _check_editor_options(options)
     check_network_options(options)
     return replace(options, name=name)
@@ -306,7 +307,9 @@ def checked_name(name: str) -> str:
         ProgdfError: it cannot.
     """
     if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
-        raise ProgdfError(f"'{name}' cannot be a layer's name; choose one with --name, as --name shirt")
+        raise ProgdfError(
+            f"'{name}' is not a valid layer name; choose one with --name, for example --name shirt"
+        )
     if len(f"{name}.gdf".encode()) > LONGEST_NAME:
         raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
     return name
@@ -320,11 +323,11 @@ def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
     """
     for what, value, low, high in ranges:
         if value is not None and not low <= value <= high:
-            raise ProgdfError(f"{what} is {value}; {low} to {high} would be right")
+            raise ProgdfError(f"{what} must be between {low} and {high}, got {value}")
 
 
 def _check_editor_options(options: TrainOptions) -> None:
-    """No option is passed over in silence: one that the editor does not know is told."""
+    """No option is passed over in silence: one that the editor does not know is refused."""
     kind = options.editor.partition(":")[0]
     of_instruct = ("model", "guidance", "image_guidance", "edit_steps", "edit_seed")
     of_painters = ("edit_size", "reedit_every")
@@ -333,7 +336,7 @@ def _check_editor_options(options: TrainOptions) -> None:
             said = getattr(options, name) != getattr(TrainOptions, name)
             if said and kind not in kinds:
                 option = "--" + name.replace("_", "-")
-                raise ProgdfError(f"{option} means nothing to {kind}; it is for {' and '.join(kinds)}")
+                raise ProgdfError(f"{option} does not apply to {kind}; it is for {' and '.join(kinds)}")
 
 
 def check_network_options(options: TrainOptions | FitOptions) -> None:
@@ -344,22 +347,22 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
     """
     if not 0 < options.target_psnr <= NO_DIFFERENCE:
         raise ProgdfError(
-            f"--target-psnr is {options.target_psnr:g}; above 0 and up to {NO_DIFFERENCE:g} dB, which stands "
-            "for no difference, would be right"
+            f"--target-psnr must be above 0 and at most {NO_DIFFERENCE:g} dB, which stands for no "
+            f"difference, got {options.target_psnr:g}"
         )
     for name, default in NETWORK_OPTIONS.items():
         option = "--" + name.replace("_", "-")
         if options.field != "neural" and getattr(options, name, default) != default:
-            raise ProgdfError(f"{option} means nothing to --field {options.field}; add --field neural")
+            raise ProgdfError(f"{option} does not apply to --field {options.field}; add --field neural")
     if options.bytes_budget is not None:
         if options.field in ("neural", "lossless"):
-            raise ProgdfError(f"--bytes-budget means nothing to --field {options.field}; leave one out")
+            raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
         if not 1 <= options.bytes_budget < math.inf:
-            raise ProgdfError(f"--bytes-budget is {options.bytes_budget:g}; 1 or more bytes would be right")
+            raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")
     if not 0 <= options.code <= 64:
-        raise ProgdfError(f"--code is {options.code}; 0 to 64 would be right")
+        raise ProgdfError(f"--code must be between 0 and 64, got {options.code}")
     if not 0 <= options.picture_loss < math.inf:
-        raise ProgdfError(f"--picture-loss is {options.picture_loss}; 0 or more would be right")
+        raise ProgdfError(f"--picture-loss must be 0 or more, got {options.picture_loss}")
 
 
 def plain_options(options: TrainOptions) -> dict[str, Any]:

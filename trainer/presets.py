@@ -30,7 +30,7 @@ PRESETS: Mapping[Preset, Mapping[str, Any]] = {
         "recording": "raw",
         "slider": "time",
         "field": "neural",
-        "fit": "alongside",
+        "fit": "joint",
         "size": "paper",
         "inputs": "position",
         "bins": "hard",

@@ -26,26 +26,26 @@ from progdf.io.images import write_image
 from progdf.io.json_values import decode_json
 from progdf.metrics.slider import slider_statistics
 from trainer.editors.base import EditKind
-from trainer.fit.evenness import evened
 from trainer.fit.fit import fit_field, without_idle_attributes
+from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.settings import objective_line, slider_meant
+from trainer.optimize.settings import objective_line, resolve_slider
 from trainer.options import TrainOptions
-from trainer.pipeline.reopen import reopened
+from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.run import use_threads
-from trainer.pipeline.training import retimed, trained
+from trainer.pipeline.training import optimize_members, retime_trajectory
 from trainer.report.measures import against_editor
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.store.images import read_picture
-from trainer.store.interrupts import stopping
+from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
-from trainer.store.run_folder import RunFolder, locked, write_json
+from trainer.store.run_folder import RunFolder, lock_folder, write_json
 from trainer.store.state import StateFolder
 
 from .options import AblateOptions
-from .setup import Ground, digest_of, make_ground, plain, run_options
-from .table import Outcome, sheet_of, table_of, told
-from .variants import Variant, chosen, sensible
+from .setup import AblationSetup, digest_of, make_ablation_setup, plain, run_options
+from .table import Outcome, outcome_line, sheet_of, table_of
+from .variants import Variant, choose_variants, differing_variants
 
 _WIDTH = 176  # of a picture in the sheet, pixels
 
@@ -77,74 +77,74 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
         KeyboardInterrupt: interrupted; the message says what is kept.
     """
     use_threads(options.threads)
-    run = reopened(options.run, options.scene)
+    run = reopen_run(options.run, options.scene)
     own = run_options(run)
     if run.about.get("kind") is None:
         raise ProgdfError(f"{options.run} was written by an earlier version; train it again first")
     kind: EditKind = run.about["kind"]
-    variants = sensible(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
-    wanted = chosen(variants, options.only)
+    variants = differing_variants(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
+    wanted = choose_variants(variants, options.only)
     root = run.folder.root / "ablation"
     make_folder(root)
-    with stopping(), locked(RunFolder(root)):
+    with interrupt_on_signals(), lock_folder(RunFolder(root)):
         log = RunLog(root / "log.txt", quiet)
         try:
-            ground = make_ground(run, own, kind, options.quick)
+            shared = make_ablation_setup(run, own, kind, options.quick)
             for i, variant in enumerate(wanted):
-                if _kept(root, variant, ground) is not None:
+                if _kept(root, variant, shared) is not None:
                     log.say(f"{variant.name}: done before")
                     continue
                 log.say(f"{variant.name} ({i + 1} of {len(wanted)}): {variant.what}")
                 try:
-                    _do(root, variant, ground, quiet)
+                    _do(root, variant, shared, quiet)
                 except KeyboardInterrupt:
                     raise KeyboardInterrupt(
                         f"{i} of {len(wanted)} variants are done and kept in {root}; "
                         "give the same command to go on"
                     ) from None
-                done = _publish(root, variants, ground)
+                done = _publish(root, variants, shared)
                 found = next(outcome for outcome in done.outcomes if outcome.name == variant.name)
-                log.say(f"{variant.name}: {found.failed or told(found)}")
+                log.say(f"{variant.name}: {found.failed or outcome_line(found)}")
             for variant in variants:
                 StateFolder(root / variant.name / "state").end()
-            return _publish(root, variants, ground)
+            return _publish(root, variants, shared)
         finally:
             log.close()
 
 
-def _do(root: Path, variant: Variant, ground: Ground, quiet: bool) -> None:
+def _do(root: Path, variant: Variant, shared: AblationSetup, quiet: bool) -> None:
     """Train and judge one variant, and keep what became of it."""
     folder = root / variant.name
     folder.mkdir(exist_ok=True)
-    options = replace(ground.options, **variant.changes)
+    options = replace(shared.options, **variant.changes)
     measure, _ = perceptual_loss()
     perceptual = perceptual_loss(options.perceptual)[0]
-    objective = objective_line(options, ground.kind, perceptual.name)
+    objective = objective_line(options, shared.kind, perceptual.name)
     outcome = Outcome(variant.name, variant.what, objective=objective)
     log = RunLog(folder / "log.txt", quiet)
     try:
-        trajectory = _recorded(root, variant, ground, options, perceptual, log)
+        trajectory = _recorded(root, variant, shared, options, perceptual, log)
         seconds = log.seconds["optimise"]
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
-        _keep(folder, replace(outcome, failed=str(error.__cause__)), (), variant, ground)
+        _keep(folder, replace(outcome, failed=str(error.__cause__)), (), variant, shared)
         return
     finally:
         log.close()
-    field, asked = _fitted(variant, trajectory, ground, options)
-    outcome = _judged(replace(outcome, seconds=seconds), field, ground, asked, measure)
-    region, scene = ground.run.region, ground.run.scene
+    field, asked = _fitted(variant, trajectory, shared, options)
+    outcome = _judged(replace(outcome, seconds=seconds), field, shared, asked, measure)
+    region, scene = shared.run.region, shared.run.scene
     told = {"name": variant.name, **plain(options)}
     gdf = Gdf(variant.name, region, field, fingerprint(scene), options.editor, told)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
-    _keep(folder, outcome, strip(ground.judge, field, ground.columns, _WIDTH), variant, ground)
+    _keep(folder, outcome, strip(shared.evaluator, field, shared.columns, _WIDTH), variant, shared)
 
 
 def _recorded(
     root: Path,
     variant: Variant,
-    ground: Ground,
+    shared: AblationSetup,
     options: TrainOptions,
     perceptual: Perceptual,
     log: RunLog,
@@ -153,39 +153,43 @@ def _recorded(
     home = root / variant.trains_as
     home.mkdir(exist_ok=True)
     state = StateFolder(home / "state")
-    begun = {"digest": digest_of(ground, variant, optimisation=True)}
+    begun = {"digest": digest_of(shared, variant, optimisation=True)}
     if state.identity() != begun:
         state.begin(begun)
-    edited = ground.edited if options.stages != 1 else {1.0: ground.edited[1.0]}
+    edited = shared.edited if options.stages != 1 else {1.0: shared.edited[1.0]}
     with log.stage("optimise"):
-        trajectory, _ = trained(options, ground.stand, edited, ground.kind, perceptual, state, log)
-    trajectory, _ = without_idle_attributes(trajectory, ground.judge)
-    return retimed(trajectory, ground.stand, options, log)
+        trajectory, _ = optimize_members(options, shared.setup, edited, shared.kind, perceptual, state, log)
+    trajectory, _ = without_idle_attributes(trajectory, shared.evaluator)
+    return retime_trajectory(trajectory, shared.setup, options, log)
 
 
 def _fitted(
-    variant: Variant, trajectory: Trajectory, ground: Ground, options: TrainOptions
+    variant: Variant, trajectory: Trajectory, shared: AblationSetup, options: TrainOptions
 ) -> tuple[BakedField, Mapping[float, float]]:
     """The variant's field, and where on its slider it was shown which of the editor's strengths."""
     if variant.linear:
         offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
         return fit_keyframes(trajectory.s, offsets, 2), {}
-    target = ground.options.target_psnr
-    fitted = fit_field(trajectory, ground.seen, ground.judge, ground.weights, "auto", target)
+    target = shared.options.target_psnr
+    fitted = fit_field(trajectory, shared.seen, shared.evaluator, shared.weights, "auto", target)
     field, dial = fitted.chosen.field, same()
-    if slider_meant(options.slider, options.editor, trajectory.strengths) == "even":
-        field, dial = evened(field, ground.stand)
+    if resolve_slider(options.slider, options.editor, trajectory.strengths) == "even":
+        field, dial = equalize_slider(field, shared.setup)
     return field, {strength: dial.at(s) for s, strength in trajectory.asked}
 
 
 def _judged(
-    outcome: Outcome, field: BakedField, ground: Ground, asked: Mapping[float, float], measure: Perceptual
+    outcome: Outcome,
+    field: BakedField,
+    shared: AblationSetup,
+    asked: Mapping[float, float],
+    measure: Perceptual,
 ) -> Outcome:
     """With the figures that the field deserves; where it was shown no picture, on the run's own slider."""
-    judge = ground.judge
-    shown = [(s, asked.get(e, at), e) for s, (at, e) in zip(SHOWN[1:], ground.columns[1:], strict=True) if e]
-    course = against_editor(judge, {"slider": field}, [(at, e) for _, at, e in shown], measure)["slider"]
-    slider = slider_statistics(lambda s: judge.pictures(field.offsets(s)), masks=judge.pixels)
+    evaluator = shared.evaluator
+    shown = [(s, asked.get(e, at), e) for s, (at, e) in zip(SHOWN[1:], shared.columns[1:], strict=True) if e]
+    course = against_editor(evaluator, {"slider": field}, [(at, e) for _, at, e in shown], measure)["slider"]
+    slider = slider_statistics(lambda s: evaluator.pictures(field.offsets(s)), masks=evaluator.pixels)
     return replace(
         outcome,
         psnr=round(course.psnr[-1], 2),
@@ -201,35 +205,35 @@ def _judged(
 
 
 def _keep(
-    folder: Path, outcome: Outcome, pictures: Sequence[Tensor], variant: Variant, ground: Ground
+    folder: Path, outcome: Outcome, pictures: Sequence[Tensor], variant: Variant, shared: AblationSetup
 ) -> None:
     """Write what became of a variant; the figures last, as they tell that it is done."""
     if pictures:
         write_image(folder / "strip.png", torch.cat(list(pictures), dim=1))
-    write_json(folder / "outcome.json", {"digest": digest_of(ground, variant), **asdict(outcome)})
+    write_json(folder / "outcome.json", {"digest": digest_of(shared, variant), **asdict(outcome)})
 
 
-def _kept(root: Path, variant: Variant, ground: Ground) -> Outcome | None:
+def _kept(root: Path, variant: Variant, shared: AblationSetup) -> Outcome | None:
     """What became of a variant in an earlier call; None where it was not done, or on other ground."""
     try:
         found = decode_json((root / variant.name / "outcome.json").read_bytes())
-        if found.pop("digest") != digest_of(ground, variant):
+        if found.pop("digest") != digest_of(shared, variant):
             return None
         return Outcome(**found)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
-def _publish(root: Path, variants: Sequence[Variant], ground: Ground) -> Ablation:
+def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> Ablation:
     """Table and picture of all that is done."""
-    kept = [_kept(root, variant, ground) for variant in variants]
+    kept = [_kept(root, variant, shared) for variant in variants]
     outcomes = [outcome for outcome in kept if outcome is not None]
-    options, stand, judge = ground.options, ground.stand, ground.judge
+    options, setup, evaluator = shared.options, shared.setup, shared.evaluator
     title = f"{options.name}: {options.editor}, part by part"
-    size = stand.held_out[0].camera
+    size = setup.held_out[0].camera
     note = (
-        f"{options.steps} steps, {len(stand.train)} views to train on and {len(stand.held_out)} to measure "
-        f"with, {size.width}x{size.height} pixels, {len(ground.run.region)} members."
+        f"{options.steps} steps, {len(setup.train)} views to train on and {len(setup.held_out)} to measure "
+        f"with, {size.width}x{size.height} pixels, {len(shared.run.region)} members."
     )
     measure = perceptual_loss()[0].name
     distance = "LPIPS" if measure.startswith("lpips") else measure
@@ -238,9 +242,9 @@ def _publish(root: Path, variants: Sequence[Variant], ground: Ground) -> Ablatio
     for outcome in outcomes:
         if not outcome.failed:
             strips[outcome.name] = read_picture(root / outcome.name / "strip.png").chunk(len(SHOWN), dim=1)
-    editor = [(image * 255).round() / 255 for image in editor_strip(judge, ground.columns, _WIDTH)]
-    caption = f"held-out view {judge.names[best_view(judge)]}; PSNR to the editor's own pictures"
-    write_image(root / "ablation.png", sheet_of(editor, outcomes, strips, ground.columns, title, caption))
+    editor = [(image * 255).round() / 255 for image in editor_strip(evaluator, shared.columns, _WIDTH)]
+    caption = f"held-out view {evaluator.names[best_view(evaluator)]}; PSNR to the editor's own pictures"
+    write_image(root / "ablation.png", sheet_of(editor, outcomes, strips, shared.columns, title, caption))
     with written_whole(root / "ablation.md") as beside:
         beside.write_text(table.markdown() + "\n", encoding="utf-8")
     rows: list[Mapping[str, Any]] = [asdict(outcome) for outcome in outcomes]

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS
 from trainer.editors.base import EditKind
-from trainer.fit.evaluate import Judge, make_judge
+from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
 from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, TrainOptions
-from trainer.pipeline.reopen import FinishedRun, its_views, options_of
+from trainer.pipeline.reopen import FinishedRun, options_of, render_run_views
 from trainer.report.report import Columns, columns_of
-from trainer.setup.training_setup import Pictures, Stand, widened
+from trainer.setup.training_setup import Pictures, TrainingSetup, widen_views
 from trainer.store.run_folder import read_views
 from trainer.views.view import View
 
@@ -30,16 +30,16 @@ _COMMAND = ("out", "scene", "threads", "resume", "save_every", "quick", "preset"
 
 
 @dataclass(frozen=True)
-class Ground:
+class AblationSetup:
     """What all variants share.
 
     Args:
         run: the finished run
         options: its own, as a draft if asked for
         kind: what the edit moves
-        stand: scene, region, views whose boxes hold the edit
+        setup: scene, region, views whose boxes hold the edit
         edited: strength → the edited training views, whole
-        judge: held-out views with the editor's pictures of the shown columns
+        evaluator: held-out views with the editor's pictures of the shown columns
         columns: where on the run's slider the variants are shown, and what the editor was asked there
         seen: a few training views, on which the field's ranks are chosen
         weights: how visible each member is. [M]
@@ -49,11 +49,11 @@ class Ground:
     run: FinishedRun
     options: TrainOptions
     kind: EditKind
-    stand: Stand
+    setup: TrainingSetup
     edited: Pictures
-    judge: Judge
+    evaluator: Evaluator
     columns: Columns
-    seen: Judge
+    seen: Evaluator
     weights: Tensor
     digest: str
 
@@ -66,7 +66,9 @@ def run_options(run: FinishedRun) -> TrainOptions:
     return options
 
 
-def make_ground(run: FinishedRun, options: TrainOptions, kind: EditKind, quick: bool) -> Ground:
+def make_ablation_setup(
+    run: FinishedRun, options: TrainOptions, kind: EditKind, quick: bool
+) -> AblationSetup:
     """The run's views and edited views; for a draft every so manieth of them.
 
     Args:
@@ -78,50 +80,50 @@ def make_ground(run: FinishedRun, options: TrainOptions, kind: EditKind, quick: 
     Raises:
         ProgdfError: an edited view is gone.
     """
-    stand, strengths = its_views(run), run.trajectory.strengths
+    setup, strengths = render_run_views(run), run.trajectory.strengths
     options = replace(options, reedit_every=0)
     if quick:
         strengths = tuple(_thinned(strengths, QUICK_STAGES))
-        train = _thinned(stand.train, max(2, QUICK_VIEWS - len(stand.held_out)))
-        stand = replace(stand, train=train)
+        train = _thinned(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))
+        setup = replace(setup, train=train)
         options = replace(options, steps=min(options.steps, QUICK_STEPS), stages=len(strengths))
-    edited = {s: _edited(run, stand.train, s) for s in strengths}
-    stand = widened(stand, edited)
+    edited = {s: _edited(run, setup.train, s) for s in strengths}
+    setup = widen_views(setup, edited)
     columns = columns_of(run.trajectory.asked)
     shown = [strength for _, strength in columns[1:] if strength is not None]
-    few = _thinned(stand.train, 4)
+    few = _thinned(setup.train, 4)
     channels = BASE_CHANNELS + 3 * run.scene.shN.shape[1]
 
-    def judge(views: Sequence[View], pictures: Pictures) -> Judge:
-        return make_judge(run.scene, run.region, views, pictures, stand.background, channels)
+    def evaluator(views: Sequence[View], pictures: Pictures) -> Evaluator:
+        return make_evaluator(run.scene, run.region, views, pictures, setup.background, channels)
 
-    drawn = {s: _edited(run, stand.held_out, s) for s in shown}
+    drawn = {s: _edited(run, setup.held_out, s) for s in shown}
     digest = hashlib.sha256(run.region.members.numpy().tobytes())
     for pictures in (*edited.values(), *drawn.values()):
         for picture in pictures:
             digest.update(picture.numpy().tobytes())
-    for view in (*stand.train, *stand.held_out):
+    for view in (*setup.train, *setup.held_out):
         digest.update(view.image.numpy().tobytes())
-    return Ground(
+    return AblationSetup(
         run,
         options,
         kind,
-        stand,
+        setup,
         edited,
-        judge(stand.held_out, drawn),
+        evaluator(setup.held_out, drawn),
         columns,
-        judge(few, {1.0: _edited(run, few, 1.0)}),
-        visibility(run.scene, run.region.members, stand.train),
+        evaluator(few, {1.0: _edited(run, few, 1.0)}),
+        visibility(run.scene, run.region.members, setup.train),
         digest.hexdigest(),
     )
 
 
-def digest_of(ground: Ground, variant: Variant, optimisation: bool = False) -> str:
+def digest_of(shared: AblationSetup, variant: Variant, optimisation: bool = False) -> str:
     """Of all that decides a variant's figures, or of its optimisation alone."""
     without = (*_COMMAND, *_LAID_OVER) if optimisation else _COMMAND
-    options = plain(replace(ground.options, **variant.changes))
+    options = plain(replace(shared.options, **variant.changes))
     decides = {name: value for name, value in options.items() if name not in without}
-    told = json.dumps([ground.digest, decides, variant.linear and not optimisation], sort_keys=True)
+    told = json.dumps([shared.digest, decides, variant.linear and not optimisation], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
 
 

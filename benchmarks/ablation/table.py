@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.table import Table, machine
 from progdf.io.images import contact_sheet
-from trainer.report.report import SHOWN, Columns, headed
+from trainer.report.report import SHOWN, Columns, column_heading
 
 BETWEEN = SHOWN[1:-1]
 
@@ -111,8 +111,8 @@ def sheet_of(
     shown = [outcome for outcome in outcomes if outcome.name in strips]
     return contact_sheet(
         [editor, *(strips[outcome.name] for outcome in shown)],
-        ["the editor", *(f"{outcome.name}\n{told(outcome)}" for outcome in shown)],
-        [headed(*column) for column in columns],
+        ["the editor", *(f"{outcome.name}\n{outcome_line(outcome)}" for outcome in shown)],
+        [column_heading(*column) for column in columns],
         title,
         caption,
     )
@@ -136,7 +136,7 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
     )
 
 
-def told(outcome: Outcome) -> str:
+def outcome_line(outcome: Outcome) -> str:
     """In short: the two figures that say most: how good the end is, how good the way."""
     between = list((outcome.between or {}).values())
     way = f", between {sum(between) / len(between):.1f}" if between else ""

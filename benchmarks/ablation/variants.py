@@ -8,7 +8,7 @@ from typing import Any
 
 from progdf.errors import ProgdfError
 from trainer.editors.base import EditKind
-from trainer.optimize.settings import PERCEPTUAL_WEIGHT, SHARPNESS, slider_meant, solves_colors
+from trainer.optimize.settings import PERCEPTUAL_WEIGHT, SHARPNESS, resolve_slider, solves_colors
 from trainer.options import TrainOptions
 from trainer.presets import PRESETS
 
@@ -60,7 +60,7 @@ VARIANTS = (
 )
 
 
-def sensible(options: TrainOptions, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
+def differing_variants(options: TrainOptions, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
     """The variants that differ from a run.
 
     Args:
@@ -83,7 +83,7 @@ def sensible(options: TrainOptions, kind: EditKind, stages: int, sh_degree: int)
     ]
 
 
-def chosen(variants: Sequence[Variant], only: str) -> list[Variant]:
+def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
     """Those that `only` names, in their own order, or all.
 
     Raises:
@@ -104,5 +104,5 @@ def _resolved(options: TrainOptions, kind: EditKind, stages: int) -> TrainOption
     weight = PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight
     weight = 0.0 if solves_colors(options, kind) else weight
     sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness
-    slider = slider_meant(options.slider, options.editor, (1.0,) * stages)
+    slider = resolve_slider(options.slider, options.editor, (1.0,) * stages)
     return replace(options, perceptual_weight=weight, sharpness=sharpness, slider=slider)

@@ -17,15 +17,15 @@ from benchmarks.ablation.ablate import ablate
 from benchmarks.ablation.options import AblateOptions
 from benchmarks.ablation.setup import run_options
 from benchmarks.ablation.table import Outcome, table_of
-from benchmarks.ablation.variants import chosen, sensible
+from benchmarks.ablation.variants import choose_variants, differing_variants
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, write_bear
-from trainer.options import TrainOptions, settled
-from trainer.pipeline.reopen import reopened
+from trainer.options import TrainOptions, resolve_options
+from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.run import train
 from trainer.store.run_folder import RunFolder
 
@@ -37,7 +37,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
     """Of a run of a second or two on a small bear, which is finished."""
     made = tmp_path_factory.mktemp("bear")
     write_bear(made)
-    options = settled(quick_options(made, steps=100, views=5, image_size=64))
+    options = resolve_options(quick_options(made, steps=100, views=5, image_size=64))
     train(options, quiet=True)
     return options
 
@@ -54,15 +54,15 @@ def _nothing_trains(*_: object, **__: object) -> tuple[Trajectory, object]:
 
 
 def _names(options: TrainOptions, *about: object) -> set[str]:
-    return {variant.name for variant in sensible(options, *about)}  # type: ignore[arg-type]
+    return {variant.name for variant in differing_variants(options, *about)}  # type: ignore[arg-type]
 
 
 def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
-    colour = _names(options, "colour", 4, 1)
-    assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "paper"} <= colour
-    assert "no-lpips" not in colour, "colors are solved for, without LPIPS"
+    color = _names(options, "colour", 4, 1)
+    assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "paper"} <= color
+    assert "no-lpips" not in color, "colors are solved for, without LPIPS"
     assert "no-lpips" in _names(replace(options, perceptual_weight=0.1), "colour", 4, 1)
-    assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & colour
+    assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & color
     style = _names(options, "style", 4, 1)
     assert "sharpness-off" in style
     assert "sharpness-hinge" not in style
@@ -75,14 +75,14 @@ def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions)
 
 
 def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
-    variants = sensible(options, "colour", 4, 1)
-    assert [v.name for v in chosen(variants, "no-sh, base")] == ["base", "no-sh"]
+    variants = differing_variants(options, "colour", 4, 1)
+    assert [v.name for v in choose_variants(variants, "no-sh, base")] == ["base", "no-sh"]
     with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
-        chosen(variants, "base,warmup")
+        choose_variants(variants, "base,warmup")
     with pytest.raises(ProgdfError, match="'sharpness-off' makes no difference to this run; "):
-        chosen(variants, "sharpness-off")
+        choose_variants(variants, "sharpness-off")
     with pytest.raises(ProgdfError, match="--only ' ,' names no variant; choose of base,"):
-        chosen(variants, " ,")
+        choose_variants(variants, " ,")
 
 
 def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
@@ -96,7 +96,7 @@ def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
 
 
 def test_the_options_of_a_run_are_read_back_as_they_were(options: TrainOptions) -> None:
-    assert run_options(reopened(options.out)) == replace(options, group_steps=0), "as the run resolved it"
+    assert run_options(reopen_run(options.out)) == replace(options, group_steps=0), "as the run resolved it"
 
 
 def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to_open(
@@ -140,7 +140,7 @@ def test_what_is_done_is_not_done_again_until_the_edited_views_change(
     monkeypatch.setattr(benchmarks.ablation.ablate, "trained", _nothing_trains)
     again = ablate(AblateOptions(run, only="base,one-target", threads=1), quiet=True)
     assert [outcome.name for outcome in again.outcomes] == ONLY.split(",")
-    name = reopened(run).about["held_out"][0]
+    name = reopen_run(run).about["held_out"][0]
     path = RunFolder(run).view("edited", name)
     kept = path.read_bytes()
     try:

@@ -26,8 +26,8 @@ from progdf.io.images import write_image
 from progdf.rasterize import render
 from progdf.scene.region_spec import parse_region
 from tests.helpers.paths import SHARED_DATA
-from trainer.options import TrainOptions, settled
-from trainer.setup.training_setup import make_stand
+from trainer.options import TrainOptions, resolve_options
+from trainer.setup.training_setup import make_training_setup
 
 PLAYBOT = SHARED_DATA / "playbot_31k.ply"
 _EARS, _HANDS = "big ears", (2, 3)
@@ -85,9 +85,9 @@ def write_analytic_views(
         options: as `train` will be given them; of these, what decides about the views counts
         strengths: ascending, the last 1
     """
-    options = settled(options)
+    options = resolve_options(options)
     region = parse_region(options.region, truth.scene, options.name)
-    stand = make_stand(options, truth.scene, region)
+    stand = make_training_setup(options, truth.scene, region)
     for strength in strengths:
         where = folder if strength == 1.0 else folder / f"{strength:g}"
         edited = truth.edit.apply(truth.scene, region.members, strength)

@@ -32,7 +32,7 @@ from tests.helpers.trained import quick_options, write_bear
 from trainer.options import FitOptions, TrainOptions
 from trainer.pipeline.run import refit, train
 from trainer.regions.from_pictures import RegionSettings, region_kinds
-from trainer.store.state import Autosave
+from trainer.store.state import PeriodicSave
 
 Reader = tuple[str, Callable[[Path], Any], list[Change]]
 
@@ -206,9 +206,9 @@ def _run(name: str, folder: Path) -> Reader:
 
 def _train(options: TrainOptions, stop_at: int | None) -> None:
     """Train, or begin to: Ctrl-C comes after so many steps."""
-    calls, done = 0, Autosave.step_done
+    calls, done = 0, PeriodicSave.step_done
 
-    def step_done(self: Autosave) -> None:
+    def step_done(self: PeriodicSave) -> None:
         nonlocal calls
         calls += 1
         if calls == stop_at:
@@ -216,5 +216,5 @@ def _train(options: TrainOptions, stop_at: int | None) -> None:
         done(self)
 
     with pytest.MonkeyPatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
-        patch.setattr(Autosave, "step_done", step_done)
+        patch.setattr(PeriodicSave, "step_done", step_done)
         train(options, quiet=True)

@@ -22,10 +22,10 @@ from progdf.field.trajectory import load_trajectory
 from tests.helpers.paths import ROOT
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.trained import write_bear
-from trainer.optimize.retime import before_fit
+from trainer.optimize.retime import undo_retiming
 from trainer.pipeline.run import train
 from trainer.store.run_folder import RunFolder
-from trainer.store.state import Autosave
+from trainer.store.state import PeriodicSave
 
 NEVER = 1e6  # seconds between saves
 
@@ -74,16 +74,16 @@ def stopped(interrupted: Path, elsewhere: None) -> None:
 
 def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], object]) -> None:
     """Let something happen when the optimiser has done so many steps in this process."""
-    calls, done = 0, Autosave.step_done
+    calls, done = 0, PeriodicSave.step_done
 
-    def step_done(self: Autosave) -> None:
+    def step_done(self: PeriodicSave) -> None:
         nonlocal calls
         calls += 1
         if calls == number:
             happens()
         done(self)
 
-    monkeypatch.setattr(Autosave, "step_done", step_done)
+    monkeypatch.setattr(PeriodicSave, "step_done", step_done)
 
 
 def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
@@ -101,7 +101,7 @@ def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
 def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and header of a trajectory, without the slider that a finished run laid over it."""
     trajectory, extra, about = load_trajectory(path)
-    made = before_fit(trajectory, extra)
+    made = undo_retiming(trajectory, extra)
     extra.pop("s_before_fit", None)
     return {**extra, "s": made.s, "offsets": made.offsets, "end": made.end, "steps": made.steps}, about
 

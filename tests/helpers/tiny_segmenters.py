@@ -55,7 +55,7 @@ def tiny_detector(folder: Path, seed: int = 0) -> Path:
     return folder
 
 
-def tiny_outliner(folder: Path, seed: int = 0) -> Path:
+def tiny_sam(folder: Path, seed: int = 0) -> Path:
     """A SamModel with its processor, in `folder`; pictures are 64 pixels to it."""
     from transformers import (
         SamConfig,

@@ -18,11 +18,11 @@ from progdf.region import Region, from_mask
 from trainer.editors import make_editor
 from trainer.optimize.losses import GradientL1
 from trainer.optimize.objective import LossWeights, Objective
-from trainer.optimize.pgs import PgsSettings, Stage, learning_rates
+from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
 from trainer.options import TrainOptions
 from trainer.views.choose import choose_views
 from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import View, crop, drawn, region_rig
+from trainer.views.view import View, crop, region_rig, render_colors
 
 WHITE = torch.ones(3)
 
@@ -47,7 +47,7 @@ def small(part: str = "scarf", size: int = 1500, count: int = 6, image_size: int
     return Small(demo.gaussians, region, choose_views(demo.gaussians, region, cameras, count, WHITE).views)
 
 
-Course = tuple[Tensor, list[CropScene], list[CropScene], list[Stage], Objective, PgsSettings]
+Course = tuple[Tensor, list[CropScene], list[CropScene], list[TargetStage], Objective, PgsSettings]
 
 
 def course(case: Small, steps: int = 40, **more: object) -> Course:
@@ -55,7 +55,7 @@ def course(case: Small, steps: int = 40, **more: object) -> Course:
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
-    stages = [Stage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in (0.5, 1.0)]
+    stages = [TargetStage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in (0.5, 1.0)]
     settings = replace(PgsSettings(learning_rates("colour", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
     return original, crops, crops[:2], stages, Objective(GradientL1(), LossWeights()), settings
 
@@ -63,7 +63,7 @@ def course(case: Small, steps: int = 40, **more: object) -> Course:
 def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:
     """Where the members [N] bool make up more than half of what a pixel shows. [H,W] bool"""
     white = member.float()[:, None].expand(-1, 3).contiguous()
-    return drawn(scene, white, camera, torch.zeros(3))[..., 0] > 0.5
+    return render_colors(scene, white, camera, torch.zeros(3))[..., 0] > 0.5
 
 
 def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:

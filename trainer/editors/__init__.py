@@ -10,7 +10,7 @@ from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.views.view import View
 
-from .base import EditorSettings, ImageEditor, Painter
+from .base import EditorSettings, ImageEditor, RepaintingEditor
 from .folder import folder, folder_of, photograph_folders, photographs
 from .instruct import check_instruct, instruct
 from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
@@ -73,7 +73,7 @@ def check_editor(spec: str) -> tuple[str, str]:
     """Split `KIND:WHAT`; ProgdfError if there is no such kind. Cheap: nothing is read or rendered."""
     kind, _, what = spec.partition(":")
     if kind not in EDITORS:
-        raise ProgdfError(f"there is no editor '{kind}'; use one of {', '.join(EXAMPLES)}")
+        raise ProgdfError(f"unknown editor '{kind}'; use one of {', '.join(EXAMPLES)}")
     return kind, what
 
 
@@ -106,7 +106,7 @@ __all__ = [
     "VIEW_BY_VIEW",
     "EditorSettings",
     "ImageEditor",
-    "Painter",
+    "RepaintingEditor",
     "check_editor",
     "check_new_editor",
     "make_editor",

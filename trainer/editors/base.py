@@ -1,4 +1,4 @@
-"""The one thing an image editor must do, and what a learned one can be told."""
+"""What an image editor must do, and the settings of learned ones."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class ImageEditor(Protocol):
 
 
 @runtime_checkable
-class Painter(Protocol):
+class RepaintingEditor(Protocol):
     """An editor that looks at a picture and paints another, and so can look at a render again."""
 
     def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:

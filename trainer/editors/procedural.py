@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.color import edits as colour
+from progdf.color import edits as color
 from progdf.color.path import ColorPath, bend_of, between, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.views.view import View, drawn, seen_colors
+from trainer.views.view import View, render_colors, seen_colors
 
 from .base import EditKind, EditorSettings
 
@@ -27,7 +27,7 @@ _STRIPES = 7  # across the longest side of the region
 
 
 @dataclass(frozen=True)
-class ColourEditor:
+class ColorEditor:
     """A function of colour and strength, applied to each pixel's share of the region."""
 
     change: Callable[[Tensor, float], Tensor]
@@ -69,7 +69,7 @@ class StripesEditor:
     def painted(self, rgb: Tensor, strength: float) -> Tensor:
         """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
         plainer = torch.lerp(rgb, self.typical.expand_as(rgb), (_COVER * self.pattern)[:, None])
-        under = colour.recolored(plainer, self.target, self.typical)
+        under = color.recolored(plainer, self.target, self.typical)
         bend = bend_of(self.typical, self.target, self.path)
         return between(rgb, under, strength * self.pattern, bend)
 
@@ -80,40 +80,40 @@ class StripesEditor:
         scene, members, camera = self.scene, self.members, view.camera
         painted = self.painted(seen_colors(scene[members], camera), strength)
         colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
-        premultiplied = drawn(scene, colors, camera, torch.zeros(3))
+        premultiplied = render_colors(scene, colors, camera, torch.zeros(3))
         return view.blended((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
 
 
 def recolor(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> ColourEditor:
+) -> ColorEditor:
     """`recolor:#rrggbb[,path=hue]`: another colour, the shading kept."""
     (target, path), own = paint_of(what), region_color(views)
-    return ColourEditor(lambda rgb, strength: colour.recolor(rgb, target, strength, own, path))
+    return ColorEditor(lambda rgb, strength: color.recolor(rgb, target, strength, own, path))
 
 
 def tint(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> ColourEditor:
+) -> ColorEditor:
     """`tint:#rrggbb[,path=hue]`: a wash of colour, lightness kept."""
     (target, path), own = paint_of(what), region_color(views)
-    return ColourEditor(lambda rgb, strength: colour.tint(rgb, target, strength, own, path))
+    return ColorEditor(lambda rgb, strength: color.tint(rgb, target, strength, own, path))
 
 
 def darken(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> ColourEditor:
+) -> ColorEditor:
     """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
     stops = stops_of(what, "darken")
-    return ColourEditor(lambda rgb, strength: colour.darken(rgb, strength, stops))
+    return ColorEditor(lambda rgb, strength: color.darken(rgb, strength, stops))
 
 
 def night(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
-) -> ColourEditor:
+) -> ColorEditor:
     """`night` or `night:AMOUNT`: as `darken`, with colours fading to the blue of moonlight."""
     stops = stops_of(what, "night")
-    return ColourEditor(lambda rgb, strength: colour.night(rgb, strength, stops))
+    return ColorEditor(lambda rgb, strength: color.night(rgb, strength, stops))
 
 
 def stripes(
@@ -123,7 +123,7 @@ def stripes(
     target, path = paint_of(what)
     points = scene.means[region.members]
     axis, period, phase = stripe_frame(points)
-    pattern = colour.stripe_pattern(points, axis, period, phase)
+    pattern = color.stripe_pattern(points, axis, period, phase)
     return StripesEditor(scene, region.members, pattern, target, region_color(views), path)
 
 
@@ -139,7 +139,7 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
 
 def region_color(views: Sequence[View]) -> Tensor:
     """The region's typical colour over all views, so that each view's edit is one function. [3]"""
-    return colour.typical_color(
+    return color.typical_color(
         torch.cat([view.inside.reshape(-1, 3) for view in views]),
         torch.cat([view.mask.reshape(-1) for view in views]),
     )
@@ -148,7 +148,7 @@ def region_color(views: Sequence[View]) -> Tensor:
 def paint_of(what: str) -> tuple[Tensor, ColorPath]:
     """The colour [3] and the way to it that `#rrggbb` or `#rrggbb,path=hue` says; else a ProgdfError."""
     text, comma, option = what.partition(",")
-    target = colour.parse_color(text)
+    target = color.parse_color(text)
     if not comma:
         return target, "bowed"
     key, _, name = option.partition("=")

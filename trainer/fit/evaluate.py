@@ -22,7 +22,7 @@ from trainer.views.view import View, crop
 
 
 @dataclass(frozen=True)
-class Judge:
+class Evaluator:
     """Held-out views, ready to be compared.
 
     Args:
@@ -80,13 +80,13 @@ class Judge:
             values = [float(measure(a, b, k)) for a, b, k in zip(found, expected, keys, strict=True)]
         return sum(values) / max(1, len(values))
 
-    def counted(self, offsets: Tensor) -> Tensor:
+    def counted_pixels(self, offsets: Tensor) -> Tensor:
         """The pixels that count, of all views, with these offsets. [M,C] -> [P,3]"""
         pictures = self.pictures(offsets)
         return torch.cat([picture[pixels] for picture, pixels in zip(pictures, self.pixels, strict=True)])
 
 
-def make_judge(
+def make_evaluator(
     scene: Gaussians,
     region: Region,
     views: Sequence[View],
@@ -94,7 +94,7 @@ def make_judge(
     background: Tensor,
     channels: int,
     still: bool = False,
-) -> Judge:
+) -> Evaluator:
     """Prepare held-out views.
 
     Args:
@@ -107,7 +107,7 @@ def make_judge(
         still: nothing but colours will move, see `crop_scene`
     """
     if edited:
-        views = [v.widened([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]
+        views = [v.widen([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]
     crops = [crop_scene(scene, region.members, v.camera, v.box, background, still) for v in views]
     pixels = []
     for i, view in enumerate(views):
@@ -117,4 +117,4 @@ def make_judge(
         pixels.append(crop(counts, view.box))
     boxes = {s: [crop(p, v.box) for p, v in zip(ps, views, strict=True)] for s, ps in edited.items()}
     original = pack(scene[region.members], with_shN=channels > 14)
-    return Judge(original, crops, pixels, boxes, [view.camera.name for view in views])
+    return Evaluator(original, crops, pixels, boxes, [view.camera.name for view in views])

@@ -20,7 +20,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
 from trainer.views.view import View
 
-from .evaluate import Judge
+from .evaluate import Evaluator
 
 BASELINES = (2, 4)
 _PAYS = 0.1  # dB that an attribute must be worth to be stored
@@ -47,8 +47,8 @@ class Fitted:
 
 def fit_field(
     trajectory: Trajectory,
-    seen: Judge,
-    judge: Judge,
+    seen: Evaluator,
+    evaluator: Evaluator,
     weights: Tensor,
     kind: Kind,
     target_psnr: float,
@@ -59,7 +59,7 @@ def fit_field(
     Args:
         trajectory: what was recorded
         seen: training views, on which ranks are chosen
-        judge: held-out views, which have the last word
+        evaluator: held-out views, which have the last word
         weights: how visible each member is. [M]
         kind: "auto" tries separable and keyframe fields, the others only their kind
         target_psnr: dB; where none reaches it, the best is kept and `met` is false
@@ -67,12 +67,12 @@ def fit_field(
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
-    errors = FieldJudge(trajectory.s, offsets, judge.counted)
+    errors = FieldJudge(trajectory.s, offsets, evaluator.counted_pixels)
     target = target_psnr if budget is None else math.inf
     choice = choose_field(
         trajectory.s,
         offsets,
-        seen.counted,
+        seen.counted_pixels,
         weights,
         kind,
         target,
@@ -93,13 +93,15 @@ def expected_looks(trajectory: Trajectory, kind: Kind) -> int:
     return ranks + SAMPLES * (1 + candidates + len(BASELINES))
 
 
-def judged_field(trajectory: Trajectory, judge: Judge, field: BakedField, target_psnr: float) -> Fitted:
+def evaluate_field(
+    trajectory: Trajectory, evaluator: Evaluator, field: BakedField, target_psnr: float
+) -> Fitted:
     """A field that is there already, a network's, beside the same baselines."""
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    errors = FieldJudge(trajectory.s, offsets, judge.counted)
-    judged = errors.candidate(field, field.kind)
+    errors = FieldJudge(trajectory.s, offsets, evaluator.counted_pixels)
+    measured = errors.candidate(field, field.kind)
     baselines = _baselines(trajectory, offsets, errors)
-    return Fitted(judged, judged.worst >= target_psnr, (judged,), baselines, "a network was asked for")
+    return Fitted(measured, measured.worst >= target_psnr, (measured,), baselines, "a network was asked for")
 
 
 def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldJudge) -> dict[str, Candidate]:
@@ -156,7 +158,9 @@ def visibility(
     return total / total.mean().clamp_min(1e-12) + 1e-3
 
 
-def without_idle_attributes(trajectory: Trajectory, judge: Judge) -> tuple[Trajectory, dict[str, float]]:
+def without_idle_attributes(
+    trajectory: Trajectory, evaluator: Evaluator
+) -> tuple[Trajectory, dict[str, float]]:
     """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views,
     all that are taken out together.
 
@@ -167,14 +171,14 @@ def without_idle_attributes(trajectory: Trajectory, judge: Judge) -> tuple[Traje
     offsets, end = trajectory.offsets, trajectory.end
     costs: dict[str, float] = {}
     slices = attribute_slices(end.shape[1])
-    target = judge.edited[1.0]
-    now = whole = judge.psnr(judge.pictures(end), target)
+    target = evaluator.edited[1.0]
+    now = whole = evaluator.psnr(evaluator.pictures(end), target)
     for name in ("shN", "quats", "log_scales", "means", "logit_opacities"):
         if name not in slices or not bool(end[:, slices[name]].any()):
             continue
         tried = end.clone()
         tried[:, slices[name]] = 0.0
-        then = judge.psnr(judge.pictures(tried), target)
+        then = evaluator.psnr(evaluator.pictures(tried), target)
         costs[name] = round(now - then, 3)
         if whole - then < _PAYS:
             now = then

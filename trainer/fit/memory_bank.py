@@ -3,7 +3,7 @@
 ProGDF trains its field alongside PGS: after each of its steps one of the field's, on a snapshot drawn from
 those recorded so far. The slider values are not known before the whole way is, so a snapshot goes by its
 stage's strength and its step until then; when the optimisation is done, the network is finished on the
-trajectory as it was re-timed. Its end is not known either: alongside, a network sees positions (and its
+trajectory as it was re-timed. Its end is not known either: until then a network sees positions (and its
 codes) alone. Separable and keyframe fields have closed forms: they are solved once the trajectory is whole.
 """
 
@@ -63,7 +63,7 @@ class MemoryBank:
         return torch.stack(self._offsets)
 
 
-class Alongside:
+class JointTraining:
     """A network in training beside PGS; a `state.Resumable`.
 
     Args:

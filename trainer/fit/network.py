@@ -21,22 +21,22 @@ from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
 from trainer.optimize.losses import Perceptual, l1
-from trainer.optimize.pgs import Stage
-from trainer.optimize.settings import slider_meant
+from trainer.optimize.pgs import TargetStage
+from trainer.optimize.settings import resolve_slider
 from trainer.options import NETWORK_OPTIONS, TrainOptions, plain_options
-from trainer.setup.training_setup import Stand, probes
+from trainer.setup.training_setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import Saved, StateFolder
 from trainer.views.crops import crop_scene, render_all
 
-from .evaluate import Judge
+from .evaluate import Evaluator
 from .fit import visibility
-from .memory_bank import Alongside
+from .memory_bank import JointTraining
 
 PART = "network"
-"""Of the saved state: a network that was trained alongside, once the trajectory is recorded."""
+"""Of the saved state: a network that was trained jointly, once the trajectory is recorded."""
 
-_FINISHING = 0.5  # of the steps that a network takes which was not trained alongside
+_FINISHING = 0.5  # of the steps that a network takes which was not trained jointly
 
 
 @dataclass(frozen=True)
@@ -65,32 +65,32 @@ class NetworkFit:
 def network_settings(options: Mapping[str, Any]) -> NeuralSettings:
     """What the options, JSON values of this or an older run, say of the network."""
     said = {name: options.get(name, default) for name, default in NETWORK_OPTIONS.items()}
-    inputs: Inputs = "position" if said["fit"] == "alongside" else said["inputs"]
+    inputs: Inputs = "position" if said["fit"] == "joint" else said["inputs"]
     steps = EFFORT[said["size"]][0] // 3 if options.get("quick") else 0
     seed = int(options.get("seed", 0))
     return NeuralSettings(said["size"], inputs, said["code"], said["bins"], steps, seed=seed)
 
 
-def begin_alongside(
-    options: TrainOptions, stand: Stand, rates: Tensor, stages: Sequence[Stage]
-) -> Alongside | None:
+def begin_joint_training(
+    options: TrainOptions, setup: TrainingSetup, rates: Tensor, stages: Sequence[TargetStage]
+) -> JointTraining | None:
     """The network that is trained beside PGS, where the options ask for one.
 
     Args:
         options: see `TrainOptions`
-        stand: scene, region, views
+        setup: scene, region, views
         rates: learning rates of PGS; what has none does not move. [C]
         stages: of PGS
     """
-    if options.field != "neural" or options.fit != "alongside":
+    if options.field != "neural" or options.fit != "joint":
         return None
     channels = len(rates)
     slices = attribute_slices(channels)
     attributes = tuple(name for name, columns in slices.items() if bool((rates[columns] > 0).any()))
-    rows = pack(stand.scene[stand.region.members], with_shN=channels > BASE_CHANNELS)
+    rows = pack(setup.scene[setup.region.members], with_shN=channels > BASE_CHANNELS)
     settings = network_settings(plain_options(options))
-    seen = visibility(stand.scene, stand.region.members, stand.train)
-    small = probes(stand)
+    seen = visibility(setup.scene, setup.region.members, setup.train)
+    small = probe_views(setup)
 
     def render(offsets: Tensor) -> Tensor:
         return torch.cat(
@@ -98,41 +98,41 @@ def begin_alongside(
         )
 
     strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
-    if slider_meant(options.slider, options.editor, strengths) == "even":
+    if resolve_slider(options.slider, options.editor, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
-    return Alongside(
+    return JointTraining(
         NeuralFit(rows, channels, attributes, settings, seen), channels, strengths, steps, render
     )
 
 
-def keep(alongside: Alongside, folder: StateFolder) -> None:
+def save_network(joint: JointTraining, folder: StateFolder) -> None:
     """Save the network for the end of the run, when the trajectory is whole."""
-    folder.save(PART, alongside.fit.saved(), {"shape": asdict(alongside.fit.shape)})
+    folder.save(PART, joint.fit.saved(), {"shape": asdict(joint.fit.shape)})
 
 
 def fit_network(
     trajectory: Trajectory,
-    stand: Stand,
-    seen: Judge,
-    judge: Judge,
+    setup: TrainingSetup,
+    seen: Evaluator,
+    evaluator: Evaluator,
     weights: Tensor,
     options: Mapping[str, Any],
     perceptual: Perceptual,
     log: RunLog,
     begun: Saved | None = None,
 ) -> NetworkFit:
-    """Train a network on a trajectory, or finish one that was trained alongside, and bake it.
+    """Train a network on a trajectory, or finish one that was trained jointly, and bake it.
 
     Args:
         trajectory: what was recorded
-        stand: scene, region, views
+        setup: scene, region, views
         seen: training views, which tell how much each attribute shows
-        judge: held-out views
+        evaluator: held-out views
         weights: how visible each member is. [M]
         options: of the run, JSON values
         perceptual: for the loss of pictures
-        log: where progress is told
-        begun: what `keep` saved
+        log: of the run
+        begun: what `save_network` saved
 
     Raises:
         ProgdfError: the edit moves nothing, or the training breaks down.
@@ -141,7 +141,7 @@ def fit_network(
     attributes = tuple(moving_attributes(offsets))
     if not attributes:
         raise ProgdfError("the edit moves nothing that a network could learn; use --field auto")
-    rows = pack(stand.scene[stand.region.members])
+    rows = pack(setup.scene[setup.region.members])
     settings = network_settings(options)
     fit = NeuralFit(rows, offsets.shape[2], attributes, settings, weights)
     steps = fit.settings.steps
@@ -149,9 +149,9 @@ def fit_network(
         layout = begun.values["shape"]
         fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
         steps = round(_FINISHING * steps)
-    fit.scale_to(offsets, rendered_importance(offsets, seen.counted))
+    fit.scale_to(offsets, rendered_importance(offsets, seen.counted_pixels))
     weight = float(options.get("picture_loss", NETWORK_OPTIONS["picture_loss"]))
-    pictures = _picture_loss(stand, trajectory, perceptual, weight, settings.seed) if weight > 0 else None
+    pictures = _picture_loss(setup, trajectory, perceptual, weight, settings.seed) if weight > 0 else None
     try:
         with log.steps("field", steps) as advance:
             trained(
@@ -160,20 +160,20 @@ def fit_network(
     except FloatingPointError as error:
         raise ProgdfError(f"{error}; try another --size, or --field auto") from error
     network = fit.field(tuple(float(s) for s in trajectory.s))
-    errors = FieldJudge(trajectory.s, offsets, judge.counted)
+    errors = FieldJudge(trajectory.s, offsets, evaluator.counted_pixels)
     return NetworkFit(
-        baked_neural(network, rows, trajectory.at, judge.counted),
+        baked_neural(network, rows, trajectory.at, evaluator.counted_pixels),
         errors.curve(network.bound(rows)),
     )
 
 
 def _picture_loss(
-    stand: Stand, trajectory: Trajectory, perceptual: Perceptual, weight: float, seed: int
+    setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual, weight: float, seed: int
 ) -> PictureLoss:
-    """L_pred of ProGDF: L1 + LPIPS between the field's and the recording's picture of a drawn view."""
-    members = stand.region.members
-    crops = [crop_scene(stand.scene, members, v.camera, v.box, stand.background) for v in stand.train]
-    rows = pack(stand.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    """L_pred of ProGDF: L1 + LPIPS between the field's and the recording's picture of a random view."""
+    members = setup.region.members
+    crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background) for v in setup.train]
+    rows = pack(setup.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
     moving = tuple(moving_attributes(trajectory.end[None]))
     draws = torch.Generator().manual_seed(seed)
 

@@ -1,6 +1,6 @@
 """An edit of one target: does it keep the way that its training took, or go straight?
 
-Nobody said what lies between original and end, and an optimiser's way there has no claim to be shown: it
+Nobody said what lies between original and end, and an optimiser's way there need not be shown: it
 takes bytes, and looks worse half way than a blend as often as not. So it has to be nearer to the editor's own
 picture of the half, where the editor has one; parts that move as wholes keep their way, on which they stay
 whole. Everything else goes straight, which are two keyframes.
@@ -15,9 +15,9 @@ import torch
 
 from progdf.field.trajectory import Trajectory
 from trainer.editors.base import ImageEditor
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 
-from .evaluate import make_judge
+from .evaluate import make_evaluator
 
 _VIEWS = 3
 _BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes
@@ -25,7 +25,7 @@ _HALFWAY = (0.3, 0.4, 0.5, 0.6, 0.7)  # a way is judged where it comes nearest t
 _SAME = 40.0  # dB above which two ways look alike
 
 
-def straight(trajectory: Trajectory) -> Trajectory:
+def straight_path(trajectory: Trajectory) -> Trajectory:
     """The two ends alone."""
     ends = [0, len(trajectory) - 1]
     return replace(
@@ -37,9 +37,9 @@ def straight(trajectory: Trajectory) -> Trajectory:
     )
 
 
-def kept_way(
+def choose_path(
     trajectory: Trajectory,
-    stand: Stand,
+    setup: TrainingSetup,
     editor: ImageEditor | None,
     in_parts: bool,
     retimed: Callable[[Trajectory], Trajectory],
@@ -48,28 +48,30 @@ def kept_way(
 
     Args:
         trajectory: of one target, as recorded
-        stand: scene, region, and the held-out views, some of which judge
+        setup: scene, region, and the held-out views, some of which judge
         editor: what made the edited views; None where it pictures no half
         in_parts: connected parts were moved as wholes
         retimed: lays the slider over a trajectory; done only where its own way may be kept
     """
-    line = straight(trajectory)
+    line = straight_path(trajectory)
     if not in_parts and (editor is None or editor.stages):
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
-    views = stand.held_out[:_VIEWS]
+    views = setup.held_out[:_VIEWS]
     halves = {}
     if editor is not None and not in_parts:
         halves = {0.5: [editor.edit(view, 0.5) for view in views]}
-    judge = make_judge(stand.scene, stand.region, views, halves, stand.background, trajectory.end.shape[1])
+    evaluator = make_evaluator(
+        setup.scene, setup.region, views, halves, setup.background, trajectory.end.shape[1]
+    )
     if in_parts:
-        apart = judge.psnr(judge.pictures(trajectory.at(0.5)), judge.pictures(line.at(0.5)))
+        apart = evaluator.psnr(evaluator.pictures(trajectory.at(0.5)), evaluator.pictures(line.at(0.5)))
         if apart >= _SAME:
             return line, f"straight, which looks the same half way ({apart:.1f} dB)"
         return trajectory, f"as the parts move, which straight lines would distort ({apart:.1f} dB half way)"
 
     def nearest(way: Trajectory) -> float:
-        return max(judge.psnr(judge.pictures(way.at(s)), judge.edited[0.5]) for s in _HALFWAY)
+        return max(evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALFWAY)
 
     own, direct = nearest(trajectory), nearest(line)
     found = (

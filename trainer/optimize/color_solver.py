@@ -26,8 +26,8 @@ from trainer.views.crops import CropScene
 
 from .losses import l1
 from .optimizer_state import PgsState
-from .pgs import OnStep, Snapshot, Stage
-from .unseen import Followers
+from .pgs import OnStep, ParameterSnapshot, TargetStage
+from .unseen import UnseenMembers
 
 STEPS_OF_OTHERS = 8
 """Steps of an optimizer that looks at one view at a time which one iteration over all views stands for."""
@@ -122,10 +122,10 @@ class _Pull:
 def _pull(view: ColorView, offsets: Tensor, target: Tensor, finished: Tensor) -> _Pull:
     """A clamp passes what would bring its value back into the range, as `losses.clamp_towards` does."""
     raw = view.colors(offsets)
-    drawn = view.picture(raw)
-    shown = drawn.clamp(0.0, 1.0)
+    rendered = view.picture(raw)
+    shown = rendered.clamp(0.0, 1.0)
     apart = shown - target
-    passed = ((drawn >= 0.0) | (apart < 0.0)) & ((drawn <= 1.0) | (apart > 0.0))
+    passed = ((rendered >= 0.0) | (apart < 0.0)) & ((rendered <= 1.0) | (apart > 0.0))
     back = view.map.gradient(apart * passed)
     back = back * ((raw >= 0.0) | (back < 0.0))
     return _Pull(back, float(apart.square().sum()), float(l1(shown, finished)))
@@ -166,7 +166,7 @@ class Solver:
         work = list(zip(self.views, targets, finished, strict=True))
         pulls = _each(lambda item: _pull(item[0], offsets, item[1], item[2]), work)
         held = self._held()
-        gradient = held * (offsets - self._foretold(offsets))
+        gradient = held * (offsets - self._predicted_bands(offsets))
         for view, pull in zip(self.views, pulls, strict=True):
             gradient += view.basis[..., None] * pull.gradient[:, None]
         squared = sum(pull.squared for pull in pulls) / max(1, sum(target.numel() for target in targets))
@@ -179,18 +179,18 @@ class Solver:
         held[:, 1:] = BANDS_HELD * self.weights[:, :1]
         return held
 
-    def _foretold(self, offsets: Tensor) -> Tensor:
+    def _predicted_bands(self, offsets: Tensor) -> Tensor:
         """DC as it is; the higher bands turned and stretched as DC is: the linear part of the affine map from
         old DC to new, fitted to all members by what they weigh. [M,B,3]"""
-        foretold = offsets.clone()
+        predicted = offsets.clone()
         if offsets.shape[1] > 1:
             weights = self.weights[:, 0]
             x = torch.cat([self.dc, torch.ones(len(self.dc), 1)], dim=1)
             square = x.T @ (weights * x)
             square += 1e-4 * square.diagonal().mean() * torch.eye(4)
             change = torch.linalg.solve(square, x.T @ (weights * offsets[:, 0]))[:3]
-            foretold[:, 1:] = self.bands @ change
-        return foretold
+            predicted[:, 1:] = self.bands @ change
+        return predicted
 
 
 def iterations(steps: int) -> int:
@@ -220,11 +220,11 @@ def make_solver(crops: Sequence[CropScene], original: Tensor, trained_bands: boo
 def solve(
     original: Tensor,
     solver: Solver,
-    stages: Sequence[Stage],
+    stages: Sequence[TargetStage],
     state: PgsState,
     on_step: OnStep,
-    followers: Followers | None = None,
-) -> Iterator[Snapshot]:
+    unseen_members: UnseenMembers | None = None,
+) -> Iterator[ParameterSnapshot]:
     """Solve for the stages in turn, each from where the last one ended, and yield each one's end.
 
     Args:
@@ -233,9 +233,9 @@ def solve(
         stages: strengths ascending; a stage's steps are its iterations
         state: where to go on from, changed in place; a step is an iteration over all views
         on_step: progress; here, and only here, the state is whole and may be saved
-        followers: members that no view shows; tied to those that they follow at every step, they cost the
-            views nothing afterwards (the demo's room in another tint, PSNR where no view looks: nobody
-            follows 17.2 dB, 42.7 with them)
+        unseen_members: members that no view shows; tied to those that they follow at every step, they cost
+            the views nothing afterwards (the demo's room in another tint, PSNR where no view looks: 17.2 dB
+            without them, 42.7 with them)
 
     Raises:
         FloatingPointError: the loss or where it leads is not finite; the state is that of the step before.
@@ -254,14 +254,14 @@ def solve(
             state.previous.copy_(state.moved.detach())
             with torch.no_grad():
                 state.moved[:, columns] = found.flatten(1)
-                if followers is not None:
-                    state.moved.copy_(followers.led(state.moved.detach()))
+                if unseen_members is not None:
+                    state.moved.copy_(unseen_members.propagate(state.moved.detach()))
             state.means.add({"l2": squared, "left": state.running})
             state.step, state.local = state.step + 1, state.local + 1
             state.average.copy_(state.moved.detach())
             if state.local == stage.steps:
                 state.recorded += 1
-                yield Snapshot(state.step, index, True, state.average.clone(), state.means.read())
+                yield ParameterSnapshot(state.step, index, True, state.average.clone(), state.means.read())
             on_step(state.step, state.running)
         state.stage, state.local = index + 1, 0
 

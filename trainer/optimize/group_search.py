@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 
 from trainer.views.crops import CropScene
 
-from .motion import Motion, Parts, moved
+from .motion import Motion, Parts, move_rows
 
 _BLURS = (9, 21)  # pixels
 _WIDE_BLURS = (0.4, 0.2, 0.1)  # of the box's longer side: a part feels a place three times its size away
@@ -80,7 +80,7 @@ class GroupSearch:
     def distance(self, targets: Sequence[Tensor], motion: Motion) -> float:
         """Mean distance of all views from their targets, at full sharpness and blurred."""
         with torch.no_grad():
-            rows = moved(self.original, self.parts, motion)
+            rows = move_rows(self.original, self.parts, motion)
             pairs = zip(self.crops, targets, strict=True)
             return sum(float(_distance(crop, rows, target)) for crop, target in pairs) / len(targets)
 
@@ -101,7 +101,7 @@ class GroupSearch:
             if not queue:
                 queue = torch.randperm(len(self.crops), generator=order).tolist()
             view = queue.pop()
-            rows = moved(self.original, self.parts, _motion(values, self.parts))
+            rows = move_rows(self.original, self.parts, _motion(values, self.parts))
             loss = _distance(self.crops[view], rows, targets[view], wide=step < widening)
             value = float(loss.detach())
             if not math.isfinite(value):

@@ -20,9 +20,9 @@ from progdf.gaussians import attribute_slices
 from trainer.views.crops import CropScene, render_all
 
 from .group_search import GroupSearch, OnStep
-from .motion import Motion, Parts, between, carried, carried_back, make_parts
+from .motion import Motion, Parts, carry_offsets, interpolate_motion, local_offsets, make_parts
 from .parts import connected_parts
-from .pgs import Stage, visible_way
+from .pgs import TargetStage, visible_way
 
 GROWTH = 2.0
 """How many times a Gaussian may grow beyond its part; larger ones are fog that hides an error."""
@@ -50,7 +50,9 @@ class Groups:
         """Size of what the members still have to move within their parts, world units."""
         return _EXTENT * float(self.parts.sizes.mean())
 
-    def staged(self, original: Tensor, crops: Sequence[CropScene], stages: Sequence[Stage]) -> list[Stage]:
+    def to_stages(
+        self, original: Tensor, crops: Sequence[CropScene], stages: Sequence[TargetStage]
+    ) -> list[TargetStage]:
         """The stages, their members' offsets now in the parts' frames. `original`: raw member rows [M,C]"""
         before: Sequence[Tensor] = render_all(crops, original)
         staged = []
@@ -65,7 +67,7 @@ class Groups:
         return staged
 
     def _placed(self, original: Tensor, motion: Motion, offsets: Tensor) -> Tensor:
-        return carried(original, offsets, self.parts, motion)
+        return carry_offsets(original, offsets, self.parts, motion)
 
     def lines(self) -> list[str]:
         """What the log says of the finished edit: where each part went, in its own sizes."""
@@ -79,7 +81,7 @@ class Groups:
         ]
 
     def saved(self) -> dict[str, Tensor]:
-        """Part of each member [M] and motions [T,P,7]; `restored_groups` takes them."""
+        """Part of each member [M] and motions [T,P,7]; `restore_groups` takes them."""
         motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
         return {"part": self.parts.part, "motions": torch.stack(motions)}
 
@@ -120,13 +122,13 @@ def group_stage(
     return Groups(parts, tuple(motions))
 
 
-def restored_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
+def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
     """What `Groups.saved` gave, of the same members."""
     motions = tuple(Motion(m[:, :3], m[:, 3], m[:, 4:]) for m in saved["motions"])
     return Groups(make_parts(original, saved["part"]), motions)
 
 
-def way(
+def group_path(
     original: Tensor, groups: Groups, ends: Sequence[Tensor], steps: Sequence[int], count: int
 ) -> list[tuple[int, int, bool, Tensor]]:
     """Recordings through the stages' ends: parts move as wholes, what bends within them bends evenly.
@@ -145,11 +147,11 @@ def way(
     each = max(2, count // len(ends))
     found = []
     for stage, (end, step, next_motion) in enumerate(zip(ends, steps, groups.motions, strict=True)):
-        next_own = carried_back(original, end, groups.parts, next_motion)
+        next_own = local_offsets(original, end, groups.parts, next_motion)
         for i in range(1, each):
             share = i / each
-            halfway = between(motion, next_motion, share)
-            offsets = carried(original, torch.lerp(own, next_own, share), groups.parts, halfway)
+            halfway = interpolate_motion(motion, next_motion, share)
+            offsets = carry_offsets(original, torch.lerp(own, next_own, share), groups.parts, halfway)
             found.append((begun + round(share * (step - begun)), stage, False, offsets.half()))
         found.append((step, stage, True, end.half()))
         motion, own, begun = next_motion, next_own, step

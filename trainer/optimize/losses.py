@@ -155,7 +155,7 @@ def laplacian(luma: Tensor) -> Tensor:
     return around - 4.0 * luma[1:-1, 1:-1]
 
 
-def eroded(mask: Tensor, by: int = 2) -> Tensor:
+def erode(mask: Tensor, by: int = 2) -> Tensor:
     """The mask without its rim of `by` pixels, beyond the picture counting as inside. [h,w] -> [h,w] bool"""
     outside = (mask <= 0.5).float()
     return max_pool2d(outside[None, None], 2 * by + 1, 1, by)[0, 0] < 0.5

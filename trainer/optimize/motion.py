@@ -43,15 +43,15 @@ class Parts:
     """
 
     part: Tensor
-    centres: Tensor
+    centers: Tensor
     sizes: Tensor
 
     def __len__(self) -> int:
-        return len(self.centres)
+        return len(self.centers)
 
     def still(self) -> Motion:
         """No part has moved."""
-        nothing = torch.zeros_like(self.centres)
+        nothing = torch.zeros_like(self.centers)
         return Motion(nothing, nothing[:, 0], nothing)
 
 
@@ -60,24 +60,24 @@ def make_parts(rows: Tensor, part: Tensor) -> Parts:
     means, log_scales, _ = _split(rows)
     counts = torch.bincount(part).to(means)
     nothing = means.new_zeros(len(counts), 3)
-    centres = nothing.index_add(0, part, means) / counts[:, None]
-    squares = (means - centres[part]).square().sum(dim=1)
+    centers = nothing.index_add(0, part, means) / counts[:, None]
+    squares = (means - centers[part]).square().sum(dim=1)
     sizes = (nothing[:, 0].index_add(0, part, squares) / counts).sqrt()
     own = log_scales.exp().amax(dim=1).mean()  # a part of one Gaussian has its size
-    return Parts(part, centres, torch.maximum(sizes, 1e-3 * own).clamp_min(1e-9))
+    return Parts(part, centers, torch.maximum(sizes, 1e-3 * own).clamp_min(1e-9))
 
 
-def moved(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
+def move_rows(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
     """Raw rows where the motion takes them; differentiable in both. [M,≥10] -> [M,≥10]"""
     part = parts.part
     means, log_scales, quats = _split(rows)
     turn, size = _quaternion(motion.turn)[part], motion.log_scale[part, None]
-    arm = means - parts.centres[part]
-    means = parts.centres[part] + motion.shift[part] + size.exp() * _turned(arm, turn)
+    arm = means - parts.centers[part]
+    means = parts.centers[part] + motion.shift[part] + size.exp() * _turned(arm, turn)
     return torch.cat([means, log_scales + size, _product(turn, quats), rows[:, _MOVING.stop :]], dim=1)
 
 
-def carried(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
+def carry_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
     """Offsets within the parts' own frames -> offsets from the original, once the parts have moved.
 
     Args:
@@ -91,21 +91,21 @@ def carried(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> 
     moving = _MOVING
     rows = original[:, moving]
     return torch.cat(
-        [moved(rows + offsets[:, moving], parts, motion) - rows, offsets[:, moving.stop :]], dim=1
+        [move_rows(rows + offsets[:, moving], parts, motion) - rows, offsets[:, moving.stop :]], dim=1
     )
 
 
-def carried_back(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """The inverse of `carried`. [M,C] -> [M,C]"""
+def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
+    """The inverse of `carry_offsets`. [M,C] -> [M,C]"""
     moving, part = _MOVING, parts.part
     means, log_scales, quats = _split(original[:, moving] + offsets[:, moving])
     back, size = _quaternion(-motion.turn)[part], motion.log_scale[part, None]
-    arm = means - parts.centres[part] - motion.shift[part]
-    own = [parts.centres[part] + _turned(arm, back) * (-size).exp(), log_scales - size, _product(back, quats)]
+    arm = means - parts.centers[part] - motion.shift[part]
+    own = [parts.centers[part] + _turned(arm, back) * (-size).exp(), log_scales - size, _product(back, quats)]
     return torch.cat([torch.cat(own, dim=1) - original[:, moving], offsets[:, moving.stop :]], dim=1)
 
 
-def between(a: Motion, b: Motion, share: float) -> Motion:
+def interpolate_motion(a: Motion, b: Motion, share: float) -> Motion:
     """The way from one motion to another: shift and log-scale straight, the turn along the great circle."""
     start = _quaternion(a.turn)
     rest = _rotation_vector(_product(_quaternion(-a.turn), _quaternion(b.turn)))

@@ -46,7 +46,7 @@ class LossWeights:
     sharpness: Sharpness = "off"
     sharpness_weight: float = 1.0
 
-    def described(self, perceptual: str) -> str:
+    def description(self, perceptual: str) -> str:
         """One line for log and report. `perceptual`: the name of the distance that is really used."""
         terms = ["L1"]
         if self.perceptual > 0:
@@ -156,7 +156,7 @@ def loss_table(rows: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, lis
     return table
 
 
-def summed(terms: Mapping[str, Tensor]) -> Tensor:
+def total_loss(terms: Mapping[str, Tensor]) -> Tensor:
     """The loss. []"""
     return torch.stack(list(terms.values())).sum()
 

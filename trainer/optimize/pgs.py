@@ -26,7 +26,7 @@ from trainer.options import Rates
 from trainer.views.crops import CropScene, render_all
 
 from .losses import l1, warmup
-from .objective import Moment, Objective, summed
+from .objective import Moment, Objective, total_loss
 from .optimizer_state import PgsState
 
 # learning rates of 3DGS (Kerbl 2023) for a scene of extent 1
@@ -83,7 +83,7 @@ class PgsSettings:
 
 
 @dataclass(frozen=True)
-class Stage:
+class TargetStage:
     """One strength to optimise towards.
 
     Args:
@@ -104,7 +104,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class ParameterSnapshot:
     """One recording: the running mean of the parameters, as offsets from the original.
 
     Args:
@@ -149,17 +149,17 @@ def learning_rates(kind: EditKind, channels: int, extent: float, form: Rates = "
     return rates
 
 
-def optimise(
+def optimize(
     original: Tensor,
     crops: Sequence[CropScene],
     probes: Sequence[CropScene],
-    stages: Sequence[Stage],
+    stages: Sequence[TargetStage],
     objective: Objective,
     settings: PgsSettings,
     on_step: OnStep | None = None,
     state: PgsState | None = None,
     renewal: Renewal | None = None,
-) -> Iterator[Snapshot]:
+) -> Iterator[ParameterSnapshot]:
     """Optimise the member rows towards each stage in turn, and yield recordings.
 
     A recording is made whenever the probes' pictures have moved by a share of what the stage has to move
@@ -229,7 +229,7 @@ def optimise(
                 if last or settings.every or _mean_distance(pictures, state.pictures) >= spacing:
                     state.pictures = pictures
                     state.recorded += 1
-                    yield Snapshot(state.step, index, last, offsets.clone(), state.means.read())
+                    yield ParameterSnapshot(state.step, index, last, offsets.clone(), state.means.read())
             if on_step is not None:
                 on_step(state.step, state.running)
         state.stage, state.local = index + 1, 0
@@ -237,7 +237,7 @@ def optimise(
 
 def _gradient(terms: Mapping[str, Tensor], state: PgsState) -> Tensor:
     """Of the terms' sum in the members' offsets. [M,C]"""
-    loss = summed(terms)
+    loss = total_loss(terms)
     if not math.isfinite(float(loss.detach())):
         raise FloatingPointError(f"the loss is {float(loss.detach())} at step {state.step}")
     state.moved.grad = None

@@ -83,12 +83,12 @@ def retime(
         for nodes, low, high in segments:
             count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
-            progress = _cumulative(_chords([blended(pictures, before, float(x)) for x in even]))
+            progress = _cumulative(_chords([blend_images(pictures, before, float(x)) for x in even]))
             s[nodes] = _placed(low, high, interpolated(s[nodes], even, progress))
     return replace(trajectory, s=s.float())
 
 
-def blended(pictures: Sequence[Tensor], places: Tensor, s: float) -> Tensor:
+def blend_images(pictures: Sequence[Tensor], places: Tensor, s: float) -> Tensor:
     """What is seen at `s`, straight between the pictures at these ascending places. [n] float64"""
     right = int(torch.searchsorted(places, s).clamp(1, len(places) - 1))
     low, high = float(places[right - 1]), float(places[right])
@@ -132,7 +132,7 @@ def straight_recordings(
     return kept
 
 
-def with_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory:
+def select_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory:
     """These recordings alone; ascending, both ends and the stages' ends among them."""
     rows = torch.tensor(kept)
     return replace(
@@ -144,8 +144,8 @@ def with_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory:
     )
 
 
-def before_fit(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajectory:
-    """A trajectory read from its file, as it was before a field's slider was laid over it (`lay_over`).
+def undo_retiming(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajectory:
+    """A trajectory read from its file, as it was before `retime_recording` moved it.
 
     Raises:
         ValueError: that slider does not fit the recordings.
@@ -157,12 +157,12 @@ def before_fit(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajector
     return replace(trajectory, s=s)
 
 
-def lay_over(path: Path, dial: Dial) -> Trajectory:
+def retime_recording(path: Path, dial: Dial) -> Trajectory:
     """Move the recordings in a trajectory's file to where the fitted field shows them, so that one can be
     held against the other; and keep where they were, from which the next field is fitted.
     """
     trajectory, extra, about = load_trajectory(path)
-    before = before_fit(trajectory, extra)
+    before = undo_retiming(trajectory, extra)
     moved = replace(before, s=dial(before.s).float())
     if not torch.equal(moved.s, trajectory.s):
         save_trajectory(path, moved, {**extra, _BEFORE: before.s}, about)

@@ -25,14 +25,14 @@ GROUP_STEPS = 120
 STAGES: dict[EditKind, int] = {"colour": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
 
 
-def stages_to_ask(options: TrainOptions, kind: EditKind) -> int:
+def stage_count(options: TrainOptions, kind: EditKind) -> int:
     """How many strengths an editor is asked for that pictures any."""
     most = STAGES[kind]
     hurried = options.quick or options.steps < STAGE_STEPS * most
     return options.stages or min(most, QUICK_STAGES if hurried else most)
 
 
-def slider_meant(slider: Slider, editor: str, strengths: Sequence[float]) -> Slider:
+def resolve_slider(slider: Slider, editor: str, strengths: Sequence[float]) -> Slider:
     """What "auto" means: even, but pinned where somebody gave pictures of several strengths.
 
     Args:
@@ -87,7 +87,7 @@ def objective_line(options: TrainOptions, kind: EditKind, perceptual: str) -> st
     """What a run minimises, for log and report. `perceptual`: the name of the distance that is used."""
     if solves_colors(options, kind):
         return "squared error, all views at once"
-    return loss_weights(options, kind).described(perceptual)
+    return loss_weights(options, kind).description(perceptual)
 
 
 def loss_weights(options: TrainOptions, kind: EditKind) -> LossWeights:

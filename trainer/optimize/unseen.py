@@ -18,7 +18,7 @@ from progdf.rasterize import alpha_weights
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
 from trainer.regions.surface import surface_likeness
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 from trainer.views.view import View
 
 _SEEN = 3.0
@@ -32,11 +32,11 @@ _SOURCES = 6
 
 
 @dataclass(frozen=True)
-class Followers:
+class UnseenMembers:
     """Who follows whom, as places among the members.
 
     Args:
-        places: the followers. [U] int64
+        places: the unseen members. [U] int64
         sources: seen members that each of them follows. [U,k] int64
         weights: how much it follows each, adding up to 1. [U,k]
     """
@@ -45,8 +45,8 @@ class Followers:
     sources: Tensor
     weights: Tensor
 
-    def led(self, offsets: Tensor) -> Tensor:
-        """The offsets with the followers' colours moved as their sources' are. [M,C] -> [M,C]"""
+    def propagate(self, offsets: Tensor) -> Tensor:
+        """The offsets with the unseen members' colors moved as their sources' are. [M,C] -> [M,C]"""
         if not len(self.places):
             return offsets
         slices = attribute_slices(offsets.shape[1])
@@ -58,15 +58,15 @@ class Followers:
         return led
 
 
-def followers_of(options: TrainOptions, stand: Stand, kind: EditKind) -> Followers:
+def unseen_members_of(options: TrainOptions, setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
     """Those of a run: nobody but in an edit of colours that is to be followed (`--follow`)."""
     if kind != "colour" or not options.follow:
         nobody = torch.zeros(0, dtype=torch.int64)
-        return Followers(nobody, nobody[:, None], torch.zeros(0, 1))
-    return find_followers(stand.scene, stand.region.members, stand.train)
+        return UnseenMembers(nobody, nobody[:, None], torch.zeros(0, 1))
+    return find_unseen_members(setup.scene, setup.region.members, setup.train)
 
 
-def find_followers(scene: Gaussians, members: Tensor, views: Sequence[View]) -> Followers:
+def find_unseen_members(scene: Gaussians, members: Tensor, views: Sequence[View]) -> UnseenMembers:
     """The members that no view shows, and the nearest seen ones along the surface.
 
     A follower whose neighbours are all unseen follows what these follow; one from which no seen member can be
@@ -83,7 +83,7 @@ def find_followers(scene: Gaussians, members: Tensor, views: Sequence[View]) -> 
         shown += alpha_weights(scene, camera, torch.ones_like(view.mask), near=camera.near)[
             members, 2
         ].float()
-    return _following(scene[members], shown >= least_shown(shown))
+    return _find_sources(scene[members], shown >= least_shown(shown))
 
 
 def least_shown(shown: Tensor) -> float:
@@ -97,14 +97,14 @@ def least_shown(shown: Tensor) -> float:
     return min(_SEEN, _SHARE * own)
 
 
-def _following(region: Gaussians, seen: Tensor) -> Followers:
-    """See `find_followers`; `seen`: [M] bool"""
+def _find_sources(region: Gaussians, seen: Tensor) -> UnseenMembers:
+    """See `find_unseen_members`; `seen`: [M] bool"""
     unseen = (~seen).nonzero()[:, 0]
     k = min(_SOURCES, int(seen.sum()))
     sources = torch.zeros(len(seen), k, dtype=torch.int64)
     weights = torch.zeros(len(seen), k)
     if k == 0 or not len(unseen):
-        return Followers(unseen[:0], sources[:0], weights[:0])
+        return UnseenMembers(unseen[:0], sources[:0], weights[:0])
     sources[seen, 0], weights[seen, 0] = seen.nonzero()[:, 0], 1.0
     near, likeness = surface_likeness(region, unseen)
     decided = seen.clone()
@@ -121,5 +121,5 @@ def _following(region: Gaussians, seen: Tensor) -> Followers:
         sources[rows] = sources[through].gather(2, best)[..., 0]
         weights[rows] = found.values / found.values.sum(dim=1, keepdim=True)
         decided[rows] = True
-    followers = unseen[decided[unseen]]
-    return Followers(followers, sources[followers], weights[followers])
+    unseen_members = unseen[decided[unseen]]
+    return UnseenMembers(unseen_members, sources[unseen_members], weights[unseen_members])

@@ -16,7 +16,7 @@ import torch
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.sh import basis
-from trainer.views.visible_area import covered_areas
+from trainer.views.visible_area import visible_area
 
 NEEDED = 0.04
 """Colour (0..1) by which a region's must change with the view for the bands to pay."""
@@ -35,7 +35,7 @@ def view_dependence(members: Gaussians, cameras: Sequence[Camera]) -> float:
     for camera in cameras:
         directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
         seen.append((basis(degree, directions)[:, 1 : bands + 1, None] * members.shN[:, :bands]).sum(dim=1))
-    colours = torch.stack(seen)
-    change = (colours - colours.mean(dim=0)).square().mean(dim=(0, 2)).double()
-    areas = covered_areas(members)
+    colors = torch.stack(seen)
+    change = (colors - colors.mean(dim=0)).square().mean(dim=(0, 2)).double()
+    areas = visible_area(members)
     return float(((change * areas).sum() / areas.sum().clamp_min(1e-300)).sqrt())

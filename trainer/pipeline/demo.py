@@ -162,7 +162,7 @@ def main(argv: Sequence[str]) -> int:
 def _check(options: DemoOptions) -> None:
     """Raises ProgdfError for a number that cannot be, before anything is made or written."""
     if options.size is not None and options.size > MOST_GAUSSIANS:
-        raise ProgdfError(f"--size is {options.size}; {MOST_GAUSSIANS} or fewer would be right")
+        raise ProgdfError(f"--size must be at most {MOST_GAUSSIANS}, got {options.size}")
     check_ranges(("--seed", options.seed, 0, LARGEST_SEED), ("--threads", options.threads, 0, MOST_THREADS))
 
 
@@ -226,11 +226,11 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
 
 def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path]:
     """Train the edits; their .gdf files by name. A demo that was stopped goes on where it was."""
-    from .resume import found  # only now: `--help` and the pictures need none of it
+    from .resume import find_run  # only now: `--help` and the pictures need none of it
     from .run import train
 
     runs = {edit.name: _run(options, show, scene, edit) for edit in show.edits}
-    here = {name: found(run) for name, run in runs.items()}
+    here = {name: find_run(run) for name, run in runs.items()}
     for edit in show.edits:
         print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
         run = runs[edit.name]

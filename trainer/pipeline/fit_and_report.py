@@ -17,17 +17,17 @@ from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import decode_json
-from trainer.fit.evaluate import Judge, make_judge
-from trainer.fit.evenness import evened
-from trainer.fit.fit import expected_looks, fit_field, judged_field, visibility
+from trainer.fit.evaluate import Evaluator, make_evaluator
+from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility
 from trainer.fit.network import fit_network
+from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
-from trainer.optimize.retime import lay_over
-from trainer.optimize.settings import slider_meant
+from trainer.optimize.retime import retime_recording
+from trainer.optimize.settings import resolve_slider
 from trainer.options import CLIP_MODEL, FieldKind
 from trainer.report.measures import Texts, clip_course, expected_measures, figures, measure
 from trainer.report.report import report_picture
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
 from trainer.store.state import Saved
@@ -55,9 +55,9 @@ class RunResult:
     trajectory: Trajectory
 
 
-def finished(
+def finish_run(
     folder: RunFolder,
-    stand: Stand,
+    setup: TrainingSetup,
     trajectory: Trajectory,
     about: Mapping[str, Any],
     perceptual: Perceptual,
@@ -67,16 +67,18 @@ def finished(
 ) -> RunResult:
     """Fit, measure, and write NAME.gdf, report.json and report.png. `begun`: see `network.fit_network`."""
     options = about["options"]
-    scene, region = stand.scene, stand.region
+    scene, region = setup.scene, setup.region
     with log.stage("fit"):
-        judge = kept_judge(folder, stand, stand.held_out, trajectory)
-        few = stand.train[:: max(1, len(stand.train) // _RANK_VIEWS)][:_RANK_VIEWS]
-        seen = kept_judge(folder, stand, few, trajectory)
-        with log.looks("weigh the members", len(stand.train)) as looked:
-            weights = visibility(scene, region.members, stand.train, looked)
+        evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
+        few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
+        seen = load_evaluator(folder, setup, few, trajectory)
+        with log.looks("weigh the members", len(setup.train)) as looked:
+            weights = visibility(scene, region.members, setup.train, looked)
         if choice == "neural":
-            network = fit_network(trajectory, stand, seen, judge, weights, options, perceptual, log, begun)
-            fitted = judged_field(trajectory, judge, network.field, options["target_psnr"])
+            network = fit_network(
+                trajectory, setup, seen, evaluator, weights, options, perceptual, log, begun
+            )
+            fitted = evaluate_field(trajectory, evaluator, network.field, options["target_psnr"])
         else:
             network = None
             target, budget = options["target_psnr"], options.get("bytes_budget")
@@ -84,18 +86,18 @@ def finished(
                 fitted = fit_field(
                     trajectory,
                     replace(seen, looked=looked),
-                    replace(judge, looked=looked),
+                    replace(evaluator, looked=looked),
                     weights,
                     choice,
                     target,
                     budget,
                 )
     with log.stage("even"):
-        slider = slider_meant(options.get("slider", "stages"), options["editor"], trajectory.strengths)
+        slider = resolve_slider(options.get("slider", "stages"), options["editor"], trajectory.strengths)
         field, dial = fitted.chosen.field, same()
         if slider == "even":
-            field, dial = evened(field, stand, log)
-        laid = lay_over(folder.trajectory, dial)
+            field, dial = equalize_slider(field, setup, log)
+        laid = retime_recording(folder.trajectory, dial)
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
@@ -107,16 +109,16 @@ def finished(
         else:
             log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
     with log.stage("report"):
-        clip = clip_course(judge, stand.held_out, field, texts(options))
+        clip = clip_course(evaluator, setup.held_out, field, texts(options))
         if clip.reason and (options.get("text_before") or options.get("text_after")):
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
-            watched = replace(judge, looked=looked)
+            watched = replace(evaluator, looked=looked)
             measured = measure(watched, trajectory, fitted, field, dial, perceptual, clip)
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
-        endpoint, outside = exactness(scene, gdf, end_rows(stand, trajectory))
+        endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{options['name']}: {options['editor']}"
-        picture = report_picture(judge, measured, about["losses"], title)
+        picture = report_picture(evaluator, measured, about["losses"], title)
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -162,17 +164,19 @@ def finished(
     return RunResult(folder, folder.gdf(options["name"]), report, laid)
 
 
-def kept_judge(folder: RunFolder, stand: Stand, views: Sequence[View], trajectory: Trajectory) -> Judge:
+def load_evaluator(
+    folder: RunFolder, setup: TrainingSetup, views: Sequence[View], trajectory: Trajectory
+) -> Evaluator:
     """Some views beside their edited pictures, as the run keeps them."""
     names = [view.camera.name for view in views]
     edited = {s: read_views(folder, "edited", names, s) for s in trajectory.strengths}
     channels, still = trajectory.end.shape[1], only_recolors(trajectory.offsets)
-    return make_judge(stand.scene, stand.region, views, edited, stand.background, channels, still)
+    return make_evaluator(setup.scene, setup.region, views, edited, setup.background, channels, still)
 
 
-def end_rows(stand: Stand, trajectory: Trajectory) -> Tensor:
+def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:
     """Raw member rows of the finished edit: original + end, in float32. [M,C]"""
-    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    rows = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
     return rows + trajectory.end
 
 
@@ -194,9 +198,9 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
 
 
 def texts(options: Mapping[str, Any]) -> Texts:
-    """What CLIP is asked: the options' texts; what a learned editor was told is what one sees after."""
-    kind, _, told = options["editor"].partition(":")
-    after = options.get("text_after") or (told.strip().strip("\"'") if kind == "instruct" else "")
+    """What CLIP is asked: the options' texts; a learned editor's instruction says what one sees after."""
+    kind, _, instruction = options["editor"].partition(":")
+    after = options.get("text_after") or (instruction.strip().strip("\"'") if kind == "instruct" else "")
     return Texts(options.get("text_before", ""), after, options.get("clip_model") or CLIP_MODEL)
 
 

@@ -23,10 +23,10 @@ from trainer.editors.base import EditKind
 from trainer.optimize.groups import group_stage
 from trainer.optimize.losses import GradientL1
 from trainer.optimize.objective import LossWeights, Objective
-from trainer.optimize.pgs import Stage, optimise
+from trainer.optimize.pgs import TargetStage, optimize
 from trainer.optimize.settings import GROUP_STEPS, group_steps, pgs_settings
 from trainer.options import TrainOptions
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import Advance, RunLog
 from trainer.views.crops import CropScene, crop_scene, render_all
 from trainer.views.view import View, crop, fit_size
@@ -114,8 +114,8 @@ class Trial:
         }
 
 
-def how_to_train(
-    options: TrainOptions, stand: Stand, editor: ImageEditor, log: RunLog
+def choose_approach(
+    options: TrainOptions, setup: TrainingSetup, editor: ImageEditor, log: RunLog
 ) -> tuple[Approach, dict[str, Any] | None]:
     """What options and editor say, or a trial finds where they leave it open; and the trial's figures.
 
@@ -127,17 +127,17 @@ def how_to_train(
         kind = editor.kind
     if kind in ("colour", "style") or (kind == "geometry" and options.group_steps is not None):
         return Approach(kind, group_steps(options, kind)), None
-    edited = [editor.edit(view, 1.0) for view in stand.train]
-    ways = approaches(options, stand, edited)
-    if all(torch.equal(picture, view.image) for picture, view in zip(edited, stand.train, strict=True)):
+    edited = [editor.edit(view, 1.0) for view in setup.train]
+    ways = approaches(options, setup, edited)
+    if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
         return ways[0], None
     with log.steps("try kinds", len(ways)) as advance:
-        trial = tried(options, stand, edited, ways, advance)
+        trial = try_approaches(options, setup, edited, ways, advance)
     log.say(trial.line())
     return trial.chosen, trial.figures()
 
 
-def approaches(options: TrainOptions, stand: Stand, edited: Sequence[Tensor]) -> list[Approach]:
+def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
     """The ways that the options leave open, those that move least first.
 
     Where a tool repaints the whole picture nothing tells what moved from what was painted anew beside it, and
@@ -145,7 +145,7 @@ def approaches(options: TrainOptions, stand: Stand, edited: Sequence[Tensor]) ->
 
     Args:
         options: see `TrainOptions`
-        stand: the training views
+        setup: the training views
         edited: the finished edit of each, not confined. [H,W,3]
     """
     groups = GROUP_STEPS if options.group_steps is None else options.group_steps
@@ -154,7 +154,7 @@ def approaches(options: TrainOptions, stand: Stand, edited: Sequence[Tensor]) ->
     if options.kind != "auto":
         return geometry if options.kind == "geometry" else [Approach(options.kind)]
     changed = beside = 0.0
-    for view, picture in zip(stand.train, edited, strict=True):
+    for view, picture in zip(setup.train, edited, strict=True):
         outside = view.mask < 0.05
         changed += float(((picture - view.image).abs().amax(dim=2) > 0.05)[outside].sum())
         beside += float(outside.sum())
@@ -162,9 +162,9 @@ def approaches(options: TrainOptions, stand: Stand, edited: Sequence[Tensor]) ->
     return [Approach("colour"), Approach("style"), *geometry]
 
 
-def tried(
+def try_approaches(
     options: TrainOptions,
-    stand: Stand,
+    setup: TrainingSetup,
     edited: Sequence[Tensor],
     ways: Sequence[Approach],
     advance: Advance | None = None,
@@ -173,7 +173,7 @@ def tried(
 
     Args:
         options: of the run
-        stand: scene, region and training views
+        setup: scene, region and training views
         edited: the finished edit of each training view, not confined. [H,W,3]
         ways: see `approaches`
         advance: progress: ways tried
@@ -181,27 +181,27 @@ def tried(
     Raises:
         FloatingPointError: a loss is not finite.
     """
-    members = stand.region.members
-    most = sorted(zip(stand.train, edited, strict=True), key=lambda pair: -_change(*pair))[:_VIEWS]
-    small = [_small(stand, view.widened([picture]), picture) for view, picture in most]
+    members = setup.region.members
+    most = sorted(zip(setup.train, edited, strict=True), key=lambda pair: -_change(*pair))[:_VIEWS]
+    small = [_small(setup, view.widen([picture]), picture) for view, picture in most]
     judges = small[1::3] or small
     taught = [one for i, one in enumerate(small) if i % 3 != 1]
     crops, targets = [one.scene for one in taught], [one.target for one in taught]
-    original = pack(stand.scene[members], with_shN=stand.scene.sh_degree > 0)
-    extent = 2.0 * scene_sphere(stand.scene[members])[1]
+    original = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0)
+    extent = 2.0 * scene_sphere(setup.scene[members])[1]
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.steps)))
     objective = Objective(GradientL1(), LossWeights(perceptual=0.0))
     psnrs: dict[Approach, float] = {}
     for way in ways:
-        stages = [Stage(1.0, targets, steps)]
+        stages = [TargetStage(1.0, targets, steps)]
         if way.group_steps:
             # how far parts get as wholes; what the members add to that takes longer than a trial
             groups = group_stage(original, crops, [targets], steps, options.seed)
-            end = groups.staged(original, crops, stages)[0].place(torch.zeros_like(original))
+            end = groups.to_stages(original, crops, stages)[0].place(torch.zeros_like(original))
         else:
             own = replace(options, steps=steps, group_steps=0, sh="on", recording="smooth")
             settings = pgs_settings(own, way.kind, original.shape[1], extent, 1)
-            *_, last = optimise(original, crops, [], stages, objective, replace(settings, snapshots=1))
+            *_, last = optimize(original, crops, [], stages, objective, replace(settings, snapshots=1))
             end = last.offsets
         psnrs[way] = _psnr(judges, original + end)
         if advance is not None:
@@ -218,7 +218,7 @@ class _Small:
     counts: Tensor
 
 
-def _small(stand: Stand, view: View, picture: Tensor) -> _Small:
+def _small(setup: TrainingSetup, view: View, picture: Tensor) -> _Small:
     camera = fit_size(view.camera, _SIZE)
     across, down = camera.width / view.camera.width, camera.height / view.camera.height
     x0, y0, x1, y1 = view.box
@@ -230,7 +230,7 @@ def _small(stand: Stand, view: View, picture: Tensor) -> _Small:
         return crop(planes[0].permute(1, 2, 0), box)
 
     counts = (view.mask > 0.05) | ((picture - view.image).abs().amax(dim=2) > 2 / 255)
-    scene = crop_scene(stand.scene, stand.region.members, camera, box, stand.background)
+    scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
     return _Small(scene, small(picture), small(counts.float()[..., None])[..., 0] > 0.5)
 
 

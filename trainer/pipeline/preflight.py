@@ -13,7 +13,7 @@ from trainer.regions.from_pictures import region_checks, region_settings
 from trainer.setup.training_setup import editor_settings
 from trainer.store.run_folder import check_folder
 
-from .resume import kept_region
+from .resume import load_region
 
 
 def check_command(options: TrainOptions, edit: Mapping[str, str]) -> None:
@@ -38,7 +38,7 @@ def check_command(options: TrainOptions, edit: Mapping[str, str]) -> None:
             raise open_failure(options.scene, error) from None
     if options.cameras is not None and not options.resume:
         load_cameras(options.cameras)
-    if kept_region(options) is None:
+    if load_region(options) is None:
         check_region(options.region, region_checks(region_settings(options, edit, quiet=True)))
     if not folder.root.is_dir() or not any(folder.root.iterdir()):
         check_new_editor(options.editor, editor_settings(options, folder))

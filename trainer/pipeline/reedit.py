@@ -15,13 +15,13 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import pack
-from trainer.editors import Painter, make_editor
+from trainer.editors import RepaintingEditor, make_editor
 from trainer.editors.base import EditKind
 from trainer.options import TrainOptions
-from trainer.setup.training_setup import Stand, editor_settings, eight_bits, to_confine
+from trainer.setup.training_setup import TrainingSetup, confines_edit, editor_settings, quantize_image
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
-from trainer.views.view import crop, pictured
+from trainer.views.view import crop, render_view
 
 
 class Reedit:
@@ -29,16 +29,18 @@ class Reedit:
 
     Args:
         editor: paints
-        stand: scene, region and the training views with their final boxes
+        setup: scene, region and the training views with their final boxes
         every: steps between two edits, counted over all stages
         confined: put back what changes outside the region
-        log: where it is told
+        log: of the run
     """
 
-    def __init__(self, editor: Painter, stand: Stand, every: int, confined: bool, log: RunLog) -> None:
+    def __init__(
+        self, editor: RepaintingEditor, setup: TrainingSetup, every: int, confined: bool, log: RunLog
+    ) -> None:
         self._editor, self._stand, self._every, self._confined, self._log = (
             editor,
-            stand,
+            setup,
             every,
             confined,
             log,
@@ -51,23 +53,25 @@ class Reedit:
         if due <= step - local or due == self._shown:
             return None
         self._shown = due
-        stand, members = self._stand, self._stand.region.members
-        renders: list[Tensor | None] = [None] * len(stand.train)
+        setup, members = self._stand, self._stand.region.members
+        renders: list[Tensor | None] = [None] * len(setup.train)
         if due == step:
-            rows = pack(stand.scene[members], with_shN=stand.scene.sh_degree > 0) + offsets
-            scene = stand.scene.replace_rows(members, rows)
+            rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets
+            scene = setup.scene.replace_rows(members, rows)
             with torch.no_grad():
-                renders = [pictured(scene, view.camera, stand.background).clamp(0, 1) for view in stand.train]
+                renders = [
+                    render_view(scene, view.camera, setup.background).clamp(0, 1) for view in setup.train
+                ]
             self._log.say(f"step {step}: the editor looks at {len(renders)} renders again")
         targets = []
-        for view, now in zip(stand.train, renders, strict=True):
+        for view, now in zip(setup.train, renders, strict=True):
             made = self._editor.edit_again(view, strength, now, due)
-            targets.append(crop(eight_bits(view.confined(made) if self._confined else made), view.box))
+            targets.append(crop(quantize_image(view.confined(made) if self._confined else made), view.box))
         return targets
 
 
 def reedit(
-    options: TrainOptions, stand: Stand, kind: EditKind, folder: RunFolder, log: RunLog
+    options: TrainOptions, setup: TrainingSetup, kind: EditKind, folder: RunFolder, log: RunLog
 ) -> Reedit | None:
     """What --reedit-every asks for; None where it asks for nothing.
 
@@ -76,8 +80,8 @@ def reedit(
     """
     if not options.reedit_every:
         return None
-    views = [*stand.train, *stand.held_out]
-    editor = make_editor(options.editor, stand.scene, stand.region, views, editor_settings(options, folder))
-    if not isinstance(editor, Painter):
-        raise ProgdfError(f"--reedit-every means nothing to {options.editor}; leave it out")
-    return Reedit(editor, stand, options.reedit_every, to_confine(editor, options, kind), log)
+    views = [*setup.train, *setup.held_out]
+    editor = make_editor(options.editor, setup.scene, setup.region, views, editor_settings(options, folder))
+    if not isinstance(editor, RepaintingEditor):
+        raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
+    return Reedit(editor, setup, options.reedit_every, confines_edit(editor, options, kind), log)

@@ -19,11 +19,11 @@ from progdf.io.cameras import load_cameras
 from progdf.io.json_values import typed
 from progdf.region import Region
 from trainer.editors.base import EditKind
-from trainer.optimize.retime import before_fit
+from trainer.optimize.retime import undo_retiming
 from trainer.options import TrainOptions, checked_name
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 from trainer.store.run_folder import RunFolder
-from trainer.views.view import make_view, near_enough
+from trainer.views.view import make_view, with_near_plane
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class _About(msgspec.Struct):
             raise ValueError("its losses do not fit each other")
 
 
-def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
+def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
     """Open a run folder.
 
     Args:
@@ -79,24 +79,24 @@ def reopened(root: Path, scene: Path | None = None) -> FinishedRun:
         raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
-        told = typed(about, _About)
+        kept = typed(about, _About)
         options_of(about)
-        name = typed(told.options["name"], str)
+        name = typed(kept.options["name"], str)
         try:
             checked_name(name)
         except ProgdfError:
             raise ValueError("its name is none") from None
         members, score = extra["members"], extra["score"]
-        path = scene or Path(told.scene)
+        path = scene or Path(kept.scene)
         if not os.path.isfile(scene_file(path)):
-            raise ProgdfError(f"the scene {path} is gone; tell where it is with --scene")
+            raise ProgdfError(f"the scene {path} does not exist; give its path with --scene")
         gaussians = load_scene(path)
         if len(score) != len(gaussians):
             raise ProgdfError(
                 f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
                 "give that one with --scene"
             )
-        trajectory = before_fit(trajectory, extra)
+        trajectory = undo_retiming(trajectory, extra)
         region = Region(name, members, score)
         if len(region) != trajectory.end.shape[0]:
             raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")
@@ -127,13 +127,13 @@ def _path(kind: type, value: object) -> object:
     raise ValueError(f"{value!r} is no {kind.__name__}")
 
 
-def its_views(run: FinishedRun) -> Stand:
+def render_run_views(run: FinishedRun) -> TrainingSetup:
     """The run's views, rendered; their boxes hold the region, not what an edit may show beside it."""
     background = torch.tensor(run.about["background"])
     held_out = set(run.about["held_out"])
-    cameras = near_enough(load_cameras(run.folder.cameras), run.scene)
+    cameras = with_near_plane(load_cameras(run.folder.cameras), run.scene)
     views = [make_view(run.scene, run.region, camera, background) for camera in cameras]
-    return Stand(
+    return TrainingSetup(
         run.scene,
         run.region,
         [view for view in views if view.camera.name not in held_out],

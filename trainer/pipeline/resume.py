@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
 from progdf.io.json_values import decode_json, typed
 from progdf.region import Region
-from trainer.options import MOST_THREADS, TrainOptions, plain_options, settled
+from trainer.options import MOST_THREADS, TrainOptions, plain_options, resolve_options
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
 _ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
@@ -27,7 +27,7 @@ REGION = "region"
 
 
 @dataclass(frozen=True)
-class Session:
+class ResumeDecision:
     """What is to be done in a run folder.
 
     Args:
@@ -41,7 +41,7 @@ class Session:
     notes: tuple[str, ...] = ()
 
 
-def kept_region(options: TrainOptions) -> Region | None:
+def load_region(options: TrainOptions) -> Region | None:
     """The region of a stopped run that is to go on: what it was made from need not be looked at again."""
     state = RunFolder(options.out).state
     saved = state.load(REGION) if options.resume and state.identity() is not None else None
@@ -51,15 +51,15 @@ def kept_region(options: TrainOptions) -> Region | None:
         return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"])
 
 
-def open_session(
+def decide_resume(
     folder: RunFolder, options: TrainOptions, edit: Mapping[str, str], region: Region, threads: int
-) -> Session:
+) -> ResumeDecision:
     """Find out what is to be done, and make the folder ready for it.
 
     Args:
-        folder: claimed and locked
+        folder: opened and locked
         options: settled
-        edit: see `claim`
+        edit: see `open_run_folder`
         region: what may change
         threads: that the options ask for
 
@@ -69,7 +69,7 @@ def open_session(
     saved = _saved_identity(folder)
     if options.resume and saved is None and folder.report.is_file():
         _check_options(folder, _finished_options(folder), options, "leave --resume away to train anew")
-        return Session("nothing", threads)
+        return ResumeDecision("nothing", threads)
     remove_leftovers(folder)
     now = _identity(options, threads)
     if options.resume and saved is not None:
@@ -86,7 +86,7 @@ def open_session(
             notes.append(f"torch was {saved.torch} and is {now['torch']}: the last bits may differ")
         if saved.threads != threads:
             notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
-        return Session("go on", saved.threads, tuple(notes))
+        return ResumeDecision("go on", saved.threads, tuple(notes))
     if saved is not None and (step := _saved_step(folder)):
         raise ProgdfError(
             f"{folder.root} holds a run that was stopped at step {step} of {saved.options.get('steps')}; "
@@ -98,12 +98,12 @@ def open_session(
     notes = (
         ["nothing to resume was saved yet, so the run starts from the beginning"] if options.resume else []
     )
-    return Session("start", threads, tuple(notes))
+    return ResumeDecision("start", threads, tuple(notes))
 
 
-def found(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
+def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
     """What --resume would find in the folder, of a run with these very options."""
-    folder, options = RunFolder(options.out), settled(options)
+    folder, options = RunFolder(options.out), resolve_options(options)
     saved = _saved_identity(folder)
     if saved is None and not folder.report.is_file():
         return "nothing"
@@ -115,8 +115,8 @@ def found(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
 
 
 @contextmanager
-def one_line(folder: RunFolder) -> Iterator[None]:
-    """Whatever stops a run, the person is told in one line what is left and how to go on."""
+def explain_stop(folder: RunFolder) -> Iterator[None]:
+    """Say in one line what is left of a stopped run and how to go on."""
     try:
         yield
     except KeyboardInterrupt:
@@ -134,8 +134,8 @@ def one_line(folder: RunFolder) -> Iterator[None]:
 
 
 @contextmanager
-def still_there(folder: RunFolder) -> Iterator[None]:
-    """If the run's folder is removed meanwhile, that is what the person is told."""
+def check_exists(folder: RunFolder) -> Iterator[None]:
+    """Say so where the run's folder was removed meanwhile."""
     try:
         yield
     except (OSError, ProgdfError) as error:

@@ -16,22 +16,22 @@ from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.io.json_values import typed
 from progdf.scene.bounds import scene_sphere
 from trainer.editors.base import EditKind
-from trainer.fit.network import begin_alongside, keep
+from trainer.fit.network import begin_joint_training, save_network
 from trainer.optimize.color_solver import iterations, make_solver, solve
-from trainer.optimize.groups import Groups, group_stage, restored_groups, way
-from trainer.optimize.losses import Perceptual, eroded
+from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
+from trainer.optimize.losses import Perceptual, erode
 from trainer.optimize.objective import Losses, Objective, loss_table
 from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import Renewal, Snapshot, Stage, learning_rates, optimise
-from trainer.optimize.retime import record, retime, straight_recordings, with_recordings
-from trainer.optimize.settings import group_steps, loss_weights, pgs_settings, slider_meant, solves_colors
-from trainer.optimize.unseen import Followers
+from trainer.optimize.pgs import ParameterSnapshot, Renewal, TargetStage, learning_rates, optimize
+from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
+from trainer.optimize.settings import group_steps, loss_weights, pgs_settings, resolve_slider, solves_colors
+from trainer.optimize.unseen import UnseenMembers
 from trainer.optimize.view_dependence import NEEDED, view_dependence
 from trainer.options import TrainOptions
-from trainer.setup.training_setup import Pictures, Stand, probes
-from trainer.store.interrupts import held
+from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views
+from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
-from trainer.store.state import Autosave, Resumable, Saved, StateFolder
+from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder
 from trainer.views.crops import (
     COLORS,
     GEOMETRY,
@@ -50,11 +50,11 @@ _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it 
 
 
 @dataclass(frozen=True)
-class Recording:
+class SavedSnapshot:
     """A snapshot as it is kept.
 
     Args:
-        step, stage, ends_stage, means: see `Snapshot`
+        step, stage, ends_stage, means: see `ParameterSnapshot`
         offsets: of the members, in half precision. [M,C] float16
     """
 
@@ -83,13 +83,13 @@ class Recordings:
     """
 
     def __init__(self, folder: StateFolder, shape: torch.Size) -> None:
-        self.made: list[Recording] = []
+        self.made: list[SavedSnapshot] = []
         self._folder, self._shape, self._written = folder, shape, 0
 
-    def add(self, found: Snapshot) -> None:
+    def add(self, found: ParameterSnapshot) -> None:
         """Keep one."""
         offsets = found.offsets.half()
-        self.made.append(Recording(found.step, found.stage, found.ends_stage, offsets, found.means))
+        self.made.append(SavedSnapshot(found.step, found.stage, found.ends_stage, offsets, found.means))
 
     def saved(self) -> Saved:
         """How many there are; those that came since the last time are written first."""
@@ -108,36 +108,36 @@ class Recordings:
             raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
         self.made = [self._read(kept) for kept in found if kept]
 
-    def _read(self, kept: Saved) -> Recording:
+    def _read(self, kept: Saved) -> SavedSnapshot:
         values, offsets = typed(kept.values, _Values), kept.tensors["offsets"]
         if offsets.shape != self._shape or offsets.dtype != torch.float16:
             raise ValueError("a recording is of other members")
-        return Recording(values.step, values.stage, values.ends_stage, offsets, values.means)
+        return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)
 
 
-def trained(
+def optimize_members(
     options: TrainOptions,
-    stand: Stand,
+    setup: TrainingSetup,
     edited: Pictures,
     kind: EditKind,
     perceptual: Perceptual,
     folder: StateFolder,
     log: RunLog,
     renewal: Renewal | None = None,
-    followers: Followers | None = None,
+    unseen_members: UnseenMembers | None = None,
 ) -> tuple[Trajectory, Losses]:
     """Optimise the members, from the beginning or from where the saved state stands.
 
     Args:
         options: see `TrainOptions`
-        stand: scene, region, views with boxes that hold the edit
+        setup: scene, region, views with boxes that hold the edit
         edited: strength → the edited training views, whole
         kind: what the edit moves
         perceptual: distance of pictures
         folder: where the state is saved
-        log: where progress is told
+        log: of the run
         renewal: see `pgs.Renewal`
-        followers: members that take their colours from others
+        unseen_members: members that take their colours from others
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -146,24 +146,24 @@ def trained(
         ProgdfError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state is saved.
     """
-    scene, members = stand.scene, stand.region.members
-    options = _with_bands_decided(options, stand, kind, log)
+    scene, members = setup.scene, setup.region.members
+    options = _decide_bands(options, setup, kind, log)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = not moving_attributes(learning_rates(kind, original.shape[1], 1.0, options.rates)[None], GEOMETRY)
-    crops = [crop_scene(scene, members, v.camera, v.box, stand.background, still) for v in stand.train]
+    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
     steps = iterations(options.steps) if solves_colors(options, kind) else options.steps
     steps = max(steps, len(edited) + 1)  # each stage is to have one
     stages = [
-        Stage(s, [crop(p, v.box) for p, v in zip(pictures, stand.train, strict=True)], steps)
-        for (s, pictures), steps in zip(edited.items(), _shared(steps, len(edited)), strict=True)
+        TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
+        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
     ]
     groups = None
     if group_steps(options, kind):
         groups = _groups(options, original, crops, [stage.targets for stage in stages], folder, log)
-        stages = groups.staged(original, crops, stages)
+        stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
-    inside = [eroded(crop(view.mask, view.box)) for view in stand.train]
+    inside = [erode(crop(view.mask, view.box)) for view in setup.train]
     objective = Objective(perceptual, loss_weights(options, kind), inside)
     solver = None
     if solves_colors(options, kind):
@@ -171,14 +171,16 @@ def trained(
             solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
-    beside = begin_alongside(options, stand, settings.rates, stages)
+    beside = begin_joint_training(options, setup, settings.rates, stages)
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
-    kept = Autosave(folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every)
+    kept = PeriodicSave(
+        folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every
+    )
     if kept.restore():
         if beside is not None:
             beside.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"going on at step {state.step} of {steps}, with {len(recordings.made)} recordings")
-    with log.steps("optimise", steps) as advance, held() as stopped:
+    with log.steps("optimise", steps) as advance, defer_signals() as stopped:
 
         def step_done(step: int, left: float) -> None:
             if beside is not None:
@@ -190,10 +192,10 @@ def trained(
             kept.step_done()
 
         way_there = (
-            solve(original, solver, stages, state, step_done, followers)
+            solve(original, solver, stages, state, step_done, unseen_members)
             if solver is not None
-            else optimise(
-                original, crops, probes(stand), stages, objective, settings, step_done, state, renewal
+            else optimize(
+                original, crops, probe_views(setup), stages, objective, settings, step_done, state, renewal
             )
         )
         try:
@@ -209,20 +211,22 @@ def trained(
             ) from error
     kept.save()
     if beside is not None:
-        keep(beside, folder)
+        save_network(beside, folder)
     losses = loss_table([(made.step, made.means) for made in recordings.made])
     left = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
     log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
     end = stages[-1].place(state.average).clone()
-    if followers is not None and len(followers.places):
-        count = len(followers.places)
+    if unseen_members is not None and len(unseen_members.places):
+        count = len(unseen_members.places)
         if solver is not None:
             log.say(f"{count} members that no view shows follow their neighbours")
-        elif no_worse(followers, end, original, crops, stages):
-            snapshots = [(step, stage, last, followers.led(made)) for step, stage, last, made in snapshots]
-            end = followers.led(end)
+        elif no_worse(unseen_members, end, original, crops, stages):
+            snapshots = [
+                (step, stage, last, unseen_members.propagate(made)) for step, stage, last, made in snapshots
+            ]
+            end = unseen_members.propagate(end)
             log.say(f"{count} members that no view shows follow their neighbours")
         else:
             log.say(
@@ -232,16 +236,16 @@ def trained(
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
-        snapshots = way(original, groups, offsets, [made.step for made in ends], settings.snapshots)
+        snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
     return record(snapshots, end, list(edited)), losses
 
 
 def no_worse(
-    followers: Followers,
+    unseen_members: UnseenMembers,
     end: Tensor,
     original: Tensor,
     crops: Sequence[CropScene],
-    stages: Sequence[Stage],
+    stages: Sequence[TargetStage],
 ) -> bool:
     """Whether the training views stay as near to the finished edit as they are, to a hundredth."""
 
@@ -249,16 +253,16 @@ def no_worse(
         pairs = zip(render_all(crops, original + offsets, COLORS), stages[-1].targets, strict=True)
         return sum(float((picture - target).square().sum()) for picture, target in pairs)
 
-    return error(followers.led(end)) <= 1.01 * error(end)
+    return error(unseen_members.propagate(end)) <= 1.01 * error(end)
 
 
-def _with_bands_decided(options: TrainOptions, stand: Stand, kind: EditKind, log: RunLog) -> TrainOptions:
-    """`options.sh` as "on" or "off": a colour edit trains the bands where the region's own show (`sheen`)."""
-    if options.sh != "auto" or stand.scene.sh_degree == 0:
+def _decide_bands(options: TrainOptions, setup: TrainingSetup, kind: EditKind, log: RunLog) -> TrainOptions:
+    """`options.sh` as "on" or "off": a color edit trains the bands where the region's own show."""
+    if options.sh != "auto" or setup.scene.sh_degree == 0:
         return options
     if kind != "colour" or options.rates == "3dgs":
         return replace(options, sh="on")
-    change = view_dependence(stand.scene[stand.region.members], [view.camera for view in stand.train])
+    change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
     needed = change >= NEEDED
     log.say(
         f"the region's colours change with the view by {change:.3f} of 1: "
@@ -278,7 +282,7 @@ def _groups(
     """The group stage, or what was saved of it."""
     done = folder.load("groups")
     if done is not None:
-        return restored_groups(original, done.tensors)
+        return restore_groups(original, done.tensors)
     steps = group_steps(options, "geometry")
     try:
         with log.steps("move parts", steps * len(targets)) as advance:
@@ -300,11 +304,13 @@ def _groups(
     return groups
 
 
-def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions, log: RunLog) -> Trajectory:
+def retime_trajectory(
+    trajectory: Trajectory, setup: TrainingSetup, options: TrainOptions, log: RunLog
+) -> Trajectory:
     """Without jitter, and at the slider values where its change is due; every recording is rendered once."""
     moving = moving_attributes(trajectory.end)
-    small = probes(stand, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
-    rows = pack(stand.scene[stand.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    small = probe_views(setup, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
+    rows = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
     shown: list[Tensor] = []
     with log.steps("time the slider", len(trajectory)) as advance:
         for i in range(len(trajectory)):
@@ -313,12 +319,12 @@ def retimed(trajectory: Trajectory, stand: Stand, options: TrainOptions, log: Ru
             advance(i + 1, "recordings")
     if options.recording == "smooth":
         kept = straight_recordings(trajectory, shown)
-        trajectory, shown = with_recordings(trajectory, kept), [shown[i] for i in kept]
-    slider = slider_meant(options.slider, options.editor, trajectory.strengths)
+        trajectory, shown = select_recordings(trajectory, kept), [shown[i] for i in kept]
+    slider = resolve_slider(options.slider, options.editor, trajectory.strengths)
     return retime(trajectory, shown, slider)
 
 
-def _shared(steps: int, stages: int) -> list[int]:
+def _steps_by_stage(steps: int, stages: int) -> list[int]:
     """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
     marks = [steps * i // (stages + 1) for i in range(stages)]
     return [b - a for a, b in pairwise([*marks, steps])]

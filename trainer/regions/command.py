@@ -27,7 +27,7 @@ from progdf.scene.region_spec import parse_region
 from progdf.scene.subject import fitted_eye, subject_rows
 from progdf.scene.up_axis import find_up
 from trainer.options import check_ranges
-from trainer.views.view import drawn, near_enough, seen_colors
+from trainer.views.view import render_colors, seen_colors, with_near_plane
 
 from .from_pictures import RegionSettings, region_kinds
 from .options import RegionOptions
@@ -60,7 +60,7 @@ def show(options: RegionOptions) -> str:
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         settings = RegionSettings(
-            options.cameras, 30, lambda: Path(folder), options.lift, options.lift_threshold,
+            options.cameras, 30, lambda: Path(folder), options.lift_rule, options.lift_threshold,
             up=options.up, scene=options.scene, say=said.append,
         )  # fmt: skip
         region = parse_region(options.spec, scene, kinds=region_kinds(settings))
@@ -72,7 +72,7 @@ def show(options: RegionOptions) -> str:
     else:
         given = [] if options.cameras is None else load_cameras(options.cameras)
         up = find_up(scene, given, options.up).direction
-        cameras = near_enough(_cameras(options, scene, up, size), scene)
+        cameras = with_near_plane(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
     share = 100 * len(region) / max(1, len(scene))
     said.append(f"wrote {options.out}: {counted(len(region))} of {grouped(len(scene))} ({share:.3g} %)")
@@ -87,7 +87,7 @@ def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
     rows = region.members
     # a light tint of its own brightness, so that shape and shading stay readable
     shown[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * grey[rows]), _TINTED)
-    return drawn(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
+    return render_colors(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
 
 
 def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:

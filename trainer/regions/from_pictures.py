@@ -25,8 +25,16 @@ from trainer.editors.cache import KeptPictures, Recipe
 from trainer.options import VIEWS, TrainOptions
 from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
-from trainer.store.run_folder import claim
-from trainer.views.view import BACKGROUND, INSIDE, fit_size, named, near_enough, pictured, region_rig
+from trainer.store.run_folder import open_run_folder
+from trainer.views.view import (
+    BACKGROUND,
+    INSIDE,
+    fit_size,
+    name_cameras,
+    region_rig,
+    render_view,
+    with_near_plane,
+)
 
 from .lift import Rule, lift_masks
 
@@ -74,20 +82,22 @@ def region_settings(
 
     Args:
         options: settled
-        edit: see `claim`
+        edit: see `open_run_folder`
         quiet, say: see `RegionSettings`
     """
 
     def kept() -> Path:
-        return claim(options.out, edit).segmented  # nothing is written into a folder that is no run of ours
+        return open_run_folder(
+            options.out, edit
+        ).segmented  # nothing is written into a folder that is no run of ours
 
     return RegionSettings(
         options.cameras,
         options.views or VIEWS,
         kept,
-        options.lift,
+        options.lift_rule,
         options.lift_threshold,
-        SegmenterSettings(options.detector, options.outliner, options.detect_least),
+        SegmenterSettings(options.detector, options.sam_model, options.box_threshold),
         quiet,
         options.up,
         options.scene,
@@ -107,9 +117,9 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         folder, file = _mask_folder(kind, rest, settings)
         cameras = _cameras(file)
         masks = read_masks(folder, cameras, bent)
-        told = sum(mask is not None for mask in masks)
-        if settings.say is not None and told < len(masks):
-            settings.say(f"{told} of {len(masks)} cameras have a mask; the others tell nothing")
+        count = sum(mask is not None for mask in masks)
+        if settings.say is not None and count < len(masks):
+            settings.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
         return _lifted(scene, cameras, masks, f"{kind}:{rest}", settings)
 
     def from_text(rest: str, scene: Gaussians) -> Region:
@@ -117,13 +127,13 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         folder = settings.kept() / _slug(prompt)
         cameras = _segmented_cameras(scene, settings)
         masks = _segmented(scene, cameras, prompt, folder, settings)
-        found = _told(masks, prompt, settings)
+        found = _found_masks(masks, prompt, settings)
         if settings.cameras is None:
             # Around the scene a thing may be a few pixels wide: look again from where it fills the picture;
             # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
             nearer = _near_cameras(scene, _lifted(scene, cameras, found, prompt, settings), settings)
             masks = [*masks, *_segmented(scene, nearer, prompt, folder, settings)]
-            cameras, found = [*cameras, *nearer], _told(masks, prompt, settings)
+            cameras, found = [*cameras, *nearer], _found_masks(masks, prompt, settings)
         # with these the folder is one for masks:DIR, of the same region
         telling = [camera for camera, mask in zip(cameras, found, strict=True) if mask is not None]
         save_cameras(folder / "cameras.json", telling)
@@ -182,16 +192,16 @@ def _lifted(
     settings: RegionSettings,
 ) -> Region:
     """The region that the masks tell of; a view without a mask tells nothing."""
-    told = [
+    given = [
         (fit_size(c, LIFTED_AT), mask) for c, mask in zip(cameras, masks, strict=True) if mask is not None
     ]
-    small = near_enough([camera for camera, _ in told], scene)
-    scaled = [_scaled(mask, camera) for camera, mask in told]
+    small = with_near_plane([camera for camera, _ in given], scene)
+    scaled = [_scaled(mask, camera) for camera, mask in given]
     region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold, settings.say)
     if not len(region):
         raise ProgdfError(
             f"{name} selects no Gaussian by the rule {settings.rule}; its highest score is "
-            f"{float(region.score.max()):.2g}, so a lower --lift-threshold would be right"
+            f"{float(region.score.max()):.2g}, lower --lift-threshold"
         )
     return region
 
@@ -204,13 +214,13 @@ def _scaled(mask: Tensor, camera: Camera) -> Tensor:
     return torch.nn.functional.interpolate(mask.float()[None, None], size=size, mode="area")[0, 0]
 
 
-def _told(masks: Sequence[Tensor], prompt: str, settings: RegionSettings) -> list[Tensor | None]:
+def _found_masks(masks: Sequence[Tensor], prompt: str, settings: RegionSettings) -> list[Tensor | None]:
     """The masks in which the prompt was found: where it was not, it may still be."""
     found = [mask if bool(mask.any()) else None for mask in masks]
     if all(mask is None for mask in found):
         raise ProgdfError(
             f"'{prompt}' is found in none of {len(masks)} views; say it otherwise, or lower "
-            f"--detect-least (now {settings.segmenter.least:g})"
+            f"--box-threshold (now {settings.segmenter.box_threshold:g})"
         )
     return found
 
@@ -223,8 +233,8 @@ def _segmented(
     recipe: Recipe = {
         "prompt": prompt,
         "detector": chosen.detector,
-        "outliner": chosen.outliner,
-        "least": chosen.least,
+        "sam_model": chosen.sam_model,
+        "box_threshold": chosen.box_threshold,
     }
     loaded: Callable[[], Segmenter] = cache(lambda: SEGMENTERS["text"](chosen))
 
@@ -233,9 +243,9 @@ def _segmented(
 
     kept = KeptPictures(folder)
     masks = []
-    views = near_enough(cameras, scene)
+    views = with_near_plane(cameras, scene)
     for camera in track(views, description=f"segment '{prompt}'", disable=settings.quiet, transient=True):
-        picture = pictured(scene, camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
+        picture = render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
         masks.append(kept.picture(camera.name, picture, recipe, paint)[..., 0])
     return masks
 
@@ -250,7 +260,7 @@ def _segmented_cameras(scene: Gaussians, settings: RegionSettings) -> list[Camer
     up = settings.up_of(scene)
     if is_surrounding(scene, up):
         raise ProgdfError(f"the scene {INSIDE}")
-    return named(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT, up=up))
+    return name_cameras(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT, up=up))
 
 
 def _near_cameras(scene: Gaussians, region: Region, settings: RegionSettings) -> list[Camera]:
@@ -260,7 +270,7 @@ def _near_cameras(scene: Gaussians, region: Region, settings: RegionSettings) ->
 
 
 def _cameras(path: Path) -> list[Camera]:
-    return named(load_cameras(path))
+    return name_cameras(load_cameras(path))
 
 
 def _slug(prompt: str) -> str:

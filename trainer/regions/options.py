@@ -1,4 +1,4 @@
-"""What `progdf region` and `progdf views` can be told."""
+"""The options of `progdf region` and `progdf views`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RegionOptions:
     """Pixels of the picture, or of each side; a camera's own if it is one."""
     up: UpChoice = "auto"
     """The axis of the scene that is up."""
-    lift: Literal["share", "count", "paper"] = "share"
+    lift_rule: Literal["share", "count", "paper"] = "share"
     """masks, text: as for progdf train."""
     lift_threshold: float | None = None
     """masks, text: as for progdf train."""
@@ -63,7 +63,7 @@ class ViewsOptions:
     """The axis of the scene that is up."""
 
 
-def joined(argv: Sequence[str]) -> list[str]:
+def join_negative_values(argv: Sequence[str]) -> list[str]:
     """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option."""
     found: list[str] = []
     for argument in argv:

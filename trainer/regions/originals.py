@@ -17,7 +17,15 @@ from progdf.scene.region_spec import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.options import check_ranges
 from trainer.views.choose import choose_views
-from trainer.views.view import BACKGROUND, INSIDE, fit_size, named, near_enough, pictured, region_rig
+from trainer.views.view import (
+    BACKGROUND,
+    INSIDE,
+    fit_size,
+    name_cameras,
+    region_rig,
+    render_view,
+    with_near_plane,
+)
 
 from .from_pictures import RegionSettings, region_kinds
 from .options import ViewsOptions
@@ -49,12 +57,12 @@ def write(options: ViewsOptions) -> str:
         cameras = region_rig(scene, region, options.views, options.image_size, up)
     else:
         cameras = orbit_rig(scene, options.views, options.image_size, options.image_size, up=up)
-    cameras = near_enough(named(cameras), scene)
+    cameras = with_near_plane(name_cameras(cameras), scene)
     if len(cameras) > options.views:
         choice = choose_views(scene, region or everything(scene), cameras, options.views, background)
         cameras = [view.camera for view in choice.views]
     for camera in cameras:
-        write_image(out / "original" / f"{camera.name}.png", pictured(scene, camera, background))
+        write_image(out / "original" / f"{camera.name}.png", render_view(scene, camera, background))
     save_cameras(out / "cameras.json", cameras)
     return (
         f"wrote {len(cameras)} views to {out / 'original'}; draw masks (white on black) as "

@@ -20,7 +20,7 @@ _ROUNDS = 100
 _NEAR = 8  # the distance to this neighbour is the unit of the next two
 _ALONG, _OFF_PLANE = 2.0, 0.5
 _TURN = 0.18  # radians between the normals
-_COLOUR = 0.16  # sRGB, length of the difference
+_COLOR = 0.16  # sRGB, length of the difference
 _SIZE = 0.25  # natural logarithm of the three scales, length of the difference
 
 
@@ -60,7 +60,7 @@ def surface_likeness(scene: Gaussians, rows: Tensor) -> tuple[Tensor, Tensor]:
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
     """How likely each neighbour is of the same surface; sums to 1. [Q,k]"""
     unit = distances[:, min(_NEAR, distances.shape[1]) - 1, None].clamp_min(1e-12)
-    normals, colours = normals_of(scene), sh0_to_rgb(scene.sh0)
+    normals, colors = normals_of(scene), sh0_to_rgb(scene.sh0)
     sizes = scene.log_scales.sort(dim=1).values
     across = scene.means[near] - scene.means[rows, None]
     off_plane = torch.maximum(
@@ -72,7 +72,7 @@ def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -
         (distances / (_ALONG * unit)) ** 2
         + (off_plane / (_OFF_PLANE * unit)) ** 2
         + turned / _TURN**2
-        + (colours[near] - colours[rows, None]).square().sum(dim=2) / _COLOUR**2
+        + (colors[near] - colors[rows, None]).square().sum(dim=2) / _COLOR**2
         + (sizes[near] - sizes[rows, None]).square().sum(dim=2) / _SIZE**2
     )
     return torch.softmax(-0.5 * unlike, dim=1)

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from progdf.rasterize import rasterize
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
 
@@ -53,7 +53,7 @@ class Agreement:
         """Whether that is what edits that are the same from everywhere leave."""
         return self.unexplained <= _MOST_UNEXPLAINED or self.psnr >= _HARMLESS_DB
 
-    def told(self, editor: str) -> str:
+    def line(self, editor: str) -> str:
         """One line for the log, with advice where the views disagree. `editor`: its kind."""
         share = f"{100 * self.unexplained:.0f} % of the change"
         if self.agree:
@@ -108,20 +108,20 @@ class _Sight:
         return gradient
 
 
-def measured(stand: Stand, train: Sequence[Tensor], held_out: Sequence[Tensor]) -> Agreement:
+def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: Sequence[Tensor]) -> Agreement:
     """Fit one change of colour per member to the edited training views, and look at the held-out ones.
 
     Args:
-        stand: scene, region and views
+        setup: scene, region and views
         train, held_out: their edited pictures, in their order. [H,W,3] each
     """
-    members = len(stand.region.members)
-    seen = [_sight(stand, view, edited) for view, edited in zip(stand.train, train, strict=True)]
+    members = len(setup.region.members)
+    seen = [_sight(setup, view, edited) for view, edited in zip(setup.train, train, strict=True)]
     colors = _best_colors(seen, members)
     lost = change = count = 0.0
     with torch.no_grad():
-        for view, edited in zip(stand.held_out, held_out, strict=True):
-            sight = _sight(stand, view, edited)
+        for view, edited in zip(setup.held_out, held_out, strict=True):
+            sight = _sight(setup, view, edited)
             lost += float((sight.change - sight.shown(colors)).square().sum())
             change += float(sight.change.square().sum())
             count += 3 * float(sight.counts.sum())
@@ -156,7 +156,7 @@ def _best_colors(seen: Sequence[_Sight], members: int) -> Tensor:
     return colors
 
 
-def _sight(stand: Stand, view: View, edited: Tensor) -> _Sight:
+def _sight(setup: TrainingSetup, view: View, edited: Tensor) -> _Sight:
     camera = view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2))
     x0, y0, x1, y1 = view.box
     box = (x0 // 2, y0 // 2, min(camera.width, -(-x1 // 2)), min(camera.height, -(-y1 // 2)))
@@ -169,5 +169,5 @@ def _sight(stand: Stand, view: View, edited: Tensor) -> _Sight:
     change = edited - view.image
     counts = (view.mask > 0.05) | (change.abs().amax(dim=2) > 2 / 255)
     counting = (small(counts.float()[..., None]) > 0.5).float()
-    scene = crop_scene(stand.scene, stand.region.members, camera, box, stand.background)
+    scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
     return _Sight(scene, small(change) * counting, counting)

@@ -15,7 +15,7 @@ from progdf.field.evaluate import sample_strengths
 from progdf.field.remap import Dial
 from progdf.field.trajectory import Trajectory
 from progdf.metrics.slider import SliderStatistics, slider_statistics
-from trainer.fit.evaluate import Judge
+from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
 from trainer.views.view import View
@@ -31,7 +31,7 @@ CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
 
 
 @dataclass(frozen=True)
-class Course:
+class ErrorCurve:
     """Errors of pictures along the slider, over all held-out views.
 
     Args:
@@ -96,14 +96,14 @@ class Measured:
     asked: Sequence[tuple[float, float]]
     slider: SliderStatistics
     at_recordings: float
-    trajectory: Mapping[str, Course]
-    editor: Mapping[str, Course]
+    trajectory: Mapping[str, ErrorCurve]
+    editor: Mapping[str, ErrorCurve]
     perceptual: str
     clip: Direction
 
 
 def measure(
-    judge: Judge,
+    evaluator: Evaluator,
     trajectory: Trajectory,
     fitted: Fitted,
     shown: BakedField,
@@ -114,7 +114,7 @@ def measure(
     """Measure the chosen field beside the compared baseline.
 
     Args:
-        judge: held-out views
+        evaluator: held-out views
         trajectory: what was recorded
         fitted: the field and its baselines
         shown: the field as it is shipped
@@ -124,15 +124,18 @@ def measure(
     """
     field = fitted.chosen.field
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
-    slider = slider_statistics(lambda s: judge.pictures(shown.offsets(s)), masks=judge.pixels)
+    slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
-    recorded = courses(judge, fields, samples, lambda s: judge.pictures(trajectory.at(s)), perceptual)
+    recorded = courses(evaluator, fields, samples, lambda s: evaluator.pictures(trajectory.at(s)), perceptual)
     recorded = {n: replace(c, s=tuple(dial.at(s) for s in c.s)) for n, c in recorded.items()}
     asked = tuple((dial.at(s), strength) for s, strength in trajectory.asked)
-    drawn = against_editor(judge, {**fields, "slider": shown}, asked, perceptual)
+    drawn = against_editor(evaluator, {**fields, "slider": shown}, asked, perceptual)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
-        (judge.psnr(judge.pictures(field.offsets(s)), judge.pictures(trajectory.at(s))) for s in nodes),
+        (
+            evaluator.psnr(evaluator.pictures(field.offsets(s)), evaluator.pictures(trajectory.at(s)))
+            for s in nodes
+        ),
         default=fitted.chosen.worst,
     )
     return Measured(fitted, shown, dial, asked, slider, worst, recorded, drawn, perceptual.name, clip)
@@ -143,11 +146,11 @@ def expected_measures(trajectory: Trajectory) -> int:
     return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
 
 
-def clip_course(judge: Judge, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
+def clip_course(evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
     """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
 
     Args:
-        judge: held-out views
+        evaluator: held-out views
         views: the same, whole
         field: what the slider shows
         texts: see `Texts`
@@ -164,7 +167,9 @@ def clip_course(judge: Judge, views: Sequence[View], field: BakedField, texts: T
         return Direction(reason="--text-before and --text-after say the same to CLIP")
     original = clip.pictures([view.image for view in views])
     course = [
-        _mean(direction(original, _seen(clip, judge, views, field.offsets(s)), before, after)) if s else None
+        _mean(direction(original, _seen(clip, evaluator, views, field.offsets(s)), before, after))
+        if s
+        else None
         for s in CLIP_STRENGTHS
     ]
     return Direction(CLIP_STRENGTHS, tuple(course), clip.name)
@@ -227,16 +232,16 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
 
 
 def courses(
-    judge: Judge,
+    evaluator: Evaluator,
     fields: Mapping[str, BakedField],
     strengths: Sequence[float],
     truth: Callable[[float], Sequence[Tensor]],
     perceptual: Perceptual,
-) -> dict[str, Course]:
+) -> dict[str, ErrorCurve]:
     """Each field's errors on held-out views, over the slider.
 
     Args:
-        judge: the views
+        evaluator: the views
         fields: by name
         strengths: slider values, ascending
         truth: what the pictures should be at one of them. -> [h,w,3] each
@@ -246,43 +251,43 @@ def courses(
     for s in strengths:
         expected = truth(s)
         for name, field in fields.items():
-            found = judge.pictures(field.offsets(s))
+            found = evaluator.pictures(field.offsets(s))
             rows[name].append(
                 (
-                    judge.psnr(found, expected),
-                    judge.ssim(found, expected),
-                    judge.perceptual(found, expected, perceptual, "measured"),
+                    evaluator.psnr(found, expected),
+                    evaluator.ssim(found, expected),
+                    evaluator.perceptual(found, expected, perceptual, "measured"),
                 )
             )
         perceptual.forget()
     return {
-        name: Course(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
+        name: ErrorCurve(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
         for name, found in rows.items()
     }
 
 
 def against_editor(
-    judge: Judge,
+    evaluator: Evaluator,
     fields: Mapping[str, BakedField],
     asked: Sequence[tuple[float, float]],
     perceptual: Perceptual,
-) -> dict[str, Course]:
+) -> dict[str, ErrorCurve]:
     """Each field's errors against the editor's own pictures.
 
     Args:
-        judge: held-out views with these pictures
+        evaluator: held-out views with these pictures
         fields: by name
         asked: slider value and the strength that the editor was asked at, ascending
         perceptual: LPIPS, or its stand-in
     """
     strength = dict(asked)
-    return courses(judge, fields, tuple(strength), lambda s: judge.edited[strength[s]], perceptual)
+    return courses(evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual)
 
 
-def _seen(clip: Clip, judge: Judge, views: Sequence[View], offsets: Tensor) -> Tensor:
+def _seen(clip: Clip, evaluator: Evaluator, views: Sequence[View], offsets: Tensor) -> Tensor:
     """CLIP's features of the whole views with these offsets. [n,D]"""
     whole = []
-    for view, scene, picture in zip(views, judge.crops, judge.pictures(offsets), strict=True):
+    for view, scene, picture in zip(views, evaluator.crops, evaluator.pictures(offsets), strict=True):
         x0, y0, x1, y1 = scene.box
         image = view.image.clone()
         image[y0:y1, x0:x1] = picture
@@ -295,7 +300,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return _four(sum(known) / len(known)) if known else None
 
 
-def _listed(course: Course) -> dict[str, list[float]]:
+def _listed(course: ErrorCurve) -> dict[str, list[float]]:
     return {
         "s": [_four(s) for s in course.s],
         "psnr": [round(value, 2) for value in course.psnr],

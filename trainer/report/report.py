@@ -12,10 +12,10 @@ from torch import Tensor
 from progdf.field import BakedField
 from progdf.field.evaluate import sample_strengths
 from progdf.io.images import contact_sheet, to_picture
-from trainer.fit.evaluate import Judge
+from trainer.fit.evaluate import Evaluator
 from trainer.optimize.objective import Losses
 
-from .measures import COMPARED, Course, Direction, Measured
+from .measures import COMPARED, Direction, ErrorCurve, Measured
 from .plots import PAPER, Plot, Points, draw_plot
 
 SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -29,11 +29,11 @@ _THUMBNAIL, _PLOT_HEIGHT = 240, 270
 _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
 
-def report_picture(judge: Judge, measured: Measured, losses: Losses, title: str) -> Tensor:
+def report_picture(evaluator: Evaluator, measured: Measured, losses: Losses, title: str) -> Tensor:
     """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
 
     Args:
-        judge: held-out views; the one that shows most of the region is pictured
+        evaluator: held-out views; the one that shows most of the region is shown
         measured: see `Measured`
         losses: mean of every loss term per recording
         title: one line
@@ -42,24 +42,28 @@ def report_picture(judge: Judge, measured: Measured, losses: Losses, title: str)
     columns = columns_of(measured.asked)
     sheet = to_picture(
         contact_sheet(
-            [strip(judge, chosen, columns), editor_strip(judge, columns), strip(judge, linear, columns)],
+            [
+                strip(evaluator, chosen, columns),
+                editor_strip(evaluator, columns),
+                strip(evaluator, linear, columns),
+            ],
             ["slider", "the editor", "2 keyframes"],
-            [headed(*column) for column in columns],
+            [column_heading(*column) for column in columns],
             title,
-            f"held-out view {judge.names[best_view(judge)]}"
+            f"held-out view {evaluator.names[best_view(evaluator)]}"
             + ("; grey: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
     rows = [_against_trajectory(measured)]
-    if len(judge.edited) > 1:
+    if len(evaluator.edited) > 1:
         rows.append(_against_editor(measured))
     rows.append(_feel(measured, losses))
     return _stacked(sheet, rows)
 
 
-def best_view(judge: Judge) -> int:
+def best_view(evaluator: Evaluator) -> int:
     """The view that shows most of the region."""
-    return max(range(len(judge.pixels)), key=lambda i: int(judge.pixels[i].sum()))
+    return max(range(len(evaluator.pixels)), key=lambda i: int(evaluator.pixels[i].sum()))
 
 
 def columns_of(asked: Sequence[tuple[float, float]]) -> Columns:
@@ -75,18 +79,18 @@ def columns_of(asked: Sequence[tuple[float, float]]) -> Columns:
     return columns
 
 
-def strip(judge: Judge, field: BakedField, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
+def strip(evaluator: Evaluator, field: BakedField, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
     """The best view at five strengths, as thumbnails of one size."""
-    best = best_view(judge)
-    return [thumbnail(judge.picture(field.offsets(s), best), width) for s, _ in columns]
+    best = best_view(evaluator)
+    return [thumbnail(evaluator.picture(field.offsets(s), best), width) for s, _ in columns]
 
 
-def editor_strip(judge: Judge, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
+def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
     """What the editor makes of the best view; grey where it was not asked."""
-    best = best_view(judge)
-    blank = torch.full((*judge.crops[best].size, 3), 0.94)
-    original = judge.crops[best].original().clamp(0, 1)
-    own = [original, *(blank if at is None else judge.edited[at][best] for _, at in columns[1:])]
+    best = best_view(evaluator)
+    blank = torch.full((*evaluator.crops[best].size, 3), 0.94)
+    original = evaluator.crops[best].original().clamp(0, 1)
+    own = [original, *(blank if at is None else evaluator.edited[at][best] for _, at in columns[1:])]
     return [thumbnail(image, width) for image in own]
 
 
@@ -184,7 +188,9 @@ def _clip(found: Direction) -> Plot:
     return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0, span=_SPAN)
 
 
-def _lines(courses: Mapping[str, Course], value: Callable[[Course], Sequence[float]]) -> dict[str, Points]:
+def _lines(
+    courses: Mapping[str, ErrorCurve], value: Callable[[ErrorCurve], Sequence[float]]
+) -> dict[str, Points]:
     return {_words(name): (course.s, value(course)) for name, course in courses.items()}
 
 
@@ -192,7 +198,7 @@ def _distance(measured: Measured) -> str:
     return "LPIPS" if measured.perceptual.startswith("lpips") else measured.perceptual
 
 
-def headed(s: float, asked: float | None) -> str:
+def column_heading(s: float, asked: float | None) -> str:
     """What stands above a column; the editor's strength where it is another number."""
     own = "" if asked is None or abs(asked - s) < 5e-3 else f", editor {asked:.2g}"
     return f"s = {round(s, 2):g}{own}"

@@ -1,4 +1,4 @@
-"""The one thing a segmenter must do, and what it can be told."""
+"""What a segmenter must do, and its settings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from trainer.options import DETECTOR, OUTLINER
+from trainer.options import DETECTOR, SAM_MODEL
 
 
 @dataclass(frozen=True)
@@ -16,13 +16,13 @@ class SegmenterSettings:
 
     Args:
         detector: id on the Hugging Face hub, downloaded before, or folder of a saved GroundingDINO
-        outliner: the same of a SAM
-        least: confidence of a find, 0..1
+        sam_model: the same of a SAM
+        box_threshold: confidence of a find, 0..1
     """
 
     detector: str = DETECTOR
-    outliner: str = OUTLINER
-    least: float = 0.3
+    sam_model: str = SAM_MODEL
+    box_threshold: float = 0.3
 
 
 class Segmenter(Protocol):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
-from trainer.options import DETECTOR, OUTLINER
+from trainer.options import DETECTOR, SAM_MODEL
 from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
 
 from .base import SegmenterSettings
@@ -27,15 +27,15 @@ class GroundedSam:
 
     Args:
         detector, detector_processor: `GroundingDinoForObjectDetection`, `GroundingDinoProcessor`
-        outliner, outliner_processor: `SamModel`, `SamProcessor`
-        least: confidence of a find, 0..1
+        sam_model, sam_processor: `SamModel`, `SamProcessor`
+        box_threshold: confidence of a find, 0..1
     """
 
     detector: Any
     detector_processor: Any
-    outliner: Any
-    outliner_processor: Any
-    least: float
+    sam_model: Any
+    sam_processor: Any
+    box_threshold: float
 
     def __call__(self, image: Tensor, prompt: str) -> Tensor:
         """See `Segmenter`: the union of the outlines of all that is found."""
@@ -43,12 +43,12 @@ class GroundedSam:
         boxes = self.boxes(picture, prompt)
         if not len(boxes):
             return torch.zeros(image.shape[:2], dtype=torch.bool)
-        inputs = self.outliner_processor(images=picture, input_boxes=[boxes.tolist()], return_tensors="pt")
+        inputs = self.sam_processor(images=picture, input_boxes=[boxes.tolist()], return_tensors="pt")
         with torch.no_grad():
-            found = self.outliner(
+            found = self.sam_model(
                 pixel_values=inputs["pixel_values"], input_boxes=inputs["input_boxes"], multimask_output=False
             )
-        masks: Tensor = self.outliner_processor.post_process_masks(
+        masks: Tensor = self.sam_processor.post_process_masks(
             found.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"]
         )[0]
         return masks.bool().flatten(0, 1).any(dim=0)
@@ -61,8 +61,8 @@ class GroundedSam:
         found = self.detector_processor.post_process_grounded_object_detection(
             answer,
             inputs["input_ids"],
-            threshold=self.least,
-            text_threshold=self.least,
+            threshold=self.box_threshold,
+            text_threshold=self.box_threshold,
             target_sizes=[(picture.height, picture.width)],
         )[0]
         boxes: Tensor = found["boxes"].float()
@@ -118,8 +118,8 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
         GroundingDinoForObjectDetection,
         GroundingDinoProcessor,
     )
-    outliner = loaded(settings.outliner, "sam", "--outliner", OUTLINER, SamModel, SamProcessor)
-    return GroundedSam(*finder, *outliner, settings.least)
+    sam_model = loaded(settings.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
+    return GroundedSam(*finder, *sam_model, settings.box_threshold)
 
 
 def check_grounded_sam(settings: SegmenterSettings) -> None:
@@ -134,7 +134,7 @@ def check_grounded_sam(settings: SegmenterSettings) -> None:
         raise _without_transformers(error) from error
     for model, kind, option, usual in (
         (settings.detector, "grounding-dino", "--detector", DETECTOR),
-        (settings.outliner, "sam", "--outliner", OUTLINER),
+        (settings.sam_model, "sam", "--sam-model", SAM_MODEL),
     ):
         try:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)

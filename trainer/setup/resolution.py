@@ -23,7 +23,7 @@ _WELCOME, _BEARABLE = 0.3, 0.5
 _LOOK, _LOOKS = 96, 4  # pixels of the views in which members are measured, and how many
 
 
-def unresolved(
+def unresolved_share(
     scene: Gaussians, region: Region, cameras: Sequence[Camera], image_size: int, views: int
 ) -> float:
     """Share of the visible members that get less than a pixel, in so many views of that size together. 0..1
@@ -46,7 +46,7 @@ def unresolved(
     return float((shown[visible] < 1.0).float().mean()) if bool(visible.any()) else 0.0
 
 
-def sized(
+def choose_resolution(
     options: TrainOptions,
     scene: Gaussians,
     region: Region,
@@ -72,7 +72,7 @@ def sized(
     for size, views in tried:
         cameras = cameras_of(size, views)
         count = min(views, len(cameras)) * 4 // 5  # every fifth is held out
-        share = unresolved(scene, region, cameras, size, count)
+        share = unresolved_share(scene, region, cameras, size, count)
         if share <= _WELCOME:
             break
     line = (

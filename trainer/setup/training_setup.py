@@ -20,16 +20,16 @@ from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up
 from trainer.editors import EditorSettings, ImageEditor
 from trainer.editors.base import EditKind
-from trainer.editors.procedural import ColourEditor
+from trainer.editors.procedural import ColorEditor
 from trainer.options import TrainOptions
 from trainer.store.picture_list import add_pictures
 from trainer.store.progress import Advance
 from trainer.store.run_folder import RunFolder
 from trainer.views.choose import choose_views, split_views
 from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import BACKGROUND, INSIDE, View, fit_size, named, near_enough, region_rig
+from trainer.views.view import BACKGROUND, INSIDE, View, fit_size, name_cameras, region_rig, with_near_plane
 
-from .resolution import sized
+from .resolution import choose_resolution
 
 _PROBES = 3
 
@@ -38,7 +38,7 @@ Pictures = Mapping[float, Sequence[Tensor]]
 
 
 @dataclass(frozen=True)
-class Stand:
+class TrainingSetup:
     """The scene, the region, the views on it, and what is to be said of these."""
 
     scene: Gaussians
@@ -50,7 +50,7 @@ class Stand:
     up: UpAxis | None = None
 
 
-def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand:
+def make_training_setup(options: TrainOptions, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: the best of the given cameras, or of a rig that looks at the region.
 
     Raises:
@@ -67,9 +67,9 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
             found = [fit_size(camera, image_size) for camera in given]
         else:  # half as many again, as some will find the region hidden
             found = region_rig(scene, region, views + views // 2, image_size, up.direction)
-        return near_enough(named(found), scene)
+        return with_near_plane(name_cameras(found), scene)
 
-    cameras, views, unresolved = sized(options, scene, region, cameras_of)
+    cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [f"up is {up.name}, {up.reason}"]
@@ -80,10 +80,10 @@ def make_stand(options: TrainOptions, scene: Gaussians, region: Region) -> Stand
             "the cameras have lenses that bend photographs, the views here are straight: "
             "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
         )
-    return Stand(scene, region, train, held_out, background, notes, up)
+    return TrainingSetup(scene, region, train, held_out, background, notes, up)
 
 
-def strengths_to_ask(editor: ImageEditor, stages: int) -> tuple[float, ...]:
+def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
     """What the editor is asked for: its own strengths, or `stages` even ones where any will do."""
     return editor.stages or tuple((i + 1) / stages for i in range(stages))
 
@@ -103,13 +103,13 @@ def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
     )
 
 
-def to_confine(editor: ImageEditor, options: TrainOptions, kind: EditKind) -> bool:
+def confines_edit(editor: ImageEditor, options: TrainOptions, kind: EditKind) -> bool:
     """Whether what the editor changed outside the region is to be put back."""
     wanted = kind != "geometry" if options.confine == "auto" else options.confine == "yes"
     return wanted and not editor.confined
 
 
-def edited_views(
+def edit_views(
     editor: ImageEditor,
     views: Sequence[View],
     strengths: Sequence[float],
@@ -134,7 +134,7 @@ def edited_views(
     def edit(asked: tuple[float, int]) -> Tensor:
         strength, i = asked
         made = editor.edit(views[i], strength)
-        picture = eight_bits(views[i].confined(made) if confined else made)
+        picture = quantize_image(views[i].confined(made) if confined else made)
         write_image(paths[strength][i], picture)
         return picture
 
@@ -143,7 +143,7 @@ def edited_views(
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
     with ThreadPoolExecutor(threads()) as pool:
         # the others have a network, or draw: these use all cores by themselves
-        made = pool.map(edit, asked) if isinstance(editor, ColourEditor) else map(edit, asked)
+        made = pool.map(edit, asked) if isinstance(editor, ColorEditor) else map(edit, asked)
         try:
             for done, ((strength, _), picture) in enumerate(zip(asked, made, strict=True), 1):
                 edited[strength].append(picture)
@@ -154,30 +154,28 @@ def edited_views(
     return edited
 
 
-def widened(stand: Stand, edited: Pictures) -> Stand:
+def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
     """The training views with boxes that hold all that the edit changes."""
-    views = [
-        view.widened([pictures[i] for pictures in edited.values()]) for i, view in enumerate(stand.train)
-    ]
-    return replace(stand, train=views)
+    views = [view.widen([pictures[i] for pictures in edited.values()]) for i, view in enumerate(setup.train)]
+    return replace(setup, train=views)
 
 
-def probes(stand: Stand, count: int = _PROBES, still: bool = False) -> list[CropScene]:
+def probe_views(setup: TrainingSetup, count: int = _PROBES, still: bool = False) -> list[CropScene]:
     """A few training views at half size, in which movement is measured. `still`: see `crop_scene`"""
-    chosen = stand.train[:: max(1, len(stand.train) // count)][:count]
+    chosen = setup.train[:: max(1, len(setup.train) // count)][:count]
     return [
         crop_scene(
-            stand.scene,
-            stand.region.members,
+            setup.scene,
+            setup.region.members,
             view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
             (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
-            stand.background,
+            setup.background,
             still,
         )
         for view in chosen
     ]
 
 
-def eight_bits(image: Tensor) -> Tensor:
+def quantize_image(image: Tensor) -> Tensor:
     """What is left of an image in an 8-bit file. [H,W,3] -> [H,W,3]"""
     return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0

@@ -15,18 +15,18 @@ _ENDINGS = (signal.SIGTERM, signal.SIGHUP) if sys.platform != "win32" else (sign
 
 
 @contextmanager
-def stopping() -> Iterator[None]:
+def interrupt_on_signals() -> Iterator[None]:
     """SIGTERM and SIGHUP are a KeyboardInterrupt too, so that all end in the same way."""
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise KeyboardInterrupt
 
-    with _handled(_ENDINGS, stop):
+    with _handle_signals(_ENDINGS, stop):
         yield
 
 
 @contextmanager
-def held() -> Iterator[Callable[[], bool]]:
+def defer_signals() -> Iterator[Callable[[], bool]]:
     """Hold Ctrl-C, SIGTERM and SIGHUP back; the yielded function tells whether one came.
 
     Ask it where the state is whole, save, and raise KeyboardInterrupt. A second signal does not wait, and
@@ -40,14 +40,14 @@ def held() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         came = True
 
-    with _handled((signal.SIGINT, *_ENDINGS), note):
+    with _handle_signals((signal.SIGINT, *_ENDINGS), note):
         yield lambda: came
     if came:
         raise KeyboardInterrupt
 
 
 @contextmanager
-def _handled(
+def _handle_signals(
     signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
 ) -> Iterator[None]:
     """Python lets only the main thread handle signals; elsewhere whoever owns that thread does."""

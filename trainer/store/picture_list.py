@@ -14,7 +14,7 @@ from progdf.io.atomic import written_whole
 NAME = "pictures.txt"
 
 
-def listed(folder: Path) -> list[str]:
+def read_list(folder: Path) -> list[str]:
     """The lines of the folder's list."""
     try:
         return (folder / NAME).read_text(encoding="utf-8").splitlines()
@@ -24,7 +24,7 @@ def listed(folder: Path) -> list[str]:
 
 def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
     """Put files in the folder on its list."""
-    lines = listed(folder)
+    lines = read_list(folder)
     new = dict.fromkeys(path.relative_to(folder).as_posix() for path in paths)
     if added := [line for line in new if line not in set(lines)]:
         _write(folder, [*lines, *added])
@@ -33,13 +33,13 @@ def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
 def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
     """Delete the listed files that are not of one of these views; nothing behind a link is touched."""
     kept = []
-    for line in listed(folder):
+    for line in read_list(folder):
         path = folder / line
         if path.stem in views or not _is_inside(folder, line):
             kept.append(line)
         elif os.path.isfile(path):  # pathlib's raises where a name is too long
             path.unlink()
-    if listed(folder) != kept:
+    if read_list(folder) != kept:
         _write(folder, kept)
 
 

@@ -128,7 +128,7 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
     return folder
 
 
-def claim(root: Path, edit: Mapping[str, str]) -> RunFolder:
+def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
     """Make the run's folder, or take over that of an earlier run of the same edit; see `check_folder`."""
     folder = check_folder(root, edit)
     try:
@@ -147,7 +147,7 @@ def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: RunFolder) -> Iterator[None]:
+def lock_folder(folder: RunFolder) -> Iterator[None]:
     """Nobody else trains in this folder meanwhile; the system lets go when the process ends, however.
 
     Raises:

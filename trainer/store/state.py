@@ -50,9 +50,9 @@ class Resumable(Protocol):
     """Something that trains for many steps and can be stopped between any two.
 
     The members' optimisation is one (`descent.PgsState`). Whatever trains beside it, such as a field fitted
-    alongside, implements these two and is given to `Autosave` under a name of its own: all members of one
-    `Autosave` go into one file, so that they are always of the same step. What they hold must decide every
-    later bit: parameters, both Adam moments and the step count, and the state of every random generator,
+    jointly, implements these two and is given to `PeriodicSave` under a name of its own: all members of
+    one `PeriodicSave` go into one file, so that they are always of the same step. What they hold must decide
+    every later bit: parameters, Adam moments and the step count, and the state of every random generator,
     which is a uint8 tensor as `Generator.get_state()` gives it. What can be computed again from the run's
     inputs and the recordings stays out. Dropout and the like must draw from a generator of their own.
     """
@@ -166,7 +166,7 @@ class StateFolder:
         return self.path / (f"{part}.safetensors" if index is None else f"{part}/{index:06d}.safetensors")
 
 
-class Autosave:
+class PeriodicSave:
     """Saves what trains together, in one file, every so often.
 
     Args:

@@ -22,7 +22,7 @@ from progdf.rasterize import alpha_weights
 from progdf.region import Region
 
 from .view import View, fit_size, make_view
-from .visible_area import covered_areas
+from .visible_area import visible_area
 
 _SAMPLES = 256
 """Members that stand for the region when views are compared."""
@@ -176,7 +176,7 @@ def _reach(count: int) -> float:
 
 def _sampled(scene: Gaussians, region: Region) -> Tensor:
     """Rows that stand for the region, evenly by the area they can cover. -> [S] int64"""
-    total = covered_areas(scene[region.members]).cumsum(dim=0)
+    total = visible_area(scene[region.members]).cumsum(dim=0)
     ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
     picked = torch.searchsorted(total, ticks).clamp_max(len(total) - 1)
     return region.members[torch.unique_consecutive(picked)]

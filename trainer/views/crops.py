@@ -23,7 +23,7 @@ from progdf.rasterize.cpu.parallel import threads
 from progdf.sh import C0, basis
 
 from .clamp import clamp_towards
-from .tiles import live_pixels, live_tiles, reaching
+from .tiles import live_pixels, live_tiles, may_reach
 from .view import seen_colors
 
 
@@ -230,7 +230,7 @@ def _live(view: CropScene) -> CropScene:
     live = live_tiles((share > 0).any(dim=2), view.box)
     if bool(live_pixels(live, view.box).all()):
         return view
-    kept = reaching(view.means, view.scales, view.camera, live)
+    kept = may_reach(view.means, view.scales, view.camera, live)
     kept[view.rows] = True
     index = kept.nonzero()[:, 0]
     return replace(

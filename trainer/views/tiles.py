@@ -48,7 +48,7 @@ def live_pixels(live: Tensor, box: Crop) -> Tensor:
     return live.repeat_interleave(TILE_H, dim=0).repeat_interleave(TILE_W, dim=1)[y0:y1, x0:x1]
 
 
-def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Tensor:
+def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Tensor:
     """Which Gaussians may reach into a live tile; too many rather than too few.
 
     The bound: the largest axis, through the Jacobian of the projection at the place where the rasteriser
@@ -68,7 +68,7 @@ def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Ten
     focal = torch.stack([K[0, 0], K[1, 1]])
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     slope = seen[:, :2] / z[:, None]
-    centre = slope * focal + K[:2, 2]
+    center = slope * focal + K[:2, 2]
     # at least as far out as the rasteriser's clamp, which leaves 0.15 of the picture beyond each edge
     most = torch.maximum(K[:2, 2], size - K[:2, 2]) / focal + 0.2 * size / focal
     widened = 1 + slope.abs().minimum(most).square().sum(dim=1)
@@ -77,8 +77,8 @@ def reaching(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Ten
     rows, columns = live.shape
     step = torch.tensor([TILE_W, TILE_H], dtype=torch.float64)
     last = torch.tensor([columns, rows])
-    low = ((centre - radius[:, None]) / step).floor().clamp(min=0).minimum(last).nan_to_num(0.0).long()
-    high = ((centre + radius[:, None]) / step).floor().clamp(min=-1).minimum(last - 1).nan_to_num(
+    low = ((center - radius[:, None]) / step).floor().clamp(min=0).minimum(last).nan_to_num(0.0).long()
+    high = ((center + radius[:, None]) / step).floor().clamp(min=-1).minimum(last - 1).nan_to_num(
         0.0
     ).long() + 1
     sums = torch.zeros(rows + 1, columns + 1, dtype=torch.int64)

@@ -1,4 +1,4 @@
-"""The views an edit is trained on and judged by: where the cameras stand, where the region lies in each."""
+"""The views an edit is trained on and evaluated in: their cameras, and the region in each."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class View:
         """
         return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
-    def widened(self, edited: Sequence[Tensor]) -> View:
+    def widen(self, edited: Sequence[Tensor]) -> View:
         """The view with its box grown to all that these pictures of it change visibly."""
         changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
         return replace(self, box=region_box(torch.maximum(self.mask, (changed > _CHANGED).float())))
@@ -87,9 +87,9 @@ def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tens
     member = torch.zeros(len(scene), 1)
     member[region.members] = 1.0
     black = torch.zeros(3)
-    image = drawn(scene, colors, camera, background).clamp(0.0, 1.0)
-    mask = drawn(scene, member.expand(-1, 3).contiguous(), camera, black)[..., 0].clamp(0.0, 1.0)
-    inside = drawn(scene, colors * member, camera, black) / mask.clamp_min(1e-4)[..., None]
+    image = render_colors(scene, colors, camera, background).clamp(0.0, 1.0)
+    mask = render_colors(scene, member.expand(-1, 3).contiguous(), camera, black)[..., 0].clamp(0.0, 1.0)
+    inside = render_colors(scene, colors * member, camera, black) / mask.clamp_min(1e-4)[..., None]
     return View(camera, image, mask, inside.clamp(0.0, 1.0), region_box(mask))
 
 
@@ -99,7 +99,7 @@ def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
     return shade(min(scene.sh_degree, 3), directions, scene.sh)
 
 
-def drawn(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
+def render_colors(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
     """The scene in these colours instead of its own, without gradients. [N,3] -> [H,W,3]"""
     with torch.no_grad():
         image: Tensor = rasterize(
@@ -119,9 +119,9 @@ def drawn(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) 
     return image
 
 
-def pictured(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
+def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
     """The scene as it is seen from there, without gradients. [H,W,3]"""
-    return drawn(scene, seen_colors(scene, camera), camera, background)
+    return render_colors(scene, seen_colors(scene, camera), camera, background)
 
 
 def region_box(mask: Tensor, margin: int = 6) -> Crop:
@@ -160,19 +160,19 @@ def region_rig(
         up: world direction that is up, [3]; None guesses it
     """
     up = guess_up(scene) if up is None else up
-    centre, radius = scene_sphere(scene[region.members])
+    center, radius = scene_sphere(scene[region.members])
     radius += float(scene.scales[region.members].amax(dim=1).median())
     cameras = []
     for i, camera in enumerate(orbit_rig(scene, count, image_size, image_size, up=up)):
-        distance = float((camera.position - centre).norm())
+        distance = float((camera.position - center).norm())
         share = 0.8 if i % 2 == 0 else 0.5
         fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
-        aimed = look_at(camera.position, centre, up)
+        aimed = look_at(camera.position, center, up)
         cameras.append(replace(camera, viewmat=aimed, K=intrinsics(fov, image_size, image_size)))
     return cameras
 
 
-def near_enough(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
+def with_near_plane(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
     """The cameras with a near plane for the size of the scene: a tiny one would vanish before a fixed one."""
     near = near_plane(scene_sphere(scene)[1])
     return [replace(camera, near=near) for camera in cameras]
@@ -186,7 +186,7 @@ def fit_size(camera: Camera, image_size: int) -> Camera:
     return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
-def named(cameras: Sequence[Camera]) -> list[Camera]:
+def name_cameras(cameras: Sequence[Camera]) -> list[Camera]:
     """The cameras with names that are distinct and can be file names."""
     taken: set[str] = set()
     result = []

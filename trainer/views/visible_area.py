@@ -10,7 +10,7 @@ _GIANT = 20.0
 """Times the mean area at which one Gaussian counts no more."""
 
 
-def covered_areas(gaussians: Gaussians) -> Tensor:
+def visible_area(gaussians: Gaussians) -> Tensor:
     """Opacity times the two longer axes, cut off so that no giant speaks for all. [N] float64"""
     _, middle, long = gaussians.scales.sort(dim=1).values.double().unbind(1)
     areas = gaussians.opacities.double() * middle * long

@@ -38,7 +38,7 @@ def test_strength_zero_is_the_original_view_bit_for_bit(spec: str) -> None:
 
 
 @pytest.mark.parametrize("spec", PROCEDURAL)
-def test_pixels_that_do_not_show_the_region_keep_their_colour(spec: str) -> None:
+def test_pixels_that_do_not_show_the_region_keep_their_color(spec: str) -> None:
     case = small()
     view = case.views[0]
     edited = make_editor(spec, case.scene, case.region, case.views).edit(view, 1.0)

@@ -16,7 +16,7 @@ from trainer.editors import EditorSettings, make_editor
 from trainer.editors.base import Confine, EditKind
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor, mixed
-from trainer.setup.training_setup import to_confine
+from trainer.setup.training_setup import confines_edit
 
 
 def crispness(image: Tensor) -> float:
@@ -221,4 +221,4 @@ def test_what_changed_outside_is_put_back_unless_parts_move_or_the_user_says(
     spec = f"folder:{tmp_path}" if editor == "folder" else editor
     options = quick_options(tmp_path, editor=spec, confine=confine)
     made = make_editor(spec, case.scene, case.region, case.views)
-    assert to_confine(made, options, kind) == expected
+    assert confines_edit(made, options, kind) == expected

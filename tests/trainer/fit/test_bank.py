@@ -18,8 +18,8 @@ from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options, write_bear
-from trainer.fit.memory_bank import Alongside, MemoryBank
-from trainer.options import FitOptions, check_network_options, settled
+from trainer.fit.memory_bank import JointTraining, MemoryBank
+from trainer.options import FitOptions, check_network_options, resolve_options
 from trainer.pipeline.run import RunResult, refit, train
 
 
@@ -45,9 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def alongside(folder: Path) -> RunResult:
     """A finished run whose network was trained beside the edit."""
-    return train(
-        quick_options(folder, "alongside", steps=60, stages=2, field="neural", fit="alongside"), quiet=True
-    )
+    return train(quick_options(folder, "joint", steps=60, stages=2, field="neural", fit="joint"), quiet=True)
 
 
 # ---- the bank
@@ -69,7 +67,7 @@ def test_a_bank_keeps_half_precision_in_order() -> None:
         bank.add(0.25, offsets)
 
 
-def test_a_full_bank_drops_what_its_neighbours_tell() -> None:
+def test_a_full_bank_drops_what_its_neighbors_tell() -> None:
     bank = MemoryBank(1, 14, most=4)
     for strength in (0.3, 0.35, 0.4, 1.0):
         bank.add(strength, torch.full((1, 14), strength))
@@ -77,11 +75,11 @@ def test_a_full_bank_drops_what_its_neighbours_tell() -> None:
     assert bank.offsets[:, 0, 0].tolist() == pytest.approx([0.0, 0.3, 0.4, 1.0], abs=1e-3)
 
 
-def beside(seed: int = 0) -> Alongside:
+def beside(seed: int = 0) -> JointTraining:
     rows = torch.randn(20, 14, generator=torch.Generator().manual_seed(1))
     settings = NeuralSettings(inputs="position", batch=32, seed=seed)
     fit = NeuralFit(rows, 14, ("sh0",), settings)
-    return Alongside(fit, 14, (0.5, 1.0), (10, 20), lambda moved: moved[:, 11:14])
+    return JointTraining(fit, 14, (0.5, 1.0), (10, 20), lambda moved: moved[:, 11:14])
 
 
 def test_until_the_way_is_known_a_step_stands_for_its_place_in_its_stage() -> None:
@@ -102,7 +100,7 @@ def test_what_trains_alongside_goes_on_to_the_same_bits() -> None:
     _, offsets = curved_trajectory(20, moving=("sh0",))
     recordings = [(4, offsets[3].half()), (11, offsets[5].half()), (25, offsets[8].half())]
 
-    def run(along: Alongside, begin: int, end: int) -> None:
+    def run(along: JointTraining, begin: int, end: int) -> None:
         for step in range(begin, end):
             for at, found in recordings:
                 if at == step:
@@ -141,22 +139,22 @@ def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
     folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = replace(
-        quick_options(folder, "again", steps=60, stages=2, field="neural", fit="alongside", save_every=0.0),
-        name="alongside",
+        quick_options(folder, "again", steps=60, stages=2, field="neural", fit="joint", save_every=0.0),
+        name="joint",
     )
-    step, steps = Alongside.step, 0
+    step, steps = JointTraining.step, 0
 
-    def interrupted(self: Alongside) -> None:
+    def interrupted(self: JointTraining) -> None:
         nonlocal steps
         steps += 1
         if steps == 31:
             raise KeyboardInterrupt
         step(self)
 
-    monkeypatch.setattr(Alongside, "step", interrupted)
+    monkeypatch.setattr(JointTraining, "step", interrupted)
     with pytest.raises(KeyboardInterrupt, match="--resume"):
         train(options, quiet=True)
-    monkeypatch.setattr(Alongside, "step", step)
+    monkeypatch.setattr(JointTraining, "step", step)
     found = train(replace(options, resume=True), quiet=True)
     scene = load_ply(folder / "scene.ply")
     one, other = (load_gdf(result.gdf, scene).field.origin for result in (alongside, found))
@@ -188,10 +186,10 @@ def _end(result: RunResult, folder: Path) -> Tensor:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"size": "small"}, "--size means nothing to --field auto; add --field neural"),
-        ({"fit": "alongside", "field": "keyframes"}, "--fit means nothing to --field keyframes"),
-        ({"picture_loss": 1.0, "field": "separable"}, "--picture-loss means nothing to --field separable"),
-        ({"field": "neural", "code": 65}, "--code is 65; 0 to 64"),
+        ({"size": "small"}, "--size does not apply to --field auto; add --field neural"),
+        ({"fit": "joint", "field": "keyframes"}, "--fit does not apply to --field keyframes"),
+        ({"picture_loss": 1.0, "field": "separable"}, "--picture-loss does not apply to --field separable"),
+        ({"field": "neural", "code": 65}, "--code must be between 0 and 64, got 65"),
         ({"field": "neural", "picture_loss": -1.0}, "--picture-loss is"),
     ],
 )
@@ -199,9 +197,9 @@ def test_network_options_that_mean_nothing_are_told(
     folder: Path, changed: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ProgdfError, match=message):
-        settled(quick_options(folder, **changed))
+        resolve_options(quick_options(folder, **changed))
 
 
 def test_a_refit_knows_its_options_too(folder: Path) -> None:
-    with pytest.raises(ProgdfError, match="--bins means nothing"):
+    with pytest.raises(ProgdfError, match="--bins does not apply"):
         check_network_options(FitOptions(folder, bins="hard"))

@@ -20,8 +20,8 @@ def test_the_best_field_is_the_one_whose_worst_picture_is_best() -> None:
 def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another() -> None:
     strengths, offsets = curved_trajectory(20, snapshots=3)
     shown = linear_pictures(20, 14)
-    judge = FieldJudge(strengths, offsets, shown, lambda s: s**4 * offsets[-1])
-    chosen = choose_field(strengths, offsets, shown, kind="lossless", target=80.0, judge=judge)
+    evaluator = FieldJudge(strengths, offsets, shown, lambda s: s**4 * offsets[-1])
+    chosen = choose_field(strengths, offsets, shown, kind="lossless", target=80.0, evaluator=evaluator)
     assert chosen.best.worst < 80.0
     assert not chosen.met
 
@@ -40,8 +40,8 @@ def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:
     def far(moved: Tensor) -> Tensor:
         return (10 * shown(moved)).sin() / 2  # so far from linear that effects do not add up
 
-    judge = FieldJudge(strengths, offsets, far)
+    evaluator = FieldJudge(strengths, offsets, far)
     seen = rendered_courses(offsets, torch.ones(40, 14), far)
-    found = separable_within(seen, strengths, 65.0, judge)
+    found = separable_within(seen, strengths, 65.0, evaluator)
     ranks = {name: len(bases.rest) for name, bases in found.field.attributes.items()}
-    assert found.worst >= judge.candidate(fit_separable(strengths, offsets, ranks), "").worst
+    assert found.worst >= evaluator.candidate(fit_separable(strengths, offsets, ranks), "").worst

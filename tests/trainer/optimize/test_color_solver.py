@@ -17,10 +17,10 @@ from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
 from trainer.optimize.color_solver import iterations, make_solver, solve
 from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import Snapshot, Stage
-from trainer.optimize.unseen import Followers
+from trainer.optimize.pgs import ParameterSnapshot, TargetStage
+from trainer.optimize.unseen import UnseenMembers
 from trainer.options import QUICK_STEPS
-from trainer.setup.resolution import unresolved
+from trainer.setup.resolution import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all
 
 WHITE = torch.ones(3)
@@ -62,8 +62,10 @@ def solved(scene: Gaussians, edited: Gaussians, cameras: list[Camera], steps: in
     crops, original = prepared(scene, cameras)
     targets = render_all(crops, pack(edited, with_shN=scene.sh_degree > 0))
     solver = make_solver(crops, original, scene.sh_degree > 0)
-    found: list[Snapshot] = list(
-        solve(original, solver, [Stage(1.0, targets, steps)], PgsState(original), lambda step, left: None)
+    found: list[ParameterSnapshot] = list(
+        solve(
+            original, solver, [TargetStage(1.0, targets, steps)], PgsState(original), lambda step, left: None
+        )
     )
     return found[-1].offsets
 
@@ -101,7 +103,7 @@ def test_members_smaller_than_a_pixel_learn_their_color() -> None:
     edited = replace(scene, sh0=scene.sh0.flip(1) + 0.3)
     cameras = orbit(6, 40)
     region = Region("all", torch.arange(len(scene)), torch.ones(len(scene)))
-    assert unresolved(scene, region, cameras, 40, 6) > 0.5
+    assert unresolved_share(scene, region, cameras, 40, 6) > 0.5
     offsets = solved(scene, edited, cameras, 30)
     assert psnr(scene, edited, offsets, cameras) > 35.0
     assert not bool(offsets[:, :11].any())
@@ -123,7 +125,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
     scene = dense_ball(300)
     crops, original = prepared(scene, orbit(3, 40))
     targets = render_all(crops, pack(replace(scene, sh0=-scene.sh0), with_shN=False))
-    stages = [Stage(0.5, targets, 4), Stage(1.0, targets, 6)]
+    stages = [TargetStage(0.5, targets, 4), TargetStage(1.0, targets, 6)]
     solver = make_solver(crops, original, trained_bands=False)
     whole = PgsState(original)
     list(solve(original, solver, stages, whole, lambda step, left: None))
@@ -147,7 +149,7 @@ def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
     targets = [torch.full_like(picture, torch.nan) for picture in render_all(crops, original)]
     solver, state = make_solver(crops, original, trained_bands=False), PgsState(original)
     with pytest.raises(FloatingPointError, match="the loss is nan at step 0"):
-        list(solve(original, solver, [Stage(1.0, targets, 2)], state, lambda step, left: None))
+        list(solve(original, solver, [TargetStage(1.0, targets, 2)], state, lambda step, left: None))
     assert not bool(state.moved.any())
 
 
@@ -156,8 +158,10 @@ def test_followers_are_tied_while_the_colors_are_solved_for() -> None:
     crops, original = prepared(scene, orbit(3, 40))
     targets = render_all(crops, pack(replace(scene, sh0=-scene.sh0), with_shN=False))
     solver, state = make_solver(crops, original, trained_bands=False), PgsState(original)
-    tied = Followers(torch.tensor([4]), torch.tensor([[7, 9]]), torch.tensor([[0.25, 0.75]]))
-    end = list(solve(original, solver, [Stage(1.0, targets, 5)], state, lambda step, left: None, tied))[-1]
+    tied = UnseenMembers(torch.tensor([4]), torch.tensor([[7, 9]]), torch.tensor([[0.25, 0.75]]))
+    end = list(solve(original, solver, [TargetStage(1.0, targets, 5)], state, lambda step, left: None, tied))[
+        -1
+    ]
     assert torch.allclose(end.offsets[4], 0.25 * end.offsets[7] + 0.75 * end.offsets[9], atol=1e-6)
     assert bool(end.offsets[7].any())
 

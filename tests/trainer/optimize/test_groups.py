@@ -16,21 +16,29 @@ from progdf.rasterize import render
 from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.optimize.group_search import GroupSearch
-from trainer.optimize.groups import Groups, group_stage, restored_groups, way
+from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import GradientL1
-from trainer.optimize.motion import Motion, Parts, between, carried, carried_back, make_parts, moved
+from trainer.optimize.motion import (
+    Motion,
+    Parts,
+    carry_offsets,
+    interpolate_motion,
+    local_offsets,
+    make_parts,
+    move_rows,
+)
 from trainer.optimize.objective import LossWeights, Objective
 from trainer.optimize.parts import connected_parts
-from trainer.optimize.pgs import PgsSettings, Stage, learning_rates, optimise
+from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.pipeline.run import RunResult, train
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import crop
 
 
-def blob(count: int, centre: tuple[float, float, float], seed: int) -> Tensor:
+def blob(count: int, center: tuple[float, float, float], seed: int) -> Tensor:
     """Points in a ball of radius about 1. [count,3]"""
     rng = torch.Generator().manual_seed(seed)
-    return torch.rand(count, 3, generator=rng) - 0.5 + torch.tensor(centre)
+    return torch.rand(count, 3, generator=rng) - 0.5 + torch.tensor(center)
 
 
 def test_two_blobs_apart_are_two_parts_and_the_larger_is_the_first() -> None:
@@ -89,8 +97,8 @@ def test_offsets_carried_with_their_parts_can_be_carried_back() -> None:
     rows, parts = some_parts()
     offsets = 0.1 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(1))
     motion = some_motion(parts)
-    there = carried(rows, offsets, parts, motion)
-    assert torch.allclose(carried_back(rows, there, parts, motion), offsets, atol=1e-5)
+    there = carry_offsets(rows, offsets, parts, motion)
+    assert torch.allclose(local_offsets(rows, there, parts, motion), offsets, atol=1e-5)
     assert torch.equal(there[:, 10:], offsets[:, 10:])
 
 
@@ -101,16 +109,16 @@ def test_a_moved_part_looks_as_it_did_from_a_camera_that_moved_along() -> None:
     motion = Motion(torch.tensor([[0.3, -0.2, 0.1]]), torch.tensor([0.4]), torch.tensor([[0.5, 0.9, -0.3]]))
     # colour as in band 0 alone: the bands above it do not turn with the part
     part = replace(case.scene[case.region.members], shN=torch.zeros(len(rows), 0, 3))
-    after = part.replace_rows(torch.arange(len(rows)), moved(rows, one, motion)[:, :14])
+    after = part.replace_rows(torch.arange(len(rows)), move_rows(rows, one, motion)[:, :14])
     camera = case.views[0].camera
     turn = torch.linalg.matrix_exp(torch.linalg.cross(motion.turn.expand(3, 3), torch.eye(3)).T)
     size = math.exp(0.4)
     # x' = c + shift + size·R (x − c); the same picture from a world scaled by `size`
     along = torch.eye(4)
     along[:3, :3] = camera.viewmat[:3, :3] @ turn.T
-    centre = one.centres[0]
-    along[:3, 3] = size * (camera.viewmat[:3, 3] + camera.viewmat[:3, :3] @ centre) - along[:3, :3] @ (
-        centre + motion.shift[0]
+    center = one.centers[0]
+    along[:3, 3] = size * (camera.viewmat[:3, 3] + camera.viewmat[:3, :3] @ center) - along[:3, :3] @ (
+        center + motion.shift[0]
     )
     with torch.no_grad():
         before = render(part, camera)
@@ -125,11 +133,11 @@ def test_half_way_a_part_has_half_the_shift_half_the_turn_and_half_the_growth_in
         torch.full((2,), math.log(4.0)),
         torch.tensor([[0.0, math.pi / 2, 0.0]]).expand(2, 3),
     )
-    half = between(parts.still(), end, 0.5)
+    half = interpolate_motion(parts.still(), end, 0.5)
     assert torch.allclose(half.shift, torch.full((2, 3), 0.5))
     assert torch.allclose(half.log_scale.exp(), torch.full((2,), 2.0))
     assert torch.allclose(half.turn[0], torch.tensor([0.0, math.pi / 4, 0.0]), atol=1e-6)
-    whole = between(half, end, 1.0)
+    whole = interpolate_motion(half, end, 1.0)
     assert torch.allclose(whole.turn, end.turn, atol=1e-6)
 
 
@@ -138,7 +146,7 @@ def pictured(case: Small, edit: AnalyticEdit) -> tuple[Tensor, list[CropScene], 
     edited = edit.apply(case.scene, case.region.members, 1.0)
     with torch.no_grad():
         whole = [render(edited, view.camera, WHITE).clamp(0, 1) for view in case.views]
-    views = [view.widened([picture]) for view, picture in zip(case.views, whole, strict=True)]
+    views = [view.widen([picture]) for view, picture in zip(case.views, whole, strict=True)]
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in views]
     rows = pack(case.scene[case.region.members], with_shN=case.scene.sh_degree > 0)
     return rows, crops, [crop(picture, view.box) for picture, view in zip(whole, views, strict=True)]
@@ -182,8 +190,8 @@ def test_the_same_seed_finds_the_same_bits() -> None:
     rows, crops, targets = pictured(case, grown(1.3, arm_pivots(case)))
     first, again = (group_stage(rows, crops, [targets], steps=10, seed=4).saved() for _ in range(2))
     assert all(torch.equal(first[name], again[name]) for name in first)
-    kept = restored_groups(rows, first)
-    assert torch.equal(kept.parts.centres, make_parts(rows, connected_parts(rows[:, :3])).centres)
+    kept = restore_groups(rows, first)
+    assert torch.equal(kept.parts.centers, make_parts(rows, connected_parts(rows[:, :3])).centers)
     assert torch.equal(kept.saved()["motions"], first["motions"])
 
 
@@ -210,8 +218,8 @@ def test_on_the_way_a_part_keeps_its_shape_and_the_ends_are_exact() -> None:
     rows, parts = some_parts()
     motions = (some_motion(parts, 1), some_motion(parts, 2))
     nothing = torch.zeros_like(rows)
-    ends = [carried(rows, nothing, parts, motion) for motion in motions]
-    found = way(rows, Groups(parts, motions), ends, [30, 90], 8)
+    ends = [carry_offsets(rows, nothing, parts, motion) for motion in motions]
+    found = group_path(rows, Groups(parts, motions), ends, [30, 90], 8)
     assert [(step, stage, last) for step, stage, last, _ in found if last] == [(30, 0, True), (90, 1, True)]
     assert len(found) == 8
     assert [step for step, *_ in found] == sorted(step for step, *_ in found)
@@ -232,7 +240,7 @@ def test_no_member_grows_beyond_the_clamp() -> None:
     for growth in (1.2, math.inf):
         settings = PgsSettings(20 * learning_rates("geometry", rows.shape[1], 1.0), growth=growth, ramp=0.0)
         objective = Objective(GradientL1(), LossWeights(0.0))
-        *_, last = optimise(rows, crops, crops[:1], [Stage(1.0, targets, 12)], objective, settings)
+        *_, last = optimize(rows, crops, crops[:1], [TargetStage(1.0, targets, 12)], objective, settings)
         largest.append(float(last.offsets[:, attribute_slices(14)["log_scales"]].exp().max()))
     assert largest[0] < 1.2001
     assert largest[1] > 1.3

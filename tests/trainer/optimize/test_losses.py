@@ -27,13 +27,13 @@ def test_the_clamp_passes_a_gradient_that_leads_back_into_the_range_and_no_other
     assert x.grad.tolist() == [-1.0, 0.0, -1.0, 1.0, 0.0, 1.0]
 
 
-def test_a_channel_below_zero_can_be_trained_to_a_colour_above_it() -> None:
+def test_a_channel_below_zero_can_be_trained_to_a_color_above_it() -> None:
     x = torch.tensor([-0.3], requires_grad=True)
-    optimiser = torch.optim.Adam([x], lr=0.05)
+    optimizer = torch.optim.Adam([x], lr=0.05)
     for _ in range(60):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         (clamp_towards(x, 0.0, float("inf")) - 0.4).abs().sum().backward()
-        optimiser.step()
+        optimizer.step()
     assert float(x.detach()) == pytest.approx(0.4, abs=0.06)
 
 

@@ -13,9 +13,9 @@ from progdf.gaussians import pack
 from progdf.metrics.lpips import Lpips
 from tests.helpers.trained import WHITE, small
 from trainer.editors import make_editor
-from trainer.optimize.losses import GradientL1, LpipsLoss, eroded, l1, progressive_change, sharpness
-from trainer.optimize.objective import LossWeights, Moment, Objective, TermMeans, loss_table, summed
-from trainer.optimize.pgs import PgsSettings, Snapshot, Stage, learning_rates, optimise
+from trainer.optimize.losses import GradientL1, LpipsLoss, erode, l1, progressive_change, sharpness
+from trainer.optimize.objective import LossWeights, Moment, Objective, TermMeans, loss_table, total_loss
+from trainer.optimize.pgs import ParameterSnapshot, PgsSettings, TargetStage, learning_rates, optimize
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop
 
@@ -89,7 +89,7 @@ def test_lpips_has_the_gradient_of_finite_differences(net: str) -> None:
 def test_each_term_has_its_name_and_their_sum_is_the_loss() -> None:
     terms = Objective(GradientL1(), ALL_TERMS).terms(moment())
     assert list(terms) == ["l1", "perceptual", "progressive", "sharpness"]
-    assert float(summed(terms).detach()) == pytest.approx(sum(float(x.detach()) for x in terms.values()))
+    assert float(total_loss(terms).detach()) == pytest.approx(sum(float(x.detach()) for x in terms.values()))
 
 
 def test_weights_scale_their_terms_and_leave_l1_alone() -> None:
@@ -127,8 +127,8 @@ def test_a_new_stage_forgets_the_targets_of_the_last() -> None:
 
 
 def test_the_line_for_the_log_names_what_is_really_used() -> None:
-    assert LossWeights().described("gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
-    assert ALL_TERMS.described("lpips-vgg") == (
+    assert LossWeights().description("gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
+    assert ALL_TERMS.description("lpips-vgg") == (
         "L1 + 0.3 lpips-vgg + 5 progressive (decay) + 0.5 sharpness (hinge)"
     )
 
@@ -145,21 +145,21 @@ def test_the_progressive_change_is_the_printed_sum() -> None:
         assert decayed == pytest.approx(0.05 * 1.1 ** (-step / 50) * length)
 
 
-def recoloured(weights: LossWeights, steps: int = 30, **more: object) -> list[Snapshot]:
+def recolored(weights: LossWeights, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
     """The recordings of a short recolouring of a small bear."""
     case = small("body")
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
-    stage = Stage(1.0, [crop(editor.edit(v, 1.0), v.box) for v in case.views], steps)
+    stage = TargetStage(1.0, [crop(editor.edit(v, 1.0), v.box) for v in case.views], steps)
     settings = PgsSettings(learning_rates("colour", original.shape[1], 1.0), ramp=0.0)
     settings = replace(settings, **more)  # type: ignore[arg-type]
-    return list(optimise(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
+    return list(optimize(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
 
 
 def distance_travelled(weights: LossWeights) -> float:
     """Mean offset at the end of it."""
-    return float(recoloured(weights)[-1].offsets.abs().mean())
+    return float(recolored(weights)[-1].offsets.abs().mean())
 
 
 def test_the_printed_constraint_freezes_the_edit_and_a_small_weight_of_it_does_not() -> None:
@@ -173,8 +173,8 @@ def test_the_printed_constraint_freezes_the_edit_and_a_small_weight_of_it_does_n
 
 def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps() -> None:
     frozen = LossWeights(progressive="growth")
-    assert [found.step for found in recoloured(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
-    assert len(recoloured(frozen)) < 4 < len(recoloured(LossWeights())), "else by what is seen"
+    assert [found.step for found in recolored(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
+    assert len(recolored(frozen)) < 4 < len(recolored(LossWeights())), "else by what is seen"
 
 
 # ---- sharpness
@@ -210,20 +210,20 @@ def test_the_printed_sharpness_pulls_at_no_pixel_inside_the_picture() -> None:
 def test_descending_the_hinge_brings_back_a_lost_texture_s_sharpness() -> None:
     target = noise(24, 24, 3)
     image = (0.25 * target + 0.75 * target.mean()).requires_grad_()
-    optimiser = torch.optim.SGD([image], lr=20.0)
+    optimizer = torch.optim.SGD([image], lr=20.0)
     before = float(sharpness(image, target, "hinge").detach())
     for _ in range(40):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss = sharpness(image, target, "hinge")
         loss.backward()
-        optimiser.step()
+        optimizer.step()
     assert float(sharpness(image, target, "hinge").detach()) < 0.1 * before
 
 
 def test_erosion_takes_the_rim_but_not_at_the_border_of_the_picture() -> None:
     mask = torch.zeros(12, 12)
     mask[3:, 3:] = 1.0
-    inner = eroded(mask, by=2)
+    inner = erode(mask, by=2)
     assert bool(inner[5:, 5:].all())
     assert int(inner.sum()) == 49
 

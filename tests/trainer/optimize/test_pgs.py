@@ -12,15 +12,15 @@ from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, course, masked_psnr, small
 from trainer.editors import make_editor
-from trainer.optimize.pgs import Snapshot, learning_rates, most_change, optimise
+from trainer.optimize.pgs import ParameterSnapshot, learning_rates, most_change, optimize
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop
 
 
-def run(case: Small, steps: int = 40, **more: object) -> tuple[Tensor, list[Snapshot]]:
+def run(case: Small, steps: int = 40, **more: object) -> tuple[Tensor, list[ParameterSnapshot]]:
     """Original rows and recordings of a course."""
     wanted = course(case, steps, **more)
-    return wanted[0], list(optimise(*wanted))
+    return wanted[0], list(optimize(*wanted))
 
 
 def test_the_members_arrive_at_the_edited_views() -> None:
@@ -54,7 +54,7 @@ def test_the_first_steps_start_from_the_original_exactly() -> None:
     assert float(found[0].offsets.abs().max()) < 0.1 * float(found[-1].offsets.abs().max())
 
 
-def test_a_colour_edit_moves_colours_and_nothing_else() -> None:
+def test_a_color_edit_moves_colors_and_nothing_else() -> None:
     _, found = run(small("body"))
     for name, columns in attribute_slices(found[-1].offsets.shape[1]).items():
         moved = bool(found[-1].offsets[:, columns].any())

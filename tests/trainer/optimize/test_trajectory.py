@@ -21,7 +21,7 @@ from progdf.field.trajectory import (
     save_trajectory,
 )
 from progdf.io.tensors import write_tensors
-from trainer.optimize.retime import record, retime, straight_recordings, with_recordings
+from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.options import Slider
 
 CHANNELS = 14
@@ -128,7 +128,7 @@ def test_slider_values_ascend_from_zero_to_one_for_any_way(progress: list[float]
 
 def test_a_recording_that_is_a_detour_is_left_out_and_stage_ends_stay() -> None:
     trajectory = along([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0], [5, 10], noise=0.5)
-    kept = with_recordings(trajectory, straight_recordings(trajectory, shown(trajectory)))
+    kept = select_recordings(trajectory, straight_recordings(trajectory, shown(trajectory)))
     assert len(kept) == 3
     assert kept.stage_ends == (1, 2)
     assert torch.equal(kept.node(1), trajectory.node(5))

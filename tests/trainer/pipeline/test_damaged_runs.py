@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.field.trajectory import load_trajectory, save_trajectory
 from tests.helpers.refused import refusal
 from tests.helpers.trained import quick_options, write_bear
-from trainer.pipeline.reopen import reopened
+from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.run import train
 
 Change = Callable[[dict[str, Any], dict[str, Tensor]], object]
@@ -57,7 +57,7 @@ def test_what_a_trajectory_tells_is_checked_before_it_is_used(
     about = json.loads(json.dumps(about))
     extra.setdefault("s_before_fit", trajectory.s)
     save_trajectory(path, trajectory, extra, about)
-    reopened(tmp_path / "run")
+    reopen_run(tmp_path / "run")
     change(about, extra)
     save_trajectory(path, trajectory, extra, about)
-    assert "is damaged" in refusal(lambda path: reopened(path.parent), path)
+    assert "is damaged" in refusal(lambda path: reopen_run(path.parent), path)

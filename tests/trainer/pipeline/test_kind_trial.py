@@ -17,10 +17,10 @@ from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
 from trainer.options import TrainOptions
-from trainer.pipeline.kind_trial import Approach, Trial, approaches, tried
-from trainer.setup.training_setup import Stand
+from trainer.pipeline.kind_trial import Approach, Trial, approaches, try_approaches
+from trainer.setup.training_setup import TrainingSetup
 
-COLOUR, STYLE, FREE = Approach("colour"), Approach("style"), Approach("geometry")
+COLOR, STYLE, FREE = Approach("colour"), Approach("style"), Approach("geometry")
 IN_PARTS = Approach("geometry", 120)
 
 
@@ -28,8 +28,8 @@ def options(**more: object) -> TrainOptions:
     return replace(quick_options(Path("nowhere")), **{"steps": 144, **more})  # type: ignore[arg-type]
 
 
-def stand(case: Small) -> Stand:
-    return Stand(case.scene, case.region, case.views, [], WHITE)
+def setup(case: Small) -> TrainingSetup:
+    return TrainingSetup(case.scene, case.region, case.views, [], WHITE)
 
 
 def pictured(case: Small, edit: AnalyticEdit) -> list[Tensor]:
@@ -50,19 +50,19 @@ def scarf() -> Small:
     return small("scarf", count=6, image_size=72)
 
 
-def test_a_recolour_given_as_pictures_is_a_colour_edit() -> None:
+def test_a_recolor_given_as_pictures_is_a_color_edit() -> None:
     case = scarf()
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     pictures = [editor.edit(view, 1.0) for view in case.views]
-    trial = tried(options(), stand(case), pictures, [COLOUR, STYLE, FREE, IN_PARTS])
-    assert trial.chosen == COLOUR
-    assert trial.psnrs[COLOUR] > trial.psnrs[FREE] + 2
+    trial = try_approaches(options(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
+    assert trial.chosen == COLOR
+    assert trial.psnrs[COLOR] > trial.psnrs[FREE] + 2
 
 
 def test_a_part_that_moved_is_geometry_in_parts() -> None:
     case = small("ears", count=6, image_size=72)
     edit, _ = bear_edits(bear(1500))["big ears"]
-    trial = tried(options(), stand(case), pictured(case, edit), [COLOUR, STYLE, FREE, IN_PARTS])
+    trial = try_approaches(options(), setup(case), pictured(case, edit), [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == IN_PARTS
     assert trial.psnrs[IN_PARTS] > trial.psnrs[FREE] + 2
 
@@ -70,7 +70,7 @@ def test_a_part_that_moved_is_geometry_in_parts() -> None:
 def test_what_bends_softly_is_geometry_without_parts() -> None:
     case = scarf()
     pictures = pictured(case, AnalyticEdit("waves", waves))
-    trial = tried(options(), stand(case), pictures, [COLOUR, STYLE, FREE, IN_PARTS])
+    trial = try_approaches(options(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == FREE
     assert trial.psnrs[FREE] > trial.psnrs[STYLE]
 
@@ -78,25 +78,25 @@ def test_what_bends_softly_is_geometry_without_parts() -> None:
 def test_the_same_trial_gives_the_same_figures() -> None:
     case = scarf()
     pictures = pictured(case, AnalyticEdit("waves", waves))
-    assert tried(options(), stand(case), pictures, [STYLE]) == tried(
-        options(), stand(case), pictures, [STYLE]
+    assert try_approaches(options(), setup(case), pictures, [STYLE]) == try_approaches(
+        options(), setup(case), pictures, [STYLE]
     )
 
 
-def test_colours_alone_are_taken_where_training_all_is_hardly_better() -> None:
-    assert Trial(40, {COLOUR: 19.9, STYLE: 20.0, FREE: 12.0}, 10.0).chosen == COLOUR
-    assert Trial(40, {COLOUR: 19.0, STYLE: 20.0, FREE: 12.0}, 10.0).chosen == STYLE
+def test_colors_alone_are_taken_where_training_all_is_hardly_better() -> None:
+    assert Trial(40, {COLOR: 19.9, STYLE: 20.0, FREE: 12.0}, 10.0).chosen == COLOR
+    assert Trial(40, {COLOR: 19.0, STYLE: 20.0, FREE: 12.0}, 10.0).chosen == STYLE
 
 
 def test_moving_is_taken_where_it_gains_nearly_as_much_as_paint() -> None:
-    assert Trial(40, {COLOUR: 20.7, STYLE: 21.3, FREE: 21.1, IN_PARTS: 20.2}, 19.8).chosen == FREE
-    assert Trial(40, {COLOUR: 15.1, STYLE: 14.9, FREE: 12.2, IN_PARTS: 9.8}, 10.4).chosen == COLOUR
+    assert Trial(40, {COLOR: 20.7, STYLE: 21.3, FREE: 21.1, IN_PARTS: 20.2}, 19.8).chosen == FREE
+    assert Trial(40, {COLOR: 15.1, STYLE: 14.9, FREE: 12.2, IN_PARTS: 9.8}, 10.4).chosen == COLOR
     assert Trial(40, {FREE: 9.0, IN_PARTS: 9.5}, 10.0).chosen == IN_PARTS
-    assert Trial(40, {COLOUR: 9.0, STYLE: 9.5, FREE: 9.9}, 10.0).chosen == STYLE, "nothing gains"
+    assert Trial(40, {COLOR: 9.0, STYLE: 9.5, FREE: 9.9}, 10.0).chosen == STYLE, "nothing gains"
 
 
 def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
-    line = Trial(40, {COLOUR: 18.0, FREE: 21.23}, 10.0).line()
+    line = Trial(40, {COLOR: 18.0, FREE: 21.23}, 10.0).line()
     assert "40 steps with L1" in line
     assert "colour 18.0, geometry 21.2 dB" in line
     assert "taken: geometry (--kind geometry --group-steps 0 skips the trial)" in line
@@ -106,9 +106,9 @@ def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        ({}, [COLOUR, STYLE, FREE, IN_PARTS]),
-        ({"group_steps": 0}, [COLOUR, STYLE, FREE]),
-        ({"group_steps": 50}, [COLOUR, STYLE, Approach("geometry", 50)]),
+        ({}, [COLOR, STYLE, FREE, IN_PARTS]),
+        ({"group_steps": 0}, [COLOR, STYLE, FREE]),
+        ({"group_steps": 50}, [COLOR, STYLE, Approach("geometry", 50)]),
         ({"kind": "geometry"}, [FREE, IN_PARTS]),
         ({"kind": "geometry", "group_steps": 12}, [Approach("geometry", 12)]),
         ({"kind": "style"}, [STYLE]),
@@ -116,11 +116,11 @@ def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
 )
 def test_what_the_options_say_is_not_tried(more: dict[str, object], expected: list[Approach]) -> None:
     case = scarf()
-    assert approaches(options(**more), stand(case), [view.image for view in case.views]) == expected
+    assert approaches(options(**more), setup(case), [view.image for view in case.views]) == expected
 
 
 def test_pictures_that_are_repainted_all_over_do_not_move_the_region() -> None:
     case = scarf()
     repainted = [0.8 * view.image for view in case.views]
-    assert approaches(options(), stand(case), repainted) == [COLOUR, STYLE]
-    assert approaches(options(kind="geometry"), stand(case), repainted) == [FREE, IN_PARTS]
+    assert approaches(options(), setup(case), repainted) == [COLOR, STYLE]
+    assert approaches(options(kind="geometry"), setup(case), repainted) == [FREE, IN_PARTS]

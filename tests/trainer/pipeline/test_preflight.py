@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from progdf.__main__ import main
-from tests.helpers.tiny_segmenters import tiny_detector, tiny_outliner
+from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 
 GOOD = {"--region": "all", "--editor": "recolor:#3060d0"}
 
@@ -103,7 +103,7 @@ def test_a_missing_extra_is_told_before_the_scene_is_loaded(
     assert f"pip install progdf-studio[{extra}]" in refused(capsys, **changes)
 
 
-@pytest.mark.parametrize("damage", ["none", "no detector", "no outliner", "no weights", "cut weights"])
+@pytest.mark.parametrize("damage", ["none", "no detector", "no sam_model", "no weights", "cut weights"])
 def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
     damage: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,19 +113,19 @@ def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
 
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(here / "hub"))
     tiny_detector(Path("detector"))
-    tiny_outliner(Path("outliner"))
-    weights = Path("outliner/model.safetensors")
+    tiny_sam(Path("sam_model"))
+    weights = Path("sam_model/model.safetensors")
     if damage == "none":
-        check_grounded_sam(SegmenterSettings("detector", "outliner"))
+        check_grounded_sam(SegmenterSettings("detector", "sam_model"))
         return
     if damage == "no weights":
         weights.unlink()
     elif damage == "cut weights":
         weights.write_bytes(weights.read_bytes()[:1000])
-    options = {"--region": "text:scarf", "--detector": "detector", "--outliner": "outliner"}
-    absent = {"no detector": {"--detector": "some/where"}, "no outliner": {"--outliner": "some/where"}}
+    options = {"--region": "text:scarf", "--detector": "detector", "--sam-model": "sam_model"}
+    absent = {"no detector": {"--detector": "some/where"}, "no sam_model": {"--sam-model": "some/where"}}
     told = refused(capsys, **{**options, **absent.get(damage, {})})
-    assert ("hf download some/where" if damage in absent else "outliner holds no whole model") in told
+    assert ("hf download some/where" if damage in absent else "sam_model holds no whole model") in told
 
 
 @pytest.mark.parametrize("damage", ["none", "no weights", "cut weights", "a shard missing", "a part missing"])

@@ -11,8 +11,8 @@ import torch
 from progdf.errors import ProgdfError
 from trainer.cli import train_options
 from trainer.optimize.objective import LossWeights
-from trainer.optimize.settings import idle_options, loss_weights, pgs_settings, stages_to_ask
-from trainer.options import Preset, TrainOptions, settled
+from trainer.optimize.settings import idle_options, loss_weights, pgs_settings, stage_count
+from trainer.options import Preset, TrainOptions, resolve_options
 from trainer.presets import PRESETS, under_preset
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
@@ -57,7 +57,7 @@ def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too()
 
 
 def test_the_papers_trainer_is_as_printed() -> None:
-    options = settled(asked("--preset", "paper"))
+    options = resolve_options(asked("--preset", "paper"))
     assert loss_weights(options, "colour") == LossWeights(1.0, 1, "decay", 5.0, "paper", 1.0)
     assert loss_weights(options, "geometry") == loss_weights(options, "colour"), "whatever the edit"
     settings = pgs_settings(options, "colour", 23, 1.0, 1)
@@ -73,21 +73,21 @@ def test_the_paper_can_tighten_instead_of_letting_go() -> None:
     assert loss_weights(options, "style").progressive == "growth"
 
 
-def test_by_default_a_colour_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
-    colour, style, geometry = (loss_weights(asked(), kind) for kind in ("colour", "style", "geometry"))
-    assert (colour.perceptual, style.perceptual, geometry.perceptual) == (0.1, 0.3, 0.3)
-    assert (colour.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
+def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
+    color, style, geometry = (loss_weights(asked(), kind) for kind in ("colour", "style", "geometry"))
+    assert (color.perceptual, style.perceptual, geometry.perceptual) == (0.1, 0.3, 0.3)
+    assert (color.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
 
 
 def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
-    asks = {kind: stages_to_ask(settled(asked()), kind) for kind in ("colour", "style", "geometry")}
+    asks = {kind: stage_count(resolve_options(asked()), kind) for kind in ("colour", "style", "geometry")}
     assert asks == {"colour": 8, "style": 1, "geometry": 8}
-    assert stages_to_ask(settled(asked("--stages", "4")), "style") == 4
-    assert stages_to_ask(settled(asked("--quick")), "colour") == 4
-    assert stages_to_ask(settled(asked("--steps", "200")), "colour") == 4, "a stage needs its steps"
-    assert stages_to_ask(settled(asked("--steps", "320")), "colour") == 8
-    assert stages_to_ask(settled(asked("--steps", "32")), "style") == 1
-    assert stages_to_ask(settled(asked("--quick", "--stages", "2")), "colour") == 2
+    assert stage_count(resolve_options(asked("--stages", "4")), "style") == 4
+    assert stage_count(resolve_options(asked("--quick")), "colour") == 4
+    assert stage_count(resolve_options(asked("--steps", "200")), "colour") == 4, "a stage needs its steps"
+    assert stage_count(resolve_options(asked("--steps", "320")), "colour") == 8
+    assert stage_count(resolve_options(asked("--steps", "32")), "style") == 1
+    assert stage_count(resolve_options(asked("--quick", "--stages", "2")), "colour") == 2
 
 
 def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() -> None:
@@ -117,7 +117,7 @@ def test_only_the_warm_up_shortens_the_first_steps() -> None:
         assert settings.warmup == warm
 
 
-def test_a_colour_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
+def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
     ours = pgs_settings(asked(), "colour", 23, 1.0, 4).rates
     plain = pgs_settings(asked("--rates", "3dgs"), "colour", 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
@@ -137,4 +137,4 @@ def test_a_colour_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked
 )
 def test_weights_and_presets_that_make_no_sense_are_named(words: tuple[str, ...], named: str) -> None:
     with pytest.raises(ProgdfError, match=named):
-        settled(asked(*words))
+        resolve_options(asked(*words))

@@ -19,7 +19,7 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
-from trainer.pipeline.resume import found
+from trainer.pipeline.resume import find_run
 from trainer.pipeline.run import train
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -43,9 +43,9 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
     [
         {"save_every": 0.2},
         {"save_every": 0, "kind": "geometry", "group_steps": 12},
-        {"save_every": 0, "field": "neural", "fit": "alongside", "size": "tiny", "quick": True},
+        {"save_every": 0, "field": "neural", "fit": "joint", "size": "tiny", "quick": True},
     ],
-    ids=["colour", "parts", "alongside"],
+    ids=["colour", "parts", "joint"],
 )
 def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
     bear_folder: Path, tmp_path: Path, options: dict[str, object]
@@ -191,10 +191,10 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
 def test_what_is_found_in_a_folder_depends_on_the_options(
     bear_folder: Path, uninterrupted: Path, interrupted: Path
 ) -> None:
-    assert found(small_run(bear_folder)) == "nothing"
+    assert find_run(small_run(bear_folder)) == "nothing"
     shutil.copytree(interrupted, OUT)
-    assert found(small_run(bear_folder)) == "stopped"
-    assert found(small_run(bear_folder, seed=1)) == "nothing"
+    assert find_run(small_run(bear_folder)) == "stopped"
+    assert find_run(small_run(bear_folder, seed=1)) == "nothing"
     shutil.rmtree(OUT)
     shutil.copytree(uninterrupted, OUT)
-    assert found(small_run(bear_folder)) == "finished"
+    assert find_run(small_run(bear_folder)) == "finished"

@@ -23,8 +23,8 @@ from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, write_bear
 from trainer import cli
-from trainer.optimize.retime import before_fit
-from trainer.options import FitOptions, settled
+from trainer.optimize.retime import undo_retiming
+from trainer.options import FitOptions, resolve_options
 from trainer.pipeline.run import RunResult, refit, train
 
 
@@ -74,7 +74,7 @@ def test_the_recording_lies_where_the_field_shows_it(folder: Path, done: RunResu
     trajectory, extra, _ = load_trajectory(done.folder.trajectory)
     assert torch.equal(trajectory.s, done.trajectory.s)
     assert gdf.field.recorded == pytest.approx(trajectory.s.tolist(), abs=1e-6)
-    assert not torch.equal(before_fit(trajectory, extra).s, trajectory.s), "where the next field begins"
+    assert not torch.equal(undo_retiming(trajectory, extra).s, trajectory.s), "where the next field begins"
 
 
 def test_with_stages_the_slider_is_the_editors_own_strength(folder: Path) -> None:
@@ -168,15 +168,15 @@ def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "budget", "message"),
     [
-        ("neural", 60, "--bytes-budget means nothing to --field neural"),
-        ("lossless", 60, "--bytes-budget means nothing to --field lossless"),
-        ("auto", 0.5, "--bytes-budget is 0.5; 1 or more"),
-        ("auto", math.nan, "--bytes-budget is nan; 1 or more"),
+        ("neural", 60, "--bytes-budget does not apply to --field neural"),
+        ("lossless", 60, "--bytes-budget does not apply to --field lossless"),
+        ("auto", 0.5, "--bytes-budget must be at least 1 byte, got 0.5"),
+        ("auto", math.nan, "--bytes-budget must be at least 1 byte, got nan"),
     ],
 )
 def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: float, message: str) -> None:
     with pytest.raises(ProgdfError, match=message):
-        settled(quick_options(folder, "budget", field=field, bytes_budget=budget))
+        resolve_options(quick_options(folder, "budget", field=field, bytes_budget=budget))
 
 
 def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
     assert again.report["field"]["psnr_worst"] > result.report["field"]["psnr_worst"]
 
 
-def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path) -> None:
+def test_refitting_changes_the_field_and_nothing_that_was_optimized(folder: Path) -> None:
     result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
     before, extra, _ = load_trajectory(result.folder.trajectory)
     again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
@@ -203,7 +203,7 @@ def test_refitting_changes_the_field_and_nothing_that_was_optimised(folder: Path
     after, kept, _ = load_trajectory(result.folder.trajectory)
     assert torch.equal(after.offsets, before.offsets)
     assert torch.equal(after.end, before.end)
-    assert torch.equal(before_fit(after, kept).s, before_fit(before, extra).s), "each fit begins alike"
+    assert torch.equal(undo_retiming(after, kept).s, undo_retiming(before, extra).s), "each fit begins alike"
     assert again.report["edit"] == result.report["edit"]
     for stage in ("optimise", "total"):
         assert again.report["time"][stage] == result.report["time"][stage]
@@ -282,7 +282,7 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
-    options = settled(parsed(trainer.options.TrainOptions, words, "progdf train"))
+    options = resolve_options(parsed(trainer.options.TrainOptions, words, "progdf train"))
     assert (options.seed, options.slider, options.name) == (7, "even", "r")
     assert (options.steps, options.views) == (240, 12)
 

@@ -19,7 +19,7 @@ from tests.helpers.full_disk import files_up_to
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
 from trainer.pipeline.run import train
-from trainer.store.run_folder import RunFolder, locked
+from trainer.store.run_folder import RunFolder, lock_folder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -105,7 +105,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
 
 def test_two_runs_in_one_folder_are_refused(bear_folder: Path) -> None:
     OUT.mkdir()
-    with locked(RunFolder(OUT)), pytest.raises(ProgdfError, match="being trained by another process; "):
+    with lock_folder(RunFolder(OUT)), pytest.raises(ProgdfError, match="being trained by another process; "):
         train(small_run(bear_folder), quiet=True)
 
 

@@ -21,7 +21,7 @@ from progdf.region import Region
 from progdf.scene.bounds import near_plane
 from trainer.options import TrainOptions
 from trainer.pipeline.run import train
-from trainer.views.view import near_enough, pictured, region_rig
+from trainer.views.view import region_rig, render_view, with_near_plane
 
 FACTORS = (1e-3, 1e4)
 
@@ -37,8 +37,8 @@ def test_a_scene_of_any_size_is_trained_on_the_same_pictures(factor: float) -> N
     region = Region("scarf", members, torch.zeros(1500).index_fill(0, members, 1.0))
     pictures = []
     for scene in (demo.gaussians, scaled(demo.gaussians, factor)):
-        cameras = near_enough(region_rig(scene, region, 4, 64), scene)
-        pictures.append([pictured(scene, camera, torch.ones(3)) for camera in cameras])
+        cameras = with_near_plane(region_rig(scene, region, 4, 64), scene)
+        pictures.append([render_view(scene, camera, torch.ones(3)) for camera in cameras])
     for first, second in zip(*pictures, strict=True):
         assert float((first < 0.9).float().mean()) > 0.2, "there is something to see"
         assert float((first - second).abs().max()) < 0.01
@@ -76,10 +76,10 @@ def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, 
     for factor in (1.0, *FACTORS):
         scene = scaled(demo.gaussians, factor)
         edited = trained(tmp_path / f"{factor:g}", scene, members, editor, kind)
-        (camera,) = near_enough(region_rig(scene, region, 1, 64), scene)
-        finished[factor] = pictured(edited, camera, torch.ones(3))
+        (camera,) = with_near_plane(region_rig(scene, region, 1, 64), scene)
+        finished[factor] = render_view(edited, camera, torch.ones(3))
         if factor == 1.0:
-            change = finished[1.0] - pictured(scene, camera, torch.ones(3))
+            change = finished[1.0] - render_view(scene, camera, torch.ones(3))
             assert float(change.abs().max()) > 0.2, "the edit shows"
     for factor in FACTORS:
         # each step of Adam divides by the size of the gradient, so that rounding grows

@@ -199,7 +199,7 @@ def test_the_nearest_rows_are_those_of_brute_force(count: int) -> None:
     assert not bool((found == rows[:, None]).any())
 
 
-def test_points_in_one_place_are_neighbours_of_each_other() -> None:
+def test_points_in_one_place_are_neighbors_of_each_other() -> None:
     points = torch.cat([torch.zeros(300, 3), torch.ones(3, 3)])
     found, distances = nearest_rows(points, torch.tensor([0, 301]), 5)
     assert distances[0].tolist() == [0.0] * 5

@@ -23,7 +23,7 @@ from progdf.lens import Lens
 from progdf.region import Region
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import parse_region
-from tests.helpers.tiny_segmenters import tiny_detector, tiny_outliner
+from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, write_bear
 from trainer import segmenters
 from trainer.pipeline.run import train
@@ -194,7 +194,7 @@ def test_a_sentence_is_segmented_once_and_kept(reddish: Asked, tmp_path: Path) -
     assert len(reddish) == 2 * VIEWS
     assert torch.equal(first.members, again.members)
     assert torch.equal(first.score, again.score)
-    region_of('text:"the Red scarf"', replace(told, segmenter=SegmenterSettings(least=0.5)))
+    region_of('text:"the Red scarf"', replace(told, segmenter=SegmenterSettings(box_threshold=0.5)))
     assert len(reddish) == 4 * VIEWS
 
 
@@ -252,11 +252,11 @@ def test_prompts_are_asked_as_the_detector_was_trained() -> None:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> SegmenterSettings:
-    """A detector and an outliner of the real classes, saved and found as real ones are."""
+    """A detector and an sam_model of the real classes, saved and found as real ones are."""
     pytest.importorskip("transformers")
     folder = tmp_path_factory.mktemp("models")
     return SegmenterSettings(
-        str(tiny_detector(folder / "dino")), str(tiny_outliner(folder / "sam")), least=0.01
+        str(tiny_detector(folder / "dino")), str(tiny_sam(folder / "sam")), box_threshold=0.01
     )
 
 
@@ -267,7 +267,7 @@ def test_the_networks_make_a_mask_of_the_pictures_size(tiny: SegmenterSettings) 
     assert (mask.shape, mask.dtype) == ((60, 90), torch.bool)
     assert 0 < int(mask.sum()) < mask.numel()
     assert torch.equal(mask, segment(image, "the scarf."))
-    nothing = SEGMENTERS["text"](replace(tiny, least=0.999))(image, "the scarf")
+    nothing = SEGMENTERS["text"](replace(tiny, box_threshold=0.999))(image, "the scarf")
     assert not bool(nothing.any())
 
 
@@ -288,8 +288,8 @@ def test_a_run_trains_a_region_that_a_sentence_names(tiny: SegmenterSettings, tm
         quick_options(tmp_path, steps=8, stages=1, views=3),
         region='text:"the scarf" - sphere:9,9,9,0.1',
         detector=tiny.detector,
-        outliner=tiny.outliner,
-        detect_least=tiny.least,
+        sam_model=tiny.sam_model,
+        box_threshold=tiny.box_threshold,
         lift_threshold=0.05,
     )
     done = train(options, quiet=True)
@@ -303,18 +303,18 @@ def test_missing_weights_are_one_line_that_tells_how_to_get_them(
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
     absent = settings(tmp_path, segmenter=replace(tiny, detector="someone/no-such-detector"))
     assert "hf download someone/no-such-detector" in refusal("text:scarf", absent)
-    absent = settings(tmp_path, segmenter=replace(tiny, outliner=str(tmp_path / "nowhere")))
-    assert "give --outliner" in refusal("text:scarf", absent)
+    absent = settings(tmp_path, segmenter=replace(tiny, sam_model=str(tmp_path / "nowhere")))
+    assert "give --sam-model" in refusal("text:scarf", absent)
     (tmp_path / "broken").mkdir()
-    for file in Path(tiny.outliner).iterdir():
+    for file in Path(tiny.sam_model).iterdir():
         (tmp_path / "broken" / file.name).write_bytes(file.read_bytes())
     (tmp_path / "broken" / "model.safetensors").write_bytes(b"half")
-    broken = settings(tmp_path, segmenter=replace(tiny, outliner=str(tmp_path / "broken")))
+    broken = settings(tmp_path, segmenter=replace(tiny, sam_model=str(tmp_path / "broken")))
     assert "no whole model with safetensors weights" in refusal("text:scarf", broken)
 
 
 def test_a_model_of_another_kind_is_one_line(tiny: SegmenterSettings, tmp_path: Path) -> None:
-    swapped = SegmenterSettings(tiny.outliner, tiny.detector)
+    swapped = SegmenterSettings(tiny.sam_model, tiny.detector)
     assert "is a sam model, no grounding-dino; give --detector" in refusal(
         "text:scarf", settings(tmp_path, segmenter=swapped)
     )

@@ -80,7 +80,7 @@ def test_rows_of_another_scene_are_one_line(
         parse_region(f"file:{tmp_path}/m.npy", demo.gaussians)
 
 
-def test_the_picture_tints_the_region_and_takes_the_colour_from_the_rest(demo: DemoScene) -> None:
+def test_the_picture_tints_the_region_and_takes_the_color_from_the_rest(demo: DemoScene) -> None:
     camera = demo.cameras[0].resized(64, 64)
     nothing = picture(demo.gaussians, from_mask("", torch.zeros(3000, dtype=torch.bool)), camera)
     assert float((nothing.amax(dim=2) - nothing.amin(dim=2)).max()) < 1e-3, "grey"
@@ -127,15 +127,15 @@ def test_masks_drawn_over_the_views_are_the_region_that_train_takes(
     cameras = load_cameras(out / "cameras.json")
     assert len(cameras) == 5
     assert f"--cameras {out}/cameras.json --region masks:{out}" in line
-    from trainer.views.view import drawn, near_enough
+    from trainer.views.view import render_colors, with_near_plane
 
     bear_itself = demo.members(*(name for name in demo.label_names if name not in ("plinth", "grass")))
     member = torch.zeros(3000, 3)
     member[bear_itself] = 1.0
-    for camera in near_enough(cameras, demo.gaussians)[:4]:
+    for camera in with_near_plane(cameras, demo.gaussians)[:4]:
         with Image.open(out / "original" / f"{camera.name}.png") as original:
             assert original.size == (96, 96)
-        seen = drawn(demo.gaussians, member, camera, torch.zeros(3))[..., 0] > 0.5
+        seen = render_colors(demo.gaussians, member, camera, torch.zeros(3))[..., 0] > 0.5
         Image.fromarray((255 * seen.numpy()).astype(np.uint8)).save(out / f"{camera.name}.png")
     settings = RegionSettings(out / "cameras.json", 5, lambda: tmp_path)
     found = parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(settings))

@@ -13,15 +13,15 @@ from torch import Tensor
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, small
 from trainer.editors import make_editor
-from trainer.report.agreement import Agreement, _best_colors, _sight, measured
-from trainer.setup.training_setup import Stand
-from trainer.views.view import crop, drawn
+from trainer.report.agreement import Agreement, _best_colors, _sight, measure_agreement
+from trainer.setup.training_setup import TrainingSetup
+from trainer.views.view import crop, render_colors
 
 
 @cache
-def stand() -> Stand:
+def setup() -> TrainingSetup:
     case = body()
-    return Stand(case.scene, case.region, case.views[:-3], case.views[-3:], WHITE)
+    return TrainingSetup(case.scene, case.region, case.views[:-3], case.views[-3:], WHITE)
 
 
 def body() -> Small:
@@ -29,8 +29,8 @@ def body() -> Small:
 
 
 def judged(pictures: list[Tensor]) -> Agreement:
-    count = len(stand().train)
-    return measured(stand(), pictures[:count], pictures[count:])
+    count = len(setup().train)
+    return measure_agreement(setup(), pictures[:count], pictures[count:])
 
 
 def edited(spec: str) -> list[Tensor]:
@@ -90,7 +90,7 @@ def test_differences_too_faint_to_see_are_no_disagreement() -> None:
     assert found.agree
 
 
-def test_colours_that_the_members_can_have_are_found() -> None:
+def test_colors_that_the_members_can_have_are_found() -> None:
     case = body()
     rng = torch.Generator().manual_seed(4)
     changed = case.scene.sh0.clone()
@@ -103,11 +103,11 @@ def test_colours_that_the_members_can_have_are_found() -> None:
 
 
 def test_the_line_tells_decibels_share_and_remedy() -> None:
-    line = Agreement(psnr=12.34, unexplained=0.61).told("style")
+    line = Agreement(psnr=12.34, unexplained=0.61).line("style")
     assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
     assert "61 % of the change; use a calmer style" in line
     assert "\n" not in line
-    assert Agreement(psnr=25.0, unexplained=0.1).told("style").startswith("the edited views agree")
+    assert Agreement(psnr=25.0, unexplained=0.1).line("style").startswith("the edited views agree")
 
 
 def test_measuring_twice_gives_the_same_figures() -> None:
@@ -115,11 +115,11 @@ def test_measuring_twice_gives_the_same_figures() -> None:
     assert judged(pictures) == judged(pictures)
 
 
-def test_a_smooth_change_that_colours_can_make_is_explained() -> None:
+def test_a_smooth_change_that_colors_can_make_is_explained() -> None:
     case = body()
     change = torch.zeros(len(case.scene), 3)
     change[case.region.members] = 0.3 * case.scene.means[case.region.members, 1:2]
-    pictures = [v.image + drawn(case.scene, change, v.camera, torch.zeros(3)) for v in case.views]
+    pictures = [v.image + render_colors(case.scene, change, v.camera, torch.zeros(3)) for v in case.views]
     assert judged(pictures).unexplained < 0.04, "without conjugate directions it is .055"
 
 
@@ -152,14 +152,14 @@ def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.Monkey
 
 
 def test_the_decibels_are_of_what_the_fit_leaves_where_the_held_out_views_change() -> None:
-    count = len(stand().train)
+    count = len(setup().train)
     pictures = [view.image for view in body().views]
-    for view, i in zip(stand().held_out, range(count, len(pictures)), strict=True):
+    for view, i in zip(setup().held_out, range(count, len(pictures)), strict=True):
         pictures[i] = view.image + 0.1 * (view.mask < 0.01)[..., None]  # all around the region
     found = judged(pictures)
     assert found.unexplained == pytest.approx(1.0)
-    changed = sum(float(crop(v.mask < 0.01, v.box).sum()) for v in stand().held_out)
-    counted = sum(float(crop((v.mask < 0.01) | (v.mask > 0.05), v.box).sum()) for v in stand().held_out)
+    changed = sum(float(crop(v.mask < 0.01, v.box).sum()) for v in setup().held_out)
+    counted = sum(float(crop((v.mask < 0.01) | (v.mask > 0.05), v.box).sum()) for v in setup().held_out)
     assert found.psnr == pytest.approx(20 + 10 * math.log10(counted / changed), abs=0.1)
 
 
@@ -173,7 +173,7 @@ def test_a_box_at_half_size_holds_all_of_its_odd_pixels_in_their_place() -> None
     view = replace(body().views[0], box=(11, 20, 61, 75))
     x, y = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="xy")
     ramp = torch.stack([0.1 + x / 200, 0.1 + y / 200, torch.full_like(x, 0.2)], dim=2)
-    sight = _sight(stand(), view, view.image + ramp)
+    sight = _sight(setup(), view, view.image + ramp)
     halved = torch.nn.functional.avg_pool2d(ramp.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)
     torch.testing.assert_close(sight.change, halved[10:38, 5:31], atol=1e-5, rtol=0)
     assert sight.scene.box == (5, 10, 31, 38)

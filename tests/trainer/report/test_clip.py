@@ -19,7 +19,7 @@ from progdf.field import BakedField
 from progdf.io.images import to_picture
 from tests.helpers.tiny_clip import tiny_clip
 from tests.helpers.trained import WHITE, quick_options, small, write_bear
-from trainer.fit.evaluate import make_judge
+from trainer.fit.evaluate import make_evaluator
 from trainer.options import FitOptions
 from trainer.pipeline.fit_and_report import texts
 from trainer.pipeline.run import refit, train
@@ -152,11 +152,11 @@ def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_w
 def test_why_nothing_is_measured_is_told(saved: Path) -> None:
     bear = small(count=3)
     unedited = {1.0: [view.image for view in bear.views]}
-    judge = make_judge(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
+    evaluator = make_evaluator(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
 
     def reason(before: str, after: str, model: str = str(saved)) -> str:
         found = clip_course(
-            judge,
+            evaluator,
             bear.views,
             BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14),
             Texts(before, after, model),

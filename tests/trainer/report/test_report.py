@@ -17,7 +17,7 @@ from progdf.field import BakedField, fit_keyframes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import pack
 from tests.helpers.trained import WHITE, Small, small
-from trainer.fit.evaluate import Judge, make_judge
+from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import without_idle_attributes
 from trainer.optimize.losses import GradientL1
 from trainer.report.measures import courses
@@ -27,10 +27,10 @@ from trainer.store.memory import PeakMemory
 from trainer.views.crops import moving_attributes
 
 
-def _judged(bear: Small) -> Judge:
+def _judged(bear: Small) -> Evaluator:
     """A judge whose editor has painted everything darker, at half strength and in full."""
     edited = {s: [view.image * (1 - 0.5 * s) for view in bear.views] for s in (0.5, 1.0)}
-    return make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
+    return make_evaluator(bear.scene, bear.region, bear.views, edited, WHITE, 14)
 
 
 def _darker(bear: Small, amount: float = 0.6) -> BakedField:
@@ -46,9 +46,9 @@ def _color_count(picture: Image.Image, color: Sequence[int]) -> int:
 
 def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None:
     bear = small(count=3)
-    judge, field = _judged(bear), _darker(bear)
-    truth = {s: judge.pictures(field.offsets(s)) for s in (0.3, 0.8)}
-    found = courses(judge, {"slider": field}, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
+    evaluator, field = _judged(bear), _darker(bear)
+    truth = {s: evaluator.pictures(field.offsets(s)) for s in (0.3, 0.8)}
+    found = courses(evaluator, {"slider": field}, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
     assert found.s == (0.3, 0.8)
     assert found.psnr == (99.0, 99.0)
     assert found.ssim == pytest.approx((1.0, 1.0), abs=1e-5)  # single precision
@@ -57,10 +57,10 @@ def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None
 
 def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
     bear = small(count=3)
-    judge = _judged(bear)
+    evaluator = _judged(bear)
     fields = {"near": _darker(bear, 0.55), "far": _darker(bear, 0.2)}
-    truth = judge.pictures(_darker(bear).offsets(1.0))
-    found = courses(judge, fields, (1.0,), lambda _: truth, GradientL1())
+    truth = evaluator.pictures(_darker(bear).offsets(1.0))
+    found = courses(evaluator, fields, (1.0,), lambda _: truth, GradientL1())
     assert found["near"].psnr[0] > found["far"].psnr[0] + 6
     assert found["near"].ssim[0] > found["far"].ssim[0]
     assert found["near"].lpips[0] < found["far"].lpips[0]
@@ -69,31 +69,31 @@ def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
 def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> None:
     bear = small(count=3)
     unedited = {1.0: [view.image for view in bear.views]}
-    judge = make_judge(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
-    truth = judge.pictures(_darker(bear).offsets(0.0))
+    evaluator = make_evaluator(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
+    truth = evaluator.pictures(_darker(bear).offsets(0.0))
     worse = [picture.clone() for picture in truth]
     worse[0] += 0.2 * torch.rand(worse[0].shape, generator=torch.Generator().manual_seed(0))
     # the window of a pixel at the region's border reaches 5 pixels beyond it
-    reach = [max_pool2d(pixels[None, None].float(), 11, 1, 5)[0, 0] > 0 for pixels in judge.pixels]
+    reach = [max_pool2d(pixels[None, None].float(), 11, 1, 5)[0, 0] > 0 for pixels in evaluator.pixels]
     beyond = [torch.where(near[..., None], p, 1 - p) for p, near in zip(truth, reach, strict=True)]
     assert any(not torch.equal(a, b) for a, b in zip(beyond, truth, strict=True))
-    assert judge.ssim(beyond, truth) == pytest.approx(1.0, abs=1e-5)
-    assert judge.ssim(worse, truth) < 0.95
-    assert judge.psnr(beyond, truth) == 99.0
+    assert evaluator.ssim(beyond, truth) == pytest.approx(1.0, abs=1e-5)
+    assert evaluator.ssim(worse, truth) < 0.95
+    assert evaluator.psnr(beyond, truth) == 99.0
 
 
 def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_was_not_asked() -> None:
     bear = small(count=3)
-    judge = _judged(bear)
+    evaluator = _judged(bear)
     columns = columns_of([(1.0, 1.0)])
-    ours, own = strip(judge, _darker(bear), columns, 64), editor_strip(judge, columns, 64)
+    ours, own = strip(evaluator, _darker(bear), columns, 64), editor_strip(evaluator, columns, 64)
     assert len(ours) == len(own) == 5
     assert {picture.shape for picture in (*ours, *own)} == {ours[0].shape}
     assert torch.equal(ours[0], own[0])
     assert float(ours[4].mean()) < float(ours[2].mean()) < float(ours[0].mean())
     grey = (own[1] - own[1].mean()).abs() < 0.02
     assert float(grey.float().mean()) > 0.5
-    assert int(judge.pixels[best_view(judge)].sum()) == max(int(p.sum()) for p in judge.pixels)
+    assert int(evaluator.pixels[best_view(evaluator)].sum()) == max(int(p.sum()) for p in evaluator.pixels)
 
 
 @pytest.mark.parametrize("size", [(40, 40), (20, 60), (90, 30)])
@@ -105,7 +105,7 @@ def test_a_thumbnail_has_the_width_that_is_asked_for_and_is_never_tall(size: tup
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
-def test_every_line_of_a_plot_is_drawn_in_its_colour(scale: str) -> None:
+def test_every_line_of_a_plot_is_drawn_in_its_color(scale: str) -> None:
     x = [i / 10 for i in range(11)]
     lines = {f"line {k}": (x, [0.1 + 0.2 * k + 0.05 * v for v in x]) for k in range(4)}
     picture = draw_plot(Plot("title", lines, "slider", scale), 400, 270)  # type: ignore[arg-type]
@@ -174,17 +174,17 @@ def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None
     edited = {1.0: [view.image for view in bear.views]}
     wide = pack(bear.scene[bear.region.members], with_shN=True).shape[1]
     assert wide > 14
-    judge = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, wide)
+    evaluator = make_evaluator(bear.scene, bear.region, bear.views, edited, WHITE, wide)
     offsets = _darker(bear).offsets(1.0)
-    narrow = make_judge(bear.scene, bear.region, bear.views, edited, WHITE, 14)
-    for a, b in zip(judge.pictures(offsets), narrow.pictures(offsets), strict=True):
+    narrow = make_evaluator(bear.scene, bear.region, bear.views, edited, WHITE, 14)
+    for a, b in zip(evaluator.pictures(offsets), narrow.pictures(offsets), strict=True):
         assert torch.allclose(a, b, atol=1e-6)
 
 
 def test_attributes_that_show_little_each_are_not_all_left_out_where_together_they_show() -> None:
     """Two attributes worth .07 dB each: one may go, both would cost more than what is allowed in all."""
 
-    class Judging(Judge):
+    class Judging(Evaluator):
         """Each of the two that is missing takes .07 dB."""
 
         def pictures(self, offsets: Tensor) -> list[Tensor]:
@@ -202,8 +202,8 @@ def test_attributes_that_show_little_each_are_not_all_left_out_where_together_th
         (1.0,),
     )
     pixels = [torch.ones(1, 1, dtype=torch.bool)]
-    judge = Judging(torch.zeros(2, 14), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])
-    kept, costs = without_idle_attributes(trajectory, judge)
+    evaluator = Judging(torch.zeros(2, 14), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])
+    kept, costs = without_idle_attributes(trajectory, evaluator)
     assert costs == {"quats": 0.07, "means": 0.07}
     moving = moving_attributes(kept.end)
     assert ("means" in moving) != ("quats" in moving)

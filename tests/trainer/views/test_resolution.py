@@ -13,7 +13,7 @@ from progdf.camera import Camera
 from progdf.demo_scenes import bear
 from progdf.region import Region
 from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
-from trainer.setup.resolution import SIZES, sized
+from trainer.setup.resolution import SIZES, choose_resolution
 from trainer.views.view import region_rig
 
 OPTIONS = TrainOptions(scene=Path("s.ply"), out=Path("o"), region="all", editor="recolor:#3060d0")
@@ -28,7 +28,7 @@ def choice(count: int, cameras: int | None = None, **said: object) -> tuple[int,
     def cameras_of(image_size: int, views: int) -> Sequence[Camera]:
         return region_rig(scene, region, cameras or views, image_size)
 
-    found, views, _ = sized(options, scene, region, cameras_of)
+    found, views, _ = choose_resolution(options, scene, region, cameras_of)
     return found[0].width, views
 
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import torch
 
 from tests.helpers.trained import WHITE, small
-from tests.trainer.views.test_tiles import COLOURS, recoloured
+from tests.trainer.views.test_tiles import COLORS, recolored
 from trainer.views.crops import crop_scene, only_recolors, render_all
 
 
 def test_a_still_view_without_gradients_is_the_picture_of_the_whole_box() -> None:
     case = small(count=2)
-    rows = recoloured(case.scene, case.region.members)
+    rows = recolored(case.scene, case.region.members)
     assert only_recolors(rows - rows)
     for view in case.views:
         still, whole = (
             crop_scene(case.scene, case.region.members, view.camera, view.box, WHITE, still)
             for still in (True, False)
         )
-        found, expected = (render_all([made], rows, COLOURS)[0] for made in (still, whole))
+        found, expected = (render_all([made], rows, COLORS)[0] for made in (still, whole))
         assert float((found - expected).abs().max()) < 2e-6, "sums in another order"
         assert (
             float((expected - view.image[view.box[1] : view.box[3], view.box[0] : view.box[2]]).abs().max())

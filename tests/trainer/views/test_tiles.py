@@ -15,21 +15,21 @@ from progdf.rasterize.cpu.bin import TILE_H, TILE_W
 from tests.helpers.scenes import front_camera, hard_cases, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, small
 from trainer.views.crops import CropScene, crop_scene, render_all
-from trainer.views.tiles import live_pixels, live_tiles, reaching
+from trainer.views.tiles import live_pixels, live_tiles, may_reach
 
-COLOURS = ("sh0", "shN")
+COLORS = ("sh0", "shN")
 
 
 def picture_and_gradient(view: CropScene, rows: Tensor) -> tuple[Tensor, Tensor]:
     packed = rows.clone().requires_grad_()
-    image, _ = view.render(packed, COLOURS)
+    image, _ = view.render(packed, COLORS)
     weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(0))
     (image * weights).sum().backward()  # type: ignore[no-untyped-call]
     assert packed.grad is not None
     return image.detach(), packed.grad
 
 
-def recoloured(scene: Gaussians, members: Tensor) -> Tensor:
+def recolored(scene: Gaussians, members: Tensor) -> Tensor:
     rows = pack(scene[members], with_shN=scene.sh_degree > 0)
     rows[:, 11:] += 0.3 * torch.randn(rows[:, 11:].shape, generator=torch.Generator().manual_seed(3))
     return rows
@@ -38,7 +38,7 @@ def recoloured(scene: Gaussians, members: Tensor) -> Tensor:
 @pytest.mark.parametrize("part", ["scarf", "ears", "head"])
 def test_picture_and_gradients_are_the_bits_of_the_whole_box(part: str) -> None:
     case = small(part, count=3, image_size=120)
-    rows = recoloured(case.scene, case.region.members)
+    rows = recolored(case.scene, case.region.members)
     saved = 0
     for view in case.views:
         box = (0, 0, view.camera.width, view.camera.height)
@@ -60,8 +60,8 @@ def test_a_region_that_no_pixel_shows_is_the_original_picture() -> None:
     members = torch.arange(3)
     camera = orbit_camera(64, 40)
     whole, tiles = (crop_scene(scene, members, camera, (0, 0, 64, 40), WHITE, s) for s in (False, True))
-    rows = recoloured(scene, members)
-    assert torch.equal(*(render_all([v], rows, COLOURS)[0] for v in (whole, tiles)))
+    rows = recolored(scene, members)
+    assert torch.equal(*(render_all([v], rows, COLORS)[0] for v in (whole, tiles)))
 
 
 def test_live_tiles_are_those_of_the_full_image() -> None:
@@ -87,7 +87,7 @@ def test_tiles_end_with_the_box() -> None:
     assert last.nonzero().tolist() == [[40 // TILE_H, 64 // TILE_W]]
 
 
-def test_needles_beyond_the_edge_of_an_off_centre_picture_are_not_left_out() -> None:
+def test_needles_beyond_the_edge_of_an_off_center_picture_are_not_left_out() -> None:
     """They lie so that the projection stretches them most, beside the picture, where it is clamped."""
     rng = torch.Generator().manual_seed(6)
     camera = front_camera(160, 80, focal=60.0)
@@ -106,7 +106,7 @@ def test_needles_beyond_the_edge_of_an_off_centre_picture_are_not_left_out() -> 
     )  # fmt: skip
     every = torch.ones(80 // TILE_H, 160 // TILE_W, dtype=torch.bool)
     assert 20 < int(found.visible.sum()) < 380
-    assert not bool((found.visible & ~reaching(means, scales, camera, every)).any())
+    assert not bool((found.visible & ~may_reach(means, scales, camera, every)).any())
 
 
 def _cases() -> dict[str, Callable[[], object]]:
@@ -132,4 +132,4 @@ def test_no_gaussian_that_reaches_a_tile_is_left_out(name: str) -> None:
             )  # fmt: skip
             live = torch.zeros(-(-camera.height // TILE_H), -(-camera.width // TILE_W), dtype=torch.bool)
             live[row, column] = True
-            assert not bool((found.visible & ~reaching(scene.means, scene.scales, camera, live)).any())
+            assert not bool((found.visible & ~may_reach(scene.means, scene.scales, camera, live)).any())

@@ -21,7 +21,7 @@ from progdf.region import from_mask
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainOptions
-from trainer.setup.training_setup import make_stand
+from trainer.setup.training_setup import make_training_setup
 from trainer.views.choose import Choice, _framed, _sampled, choose_views, split_views
 
 
@@ -42,9 +42,9 @@ def test_a_camera_that_looks_away_is_left_out() -> None:
 def test_fewer_views_than_there_are_cameras_are_spread_around_the_region() -> None:
     case = small(count=6)
     chosen = choose_views(case.scene, case.region, [view.camera for view in case.views], 3, WHITE).views
-    centre = case.scene.means[case.region.members].mean(dim=0)
+    center = case.scene.means[case.region.members].mean(dim=0)
     directions = torch.nn.functional.normalize(
-        torch.stack([view.camera.position - centre for view in chosen]), dim=1
+        torch.stack([view.camera.position - center for view in chosen]), dim=1
     )
     assert len(chosen) == 3
     assert float((directions @ directions.T - torch.eye(3)).max()) < 0.8
@@ -60,19 +60,19 @@ def test_held_out_views_are_not_trained_on() -> None:
 
 def around(case: Small, azimuths: list[float], name: str = "a", size: int = 64) -> list[Camera]:
     """Cameras at these azimuths (degrees) around the region, at three heights in turn."""
-    centre = case.scene.means[case.region.members].mean(dim=0)
+    center = case.scene.means[case.region.members].mean(dim=0)
     up = torch.tensor([0.0, 1.0, 0.0])
     cameras = []
     for i, azimuth in enumerate(math.radians(a) for a in azimuths):
-        eye = centre + 2.5 * torch.tensor([math.sin(azimuth), 0.3 + 0.2 * (i % 3), math.cos(azimuth)])
-        viewmat = look_at(eye, centre, up)
+        eye = center + 2.5 * torch.tensor([math.sin(azimuth), 0.3 + 0.2 * (i % 3), math.cos(azimuth)])
+        viewmat = look_at(eye, center, up)
         cameras.append(Camera(viewmat, intrinsics(0.6, size, size), size, size, f"{name}{i:03d}"))
     return cameras
 
 
 def azimuths_of(case: Small, cameras: list[Camera]) -> list[float]:
-    centre = case.scene.means[case.region.members].mean(dim=0)
-    places = [camera.position - centre for camera in cameras]
+    center = case.scene.means[case.region.members].mean(dim=0)
+    places = [camera.position - center for camera in cameras]
     return sorted(math.degrees(math.atan2(float(p[0]), float(p[2]))) for p in places)
 
 
@@ -157,13 +157,13 @@ def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     options = TrainOptions(tmp_path / "room.ply", tmp_path / "run", "all", "night", views=6, image_size=48)
     region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
     with pytest.raises(ProgdfError, match="--cameras") as told:
-        make_stand(options, demo.gaussians, region)
+        make_training_setup(options, demo.gaussians, region)
     assert "\n" not in str(told.value)
     save_cameras(tmp_path / "c.json", [replace(c, lens=Lens(k1=0.1)) for c in demo.cameras])
-    stand = make_stand(replace(options, cameras=tmp_path / "c.json"), demo.gaussians, region)
-    assert len(stand.train) + len(stand.held_out) == 6
-    assert "6 of 32 cameras" in stand.notes[1]
-    assert "photographs:EDITED,ORIGINALS" in stand.notes[2]
+    setup = make_training_setup(replace(options, cameras=tmp_path / "c.json"), demo.gaussians, region)
+    assert len(setup.train) + len(setup.held_out) == 6
+    assert "6 of 32 cameras" in setup.notes[1]
+    assert "photographs:EDITED,ORIGINALS" in setup.notes[2]
 
 
 def picked(likeness: Tensor, held_out: int) -> list[int]:

@@ -19,19 +19,19 @@ from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.helpers.trained import small
 from trainer.editors import EditorSettings, check_new_editor, make_editor
 from trainer.editors.folder import FolderEditor
-from trainer.views.view import fit_size, make_view, named, region_box, region_rig, seen_colors
+from trainer.views.view import fit_size, make_view, name_cameras, region_box, region_rig, seen_colors
 
 
 def test_a_box_grows_to_what_an_edit_changes() -> None:
     view = small().views[0]
     moved = view.image.clone()
     moved[0, 0] = 1.0 - moved[0, 0]
-    x0, y0, x1, y1 = view.widened([moved, view.image]).box
+    x0, y0, x1, y1 = view.widen([moved, view.image]).box
     rows, columns = (view.mask > 0.05).nonzero().unbind(dim=1)
     assert (x0, y0) == (0, 0)
     assert x1 > int(columns.max())
     assert y1 > int(rows.max())
-    assert view.widened([view.image]).box == view.box
+    assert view.widen([view.image]).box == view.box
 
 
 def test_the_rig_covers_a_small_region_with_pixels() -> None:
@@ -45,7 +45,7 @@ def test_the_rig_covers_a_small_region_with_pixels() -> None:
 def test_view_names_are_distinct_and_can_be_file_names() -> None:
     camera = small().views[0].camera
     names = ["images/a.png", "a.jpg", "", "x/../..", "b c"]
-    found = [c.name for c in named([replace(camera, name=name) for name in names])]
+    found = [c.name for c in name_cameras([replace(camera, name=name) for name in names])]
     assert len(set(found)) == len(found)
     assert found[0] == "a"
     assert not any("/" in name or name.startswith(".") for name in found)
@@ -53,7 +53,7 @@ def test_view_names_are_distinct_and_can_be_file_names() -> None:
 
 def test_a_name_too_long_for_a_file_is_cut() -> None:
     camera = small().views[0].camera
-    first, second = (c.name for c in named([replace(camera, name="\U00020000" * 300)] * 2))
+    first, second = (c.name for c in name_cameras([replace(camera, name="\U00020000" * 300)] * 2))
     assert len(f"{first}.png".encode()) < 250
     assert second == "view_001"
 
@@ -149,11 +149,11 @@ def test_a_box_grows_with_a_change_in_one_channel_and_not_with_one_too_small_to_
     faint, blue = view.image.clone(), view.image.clone()
     faint[0, 0] += 0.04
     blue[0, 0, 2] -= 0.06
-    assert view.widened([faint]).box == view.box
-    assert view.widened([blue]).box[:2] == (0, 0)
+    assert view.widen([faint]).box == view.box
+    assert view.widen([blue]).box[:2] == (0, 0)
 
 
-def test_a_view_shows_the_scene_and_of_the_region_its_own_colour() -> None:
+def test_a_view_shows_the_scene_and_of_the_region_its_own_color() -> None:
     behind = one_gaussian(mean=(0.1, 0.0, 3.0), scales=(0.3, 0.3, 0.3), rgb=(0.1, 0.2, 0.9))
     scene = concatenate(
         behind, one_gaussian(mean=(-0.1, 0.0, 2.0), scales=(0.2, 0.2, 0.2), rgb=(0.8, 0.3, 0.1))
@@ -195,13 +195,13 @@ def test_a_picture_smaller_than_64_pixels_is_all_box() -> None:
 def test_the_rig_fills_the_picture_with_the_region_to_four_fifths_and_a_half_in_turn() -> None:
     scene = ball(400)
     region = from_mask("piece", (scene.means - torch.tensor([0.3, 0.0, 0.0])).norm(dim=1) < 0.25)
-    centre, radius = scene_sphere(scene[region.members])
+    center, radius = scene_sphere(scene[region.members])
     radius += float(scene.scales[region.members].amax(dim=1).median())
     for i, camera in enumerate(region_rig(scene, region, 6, 100)):
-        distance = float((camera.position - centre).norm())
+        distance = float((camera.position - center).norm())
         across = 2 * float(camera.K[0, 0]) * math.tan(math.asin(radius / distance))
         assert across == pytest.approx(80 if i % 2 == 0 else 50, rel=0.05)
-        ahead = camera.viewmat[:3, :3] @ centre + camera.viewmat[:3, 3]
+        ahead = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
         torch.testing.assert_close(ahead[:2], torch.zeros(2), atol=1e-5, rtol=0)
 
 

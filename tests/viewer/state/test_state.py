@@ -10,14 +10,14 @@ import torch
 from progdf.errors import ProgdfError
 from tests.helpers.trained import course, small
 from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import optimise
-from trainer.store.state import Autosave, Saved, StateFolder
+from trainer.optimize.pgs import optimize
+from trainer.store.state import PeriodicSave, Saved, StateFolder
 
 
 def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) -> None:
     case = small("body")
     wanted = course(case, steps=6)
-    straight, original = list(optimise(*wanted)), wanted[0]
+    straight, original = list(optimize(*wanted)), wanted[0]
     folder = StateFolder(tmp_path / "state")
     folder.begin({})
 
@@ -31,7 +31,7 @@ def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
             raise Stop
 
         try:
-            made.extend(snapshot for snapshot in optimise(*wanted, on_step, state))
+            made.extend(snapshot for snapshot in optimize(*wanted, on_step, state))
             break
         except Stop:
             saved = state.saved()
@@ -67,7 +67,7 @@ def test_saving_waits_until_it_is_a_hundredth_of_the_time(
 
         def restore(self, saved: Saved) -> None: ...
 
-    kept = Autosave(folder, "training", {"slow": Slow()}, every_s=10.0)
+    kept = PeriodicSave(folder, "training", {"slow": Slow()}, every_s=10.0)
     for _ in range(4000):
         now += 0.1
         kept.step_done()

@@ -22,8 +22,8 @@ from progdf.field.remap import Dial, dialled, interpolated, same
 from progdf.gaussians import BASE_CHANNELS, pack
 from trainer.editors import COSTLY_DIAL, check_editor
 from trainer.editors.base import ImageEditor
-from trainer.optimize.retime import blended
-from trainer.setup.training_setup import Stand, probes
+from trainer.optimize.retime import blend_images
+from trainer.setup.training_setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
@@ -38,7 +38,7 @@ _LOOKS = 2  # how often all places are looked at
 _JUMP = 0.7  # of the change in one step of an editor's dial: no strength between can be relied on
 
 
-def even_strengths(
+def equalized_strengths(
     editor: ImageEditor, spec: str, views: Sequence[View], plain: tuple[float, ...]
 ) -> tuple[float, ...]:
     """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
@@ -71,7 +71,9 @@ def even_strengths(
     return found if rises else plain
 
 
-def evened(field: BakedField, stand: Stand, log: RunLog | None = None) -> tuple[BakedField, Dial]:
+def equalize_slider(
+    field: BakedField, setup: TrainingSetup, log: RunLog | None = None
+) -> tuple[BakedField, Dial]:
     """The field with a slider whose equal steps look equally large in training views, and where it all went.
 
     A network keeps its slider.
@@ -79,8 +81,8 @@ def evened(field: BakedField, stand: Stand, log: RunLog | None = None) -> tuple[
     if field.origin is not None or not field.attributes:
         return field, same()
     moving = list(field.attributes)
-    small = probes(stand, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
-    rows = pack(stand.scene[stand.region.members], with_shN=field.channels > BASE_CHANNELS)
+    small = probe_views(setup, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
+    rows = pack(setup.scene[setup.region.members], with_shN=field.channels > BASE_CHANNELS)
     done = 0
 
     def seen(s: float) -> Tensor:
@@ -94,7 +96,7 @@ def evened(field: BakedField, stand: Stand, log: RunLog | None = None) -> tuple[
         if log is None
         else log.steps("even the slider", _LOOKS * (STEPS * _FINE + 1)) as advance
     ):
-        dial = even_dial(seen)
+        dial = equalizing_remap(seen)
     return dialled(field, dial), dial
 
 
@@ -102,7 +104,7 @@ def _silent(done: int, word: str) -> None:
     pass
 
 
-def even_dial(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
+def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
     """The dial under which equal steps change what is seen equally, wherever they begin.
 
     Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
@@ -120,7 +122,7 @@ def even_dial(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
         best, following = -1.0, places
         for _ in range(passes + 1):
             current = following
-            shown = [blended(pictures, looked, float(s)) for s in current]
+            shown = [blend_images(pictures, looked, float(s)) for s in current]
             evenness, following = _spread(current, shown, _FINE)
             if evenness > best:
                 best, places = evenness, current

@@ -12,20 +12,20 @@ from progdf.field.trajectory import Trajectory
 from progdf.gaussians import attribute_slices, pack
 from tests.helpers.trained import WHITE, small
 from trainer.editors.base import EditKind
-from trainer.fit.own_path import kept_way
-from trainer.setup.training_setup import Stand
-from trainer.views.view import View, pictured
+from trainer.fit.own_path import choose_path
+from trainer.setup.training_setup import TrainingSetup
+from trainer.views.view import View, render_view
 
 
 @cache
-def stand() -> Stand:
+def setup() -> TrainingSetup:
     case = small("scarf")
-    return Stand(case.scene, case.region, case.views[:3], case.views[3:], WHITE)
+    return TrainingSetup(case.scene, case.region, case.views[:3], case.views[3:], WHITE)
 
 
 def way(bend: float, attribute: str = "sh0") -> Trajectory:
     """To another colour (or place), half way `bend` off the straight line."""
-    rows = pack(stand().scene[stand().region.members], with_shN=False)
+    rows = pack(setup().scene[setup().region.members], with_shN=False)
     column = attribute_slices(rows.shape[1])[attribute].start
     offsets = torch.zeros(3, *rows.shape)
     offsets[1, :, column] = 0.4 + bend
@@ -49,21 +49,21 @@ class Halfway:
 
     def edit(self, view: View, strength: float) -> Tensor:
         assert strength == 0.5, "no other picture is needed"
-        members = stand().region.members
-        rows = pack(stand().scene[members], with_shN=False) + self.offsets
-        return pictured(stand().scene.replace_rows(members, rows), view.camera, WHITE)
+        members = setup().region.members
+        rows = pack(setup().scene[members], with_shN=False) + self.offsets
+        return render_view(setup().scene.replace_rows(members, rows), view.camera, WHITE)
 
 
 def test_a_detour_that_the_editor_takes_too_is_kept() -> None:
     bent = way(0.6)
-    kept, why = kept_way(bent, stand(), Halfway(bent.node(1)), False, same)
+    kept, why = choose_path(bent, setup(), Halfway(bent.node(1)), False, same)
     assert kept is bent
     assert why.startswith("as recorded")
 
 
 def test_a_detour_that_the_editor_does_not_take_is_left() -> None:
     bent = way(0.6)
-    kept, why = kept_way(bent, stand(), Halfway(0.5 * bent.end), False, same)
+    kept, why = choose_path(bent, setup(), Halfway(0.5 * bent.end), False, same)
     assert len(kept) == 2
     assert torch.equal(kept.end, bent.end)
     assert torch.equal(kept.at(0.25), 0.25 * bent.end)
@@ -74,18 +74,18 @@ def test_a_detour_that_the_editor_does_not_take_is_left() -> None:
 
 def test_where_nobody_pictures_the_half_it_goes_straight() -> None:
     bent = way(0.6)
-    assert len(kept_way(bent, stand(), None, False, same)[0]) == 2
-    assert len(kept_way(bent, stand(), Halfway(bent.end, stages=(1.0,)), False, same)[0]) == 2
+    assert len(choose_path(bent, setup(), None, False, same)[0]) == 2
+    assert len(choose_path(bent, setup(), Halfway(bent.end, stages=(1.0,)), False, same)[0]) == 2
 
 
 def test_parts_keep_their_way_unless_a_straight_one_looks_the_same() -> None:
     turned = way(0.4, "means")
-    assert kept_way(turned, stand(), None, True, same)[0] is turned
-    assert len(kept_way(way(0.0, "means"), stand(), None, True, same)[0]) == 2
+    assert choose_path(turned, setup(), None, True, same)[0] is turned
+    assert len(choose_path(way(0.0, "means"), setup(), None, True, same)[0]) == 2
 
 
 def test_a_way_that_is_not_kept_is_not_retimed() -> None:
     def never(trajectory: Trajectory) -> Trajectory:
         raise AssertionError("re-timed in vain")
 
-    assert len(kept_way(way(0.6), stand(), None, False, never)[0]) == 2
+    assert len(choose_path(way(0.6), setup(), None, False, never)[0]) == 2

@@ -16,9 +16,9 @@ from progdf.metrics.slider import slider_statistics
 from tests.helpers.trained import WHITE, small
 from trainer.editors import make_editor
 from trainer.editors.base import EditKind
-from trainer.fit.evenness import even_dial, even_strengths, evened
-from trainer.optimize.settings import slider_meant
-from trainer.setup.training_setup import Stand
+from trainer.fit.slider_uniformity import equalize_slider, equalized_strengths, equalizing_remap
+from trainer.optimize.settings import resolve_slider
+from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View
 
@@ -47,7 +47,7 @@ def uniformity(dial_of: Tensor) -> float:
 
 def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -> None:
     views, editor = small(count=4).views, Late()
-    asked = even_strengths(editor, "darken:0.5", views, QUARTERS)
+    asked = equalized_strengths(editor, "darken:0.5", views, QUARTERS)
     assert asked == pytest.approx([0.25 ** (1 / 3), 0.5 ** (1 / 3), 0.75 ** (1 / 3), 1.0], abs=0.01)
     pictures = [torch.stack([editor.edit(view, s) for view in views]) for s in (0.0, *asked)]
     steps = torch.stack([(b - a).abs().mean() for a, b in pairwise(pictures)])
@@ -55,7 +55,7 @@ def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -
 
 
 def test_strengths_name_folders_and_so_have_three_decimals() -> None:
-    asked = even_strengths(Late(), "darken:0.5", small(count=4).views, QUARTERS)
+    asked = equalized_strengths(Late(), "darken:0.5", small(count=4).views, QUARTERS)
     assert all(float(f"{s:g}") == s and s == round(s, 3) for s in asked)
     assert asked[-1] == 1.0
 
@@ -71,13 +71,13 @@ def test_strengths_name_folders_and_so_have_three_decimals() -> None:
 def test_given_strengths_costly_models_and_single_targets_are_not_asked_around(
     editor: Late, spec: str, plain: tuple[float, ...]
 ) -> None:
-    assert even_strengths(editor, spec, small(count=4).views, plain) == plain
+    assert equalized_strengths(editor, spec, small(count=4).views, plain) == plain
     assert editor.asked == 0
 
 
 def test_an_edit_that_jumps_is_asked_at_the_plain_strengths() -> None:
-    assert even_strengths(Late(power=300.0), "darken:0.5", small(count=4).views, QUARTERS) == QUARTERS
-    assert even_strengths(Late(power=1e6), "darken:0.5", small(count=4).views, QUARTERS) == QUARTERS
+    assert equalized_strengths(Late(power=300.0), "darken:0.5", small(count=4).views, QUARTERS) == QUARTERS
+    assert equalized_strengths(Late(power=1e6), "darken:0.5", small(count=4).views, QUARTERS) == QUARTERS
 
 
 def test_steps_are_even_wherever_they_begin() -> None:
@@ -85,7 +85,7 @@ def test_steps_are_even_wherever_they_begin() -> None:
         return torch.tensor([s + 0.8 * (1 - math.cos(9 * s)) / 9 + 2.0 * s**4], dtype=torch.float64)
 
     before = uniformity(torch.cat([seen(i / 20) for i in range(21)]))
-    dial = even_dial(seen)
+    dial = equalizing_remap(seen)
     back = type(dial)(dial.new, dial.old)
     assert before < 0.4
     for phase in (0.0, 0.25, 0.5, 0.75):
@@ -94,7 +94,7 @@ def test_steps_are_even_wherever_they_begin() -> None:
 
 
 def test_what_never_changes_keeps_its_slider() -> None:
-    dial = even_dial(lambda s: torch.zeros(4))
+    dial = equalizing_remap(lambda s: torch.zeros(4))
     assert dial.at(0.3) == pytest.approx(0.3)
 
 
@@ -108,8 +108,8 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
     offsets = strengths[:, None, None] ** 2.5 * change
     field = fit_separable(strengths, offsets, {"sh0": 2})
     train, held_out = case.views[:4], case.views[4:]
-    stand = Stand(case.scene, case.region, train, held_out, WHITE)
-    even, dial = evened(field, stand)
+    setup = TrainingSetup(case.scene, case.region, train, held_out, WHITE)
+    even, dial = equalize_slider(field, setup)
     crops = [crop_scene(case.scene, members, view.camera, view.box, WHITE) for view in held_out]
     before, after = (
         slider_statistics(lambda s, f=f: render_all(crops, original + f.offsets(s))) for f in (field, even)
@@ -121,17 +121,17 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
 
 
 def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given() -> None:
-    assert slider_meant("auto", "recolor:#3060d0", QUARTERS) == "even"
-    assert slider_meant("auto", "folder:here", (1.0,)) == "even"
-    assert slider_meant("auto", "folder:here", QUARTERS) == "stages"
-    assert slider_meant("auto", "photographs:here", QUARTERS) == "stages"
-    assert slider_meant("even", "folder:here", QUARTERS) == "even"
-    assert slider_meant("time", "recolor:#3060d0", QUARTERS) == "time"
+    assert resolve_slider("auto", "recolor:#3060d0", QUARTERS) == "even"
+    assert resolve_slider("auto", "folder:here", (1.0,)) == "even"
+    assert resolve_slider("auto", "folder:here", QUARTERS) == "stages"
+    assert resolve_slider("auto", "photographs:here", QUARTERS) == "stages"
+    assert resolve_slider("even", "folder:here", QUARTERS) == "even"
+    assert resolve_slider("time", "recolor:#3060d0", QUARTERS) == "time"
 
 
 def test_the_stripes_of_a_scarf_are_asked_for_where_they_show() -> None:
     case = small(count=6)
     editor = make_editor("stripes:#20a040", case.scene, case.region, case.views)
-    asked = even_strengths(editor, "stripes:#20a040", case.views, QUARTERS)
+    asked = equalized_strengths(editor, "stripes:#20a040", case.views, QUARTERS)
     assert asked != QUARTERS
     assert all(a < b for a, b in pairwise((0.0, *asked)))

@@ -11,17 +11,17 @@ from progdf.gaussians import Gaussians
 from progdf.sh import shade
 from tests.helpers.scenes import logit_of, orbit_camera, random_gaussians
 from trainer.optimize.view_dependence import view_dependence
-from trainer.views.visible_area import covered_areas
+from trainer.views.visible_area import visible_area
 
 CAMERAS = [orbit_camera(azimuth=0.7 * i, elevation=0.1 * i) for i in range(8)]
 
 
-def test_it_is_the_change_of_the_colours_that_are_drawn() -> None:
+def test_it_is_the_change_of_the_colors_that_are_drawn() -> None:
     members = random_gaussians(1, sh_degree=3)
     members = replace(members, sh0=members.sh0 + 9.0)  # so that nothing is cut at 0
     directions = [torch.nn.functional.normalize(members.means - c.position, dim=1) for c in CAMERAS]
-    colours = torch.stack([shade(3, d, members.sh) for d in directions])
-    expected = float((colours - colours.mean(dim=0)).square().mean().sqrt())
+    colors = torch.stack([shade(3, d, members.sh) for d in directions])
+    expected = float((colors - colors.mean(dim=0)).square().mean().sqrt())
     assert view_dependence(members, CAMERAS) == pytest.approx(expected, rel=1e-5)
     assert expected > 0.02
 
@@ -46,7 +46,7 @@ def test_a_member_counts_as_the_area_that_it_can_cover() -> None:
 
 def test_no_giant_speaks_for_all() -> None:
     members = sheeny([(1e4, 1e4, 1e4), *[(0.1, 0.1, 0.1)] * 99], [0.9] * 100)
-    assert float(covered_areas(members)[0]) == pytest.approx(20 / 100 * 0.9e8, rel=1e-3)
+    assert float(visible_area(members)[0]) == pytest.approx(20 / 100 * 0.9e8, rel=1e-3)
 
 
 def test_a_matt_region_and_a_single_view_have_none() -> None:

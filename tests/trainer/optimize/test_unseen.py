@@ -12,11 +12,11 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from trainer.editors.base import EditKind
-from trainer.optimize.pgs import Stage
-from trainer.optimize.unseen import Followers, find_followers, followers_of, least_shown
+from trainer.optimize.pgs import TargetStage
+from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
 from trainer.options import TrainOptions
 from trainer.pipeline.training import no_worse
-from trainer.setup.training_setup import Stand
+from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View, make_view
 
@@ -30,13 +30,13 @@ def two_boards() -> Gaussians:
     plane = torch.cartesian_prod(at, at)
     count = 2 * len(plane)
     means = torch.cat([torch.cat([plane, torch.full((len(plane), 1), z)], dim=1) for z in (0.0, 0.3)])
-    colours = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2]]).repeat_interleave(len(plane), dim=0)
+    colors = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2]]).repeat_interleave(len(plane), dim=0)
     return Gaussians(
         means,
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
         torch.tensor([0.08, 0.08, 0.01]).log().repeat(count, 1),
         torch.full((count,), 3.0),
-        rgb_to_sh0(colours),
+        rgb_to_sh0(colors),
         torch.zeros(count, 0, 3),
     )
 
@@ -56,7 +56,7 @@ def half_seen(scene: Gaussians) -> tuple[Region, list[View]]:
 def test_what_no_view_shows_follows_its_own_board_and_not_the_one_behind() -> None:
     scene = two_boards()
     region, views = half_seen(scene)
-    found = find_followers(scene, region.members, views)
+    found = find_unseen_members(scene, region.members, views)
     board = torch.arange(len(scene)) // (SIDE * SIDE)
     assert len(found.places) > 0.3 * len(scene), "the right halves are out of sight"
     in_sight = (scene.means[:, :2] - torch.tensor([-0.6, 0.0])).abs().amax(dim=1) < 0.3
@@ -67,46 +67,46 @@ def test_what_no_view_shows_follows_its_own_board_and_not_the_one_behind() -> No
     torch.testing.assert_close(found.weights.sum(dim=1), torch.ones(len(found.places)))
 
 
-def test_followers_take_on_colours_and_nothing_else() -> None:
+def test_followers_take_on_colors_and_nothing_else() -> None:
     scene = two_boards()
     region, views = half_seen(scene)
-    found = find_followers(scene, region.members, views)
+    found = find_unseen_members(scene, region.members, views)
     board = torch.arange(len(scene)) // (SIDE * SIDE)
     offsets = torch.zeros(len(scene), 14)
     offsets[:, 11:] = torch.where(board == 0, 1.0, -2.0)[:, None]
     offsets[:, :11] = torch.randn(len(scene), 11, generator=torch.Generator().manual_seed(0))
     moved = offsets.clone()
     moved[found.places, 11:] = 0.0
-    torch.testing.assert_close(found.led(moved), offsets, atol=1e-5, rtol=0)
-    assert torch.equal(found.led(moved.half())[:, :11], moved.half()[:, :11])
+    torch.testing.assert_close(found.propagate(moved), offsets, atol=1e-5, rtol=0)
+    assert torch.equal(found.propagate(moved.half())[:, :11], moved.half()[:, :11])
 
 
 def test_where_all_is_seen_or_nothing_nobody_follows() -> None:
     scene = two_boards()
     region, views = half_seen(scene)
-    seen = find_followers(scene, region.members, views)
+    seen = find_unseen_members(scene, region.members, views)
     alone = torch.ones(len(scene), dtype=torch.bool)
     alone[seen.places] = False
     members = alone.nonzero()[:, 0]
-    assert not len(find_followers(scene, members, views).places)
+    assert not len(find_unseen_members(scene, members, views).places)
     hidden = (scene.means[:, 0] > 0.5).nonzero()[:, 0]
-    assert not len(find_followers(scene, hidden, views).places)
+    assert not len(find_unseen_members(scene, hidden, views).places)
     offsets = torch.ones(len(members), 14)
-    assert find_followers(scene, members, views).led(offsets) is offsets
+    assert find_unseen_members(scene, members, views).propagate(offsets) is offsets
 
 
 @pytest.mark.parametrize(
     ("kind", "follow", "followed"),
     [("colour", True, True), ("colour", False, False), ("geometry", True, False)],
 )
-def test_only_edits_of_colours_are_followed_and_only_if_asked(
+def test_only_edits_of_colors_are_followed_and_only_if_asked(
     tmp_path: Path, kind: EditKind, follow: bool, followed: bool
 ) -> None:
     scene = two_boards()
     region, views = half_seen(scene)
-    stand = Stand(scene, region, views, [], WHITE)
+    setup = TrainingSetup(scene, region, views, [], WHITE)
     options = TrainOptions(tmp_path / "s.ply", tmp_path, region="all", editor="night", follow=follow)
-    assert bool(len(followers_of(options, stand, kind).places)) == followed
+    assert bool(len(unseen_members_of(options, setup, kind).places)) == followed
 
 
 def test_what_counts_as_unseen_follows_the_density() -> None:
@@ -131,8 +131,8 @@ def test_following_that_makes_the_loss_worse_is_undone() -> None:
     in_sight = (scene.means[:, :2] - torch.tensor([-0.6, 0.0])).abs().amax(dim=1)[members] < 0.3
     places = in_sight.nonzero()[:, 0]
     sources = places.roll(3)[:, None]
-    wrong = Followers(places, sources, torch.ones(len(places), 1))
-    stages = [Stage(1.0, targets, 1)]
+    wrong = UnseenMembers(places, sources, torch.ones(len(places), 1))
+    stages = [TargetStage(1.0, targets, 1)]
     assert not no_worse(wrong, end, original, crops, stages)
-    right = Followers(places, places[:, None], torch.ones(len(places), 1))
+    right = UnseenMembers(places, places[:, None], torch.ones(len(places), 1))
     assert no_worse(right, end, original, crops, stages)
