@@ -18,7 +18,7 @@ import tyro
 from progdf.__main__ import guarded
 from progdf.cli.options import parsed
 from progdf.errors import ProgdfError
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 
 from .table import Table, machine, put_tables
 
@@ -99,12 +99,14 @@ def main(argv: Sequence[str]) -> int:
             print(table.markdown() + "\n", flush=True)
     if options.json:
         written = {"machine": machine(), "tables": [asdict(table) for table in tables]}
-        with written_whole(options.json) as beside:
-            beside.write_text(json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        with atomic_write(options.json) as temporary_file:
+            temporary_file.write_text(
+                json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+            )
     if options.markdown:
         filled = put_tables(options.markdown.read_text(encoding="utf-8"), tables)
-        with written_whole(options.markdown) as beside:
-            beside.write_text(filled, encoding="utf-8")
+        with atomic_write(options.markdown) as temporary_file:
+            temporary_file.write_text(filled, encoding="utf-8")
     return 0
 
 

@@ -15,7 +15,7 @@ from progdf.camera import Camera
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.demo_scenes import AnalyticEdit
-from progdf.field import BakedField, FieldJudge
+from progdf.field import BakedField, FieldEvaluator
 from progdf.field.evaluate import Field
 from progdf.field.ranks import decibels
 from progdf.field.rendered import Render
@@ -52,7 +52,7 @@ class KnownCourse:
     strengths: Tensor
     offsets: Tensor
     truth: Callable[[float], Tensor]
-    judge: FieldJudge
+    judge: FieldEvaluator
     look: Render
     weights: Tensor
     unseen: Render
@@ -93,7 +93,7 @@ def known_course(
     offsets = torch.stack([truth(float(s)) for s in strengths])
     seen, unseen = cameras[::11][:3], cameras[5::10][:2]
     shown = _changed_pixels(scene, members, offsets, unseen)
-    judge = FieldJudge(strengths, offsets, shown, truth)
+    judge = FieldEvaluator(strengths, offsets, shown, truth)
     visible = sum(
         (
             alpha_weights(scene, camera, torch.ones(camera.height, camera.width))[members, 2].float()

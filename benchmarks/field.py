@@ -23,7 +23,7 @@ from progdf.demo_scenes import bear, bear_edits
 from progdf.field import fit_separable
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.rasterize import set_threads
 from progdf.rasterize.cpu.parallel import threads
 
@@ -54,9 +54,9 @@ def tables(recorded: Sequence[KnownCourse] = (), plot: Path | None = None) -> li
     courses = [*known, *recorded]
     forms = [form for course in courses for form in (*baked_forms(course), *network_forms(course))]
     if plot is not None:
-        with written_whole(plot) as beside:
+        with atomic_write(plot) as temporary_file:
             drawn = draw_forms(forms).quantize(128, kmeans=3, dither=Image.Dither.NONE)
-            drawn.save(beside, format="PNG", optimize=True)
+            drawn.save(temporary_file, format="PNG", optimize=True)
     return [field_table(forms), floor_table(courses), _compose_table()]
 
 

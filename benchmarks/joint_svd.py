@@ -11,9 +11,9 @@ from progdf.field.baked import AttributeBases, BakedField
 from progdf.field.separable import (
     channel_weights,
     check_trajectory,
-    follow,
-    leading_modes,
+    fit_amplitude,
     moving_attributes,
+    principal_modes,
     stored_bases,
 )
 
@@ -46,19 +46,19 @@ def fit_joint(
         raise ValueError(f"rank is {rank}, expected 0 or more")
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     courses = {
-        name: follow(offsets[:, :, columns], spread[:, columns])
+        name: fit_amplitude(offsets[:, :, columns], spread[:, columns])
         for name, columns in moving_attributes(offsets).items()
     }
     gram = torch.zeros(len(strengths), len(strengths), dtype=torch.float64)
     for course in courses.values():
         power = float(course.gram.diagonal().sum())
         gram += course.gram / power if power > 0 else 0.0
-    mix, table = (part[:, :rank] for part in leading_modes(gram))
+    mix, table = (part[:, :rank] for part in principal_modes(gram))
     attributes = {}
     for name, course in courses.items():
         exact = (mix.T.float() @ course.residual.flatten(1)).reshape(-1, *course.offsets.shape[1:])
         rest, step = stored_bases(exact, torch.int8)
-        coefficients = torch.cat([course.lead[:, None], table.float()], dim=1)
+        coefficients = torch.cat([course.amplitude[:, None], table.float()], dim=1)
         coefficients[[0, -1]] = 0.0
         coefficients[-1, 0] = 1.0
         attributes[name] = AttributeBases(course.offsets[-1].contiguous(), rest, step, coefficients)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.field.evaluate import FieldJudge
+from progdf.field.evaluate import FieldEvaluator
 from progdf.field.separable import channel_weights, check_trajectory, moving_attributes
 from progdf.scene.neighbors import nearest_rows
 
@@ -61,7 +61,7 @@ def position_floor(
     offsets: Tensor,
     places: Tensor,
     visibility: Tensor | None = None,
-    judge: FieldJudge | None = None,
+    judge: FieldEvaluator | None = None,
 ) -> PositionFloor:
     """What a field of the position alone can know of a trajectory, measured without training one.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from progdf.field import FieldJudge
+from progdf.field import FieldEvaluator
 from trainer.fit.fit import visibility
 from trainer.pipeline.fit_and_report import load_evaluator
 from trainer.pipeline.reopen import render_run_views, reopen_run
@@ -38,7 +38,7 @@ def recorded_course(root: Path) -> KnownCourse:
         trajectory.s,
         offsets,
         trajectory.at,
-        FieldJudge(trajectory.s, offsets, evaluator),
+        FieldEvaluator(trajectory.s, offsets, evaluator),
         look,
         visibility(run.scene, run.region.members, setup.train),
         evaluator,

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from progdf.io.atomic import disk_full, written_whole
+from progdf.io.atomic import atomic_write, disk_full
 from progdf.io.user_folders import state_folder
 
 from .errors import ProgdfError
@@ -117,8 +117,8 @@ def _kept_details() -> str:
         path = folder / "crash.txt" if folder.name == "progdf" else folder / f"progdf-crash-{os.getpid()}.txt"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with written_whole(path) as beside:
-                beside.write_text(details, encoding="utf-8", errors="backslashreplace")
+            with atomic_write(path) as temporary_file:
+                temporary_file.write_text(details, encoding="utf-8", errors="backslashreplace")
         except (OSError, ProgdfError):
             continue
         return f"please report it with {path}"

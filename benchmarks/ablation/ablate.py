@@ -18,10 +18,10 @@ from torch import Tensor
 from benchmarks.table import machine
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
-from progdf.field.remap import same
+from progdf.field.remap import identity_remap
 from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
-from progdf.io.atomic import make_folder, written_whole
+from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import write_image
 from progdf.io.json_values import decode_json
 from progdf.metrics.slider import slider_statistics
@@ -172,10 +172,10 @@ def _fitted(
         return fit_keyframes(trajectory.s, offsets, 2), {}
     target = shared.options.target_psnr
     fitted = fit_field(trajectory, shared.seen, shared.evaluator, shared.weights, "auto", target)
-    field, dial = fitted.chosen.field, same()
+    field, remap = fitted.chosen.field, identity_remap()
     if resolve_slider(options.slider, options.editor, trajectory.strengths) == "even":
-        field, dial = equalize_slider(field, shared.setup)
-    return field, {strength: dial.at(s) for s, strength in trajectory.asked}
+        field, remap = equalize_slider(field, shared.setup)
+    return field, {strength: remap.at(s) for s, strength in trajectory.asked}
 
 
 def _judged(
@@ -245,7 +245,7 @@ def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> 
     editor = [(image * 255).round() / 255 for image in editor_strip(evaluator, shared.columns, _WIDTH)]
     caption = f"held-out view {evaluator.names[best_view(evaluator)]}; PSNR to the editor's own pictures"
     write_image(root / "ablation.png", sheet_of(editor, outcomes, strips, shared.columns, title, caption))
-    with written_whole(root / "ablation.md") as beside:
+    with atomic_write(root / "ablation.md") as beside:
         beside.write_text(table.markdown() + "\n", encoding="utf-8")
     rows: list[Mapping[str, Any]] = [asdict(outcome) for outcome in outcomes]
     about = {"machine": machine(), "note": note, "perceptual": measure, "options": plain(options)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .bake import NeuralForm, baked_neural
 from .baked import AttributeBases, BakedField
 from .choose import Choice, choose_field
-from .evaluate import Candidate, FieldJudge
+from .evaluate import Candidate, FieldEvaluator
 from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
 from .neural_fit import NeuralSettings, fit_neural
@@ -16,7 +16,7 @@ __all__ = [
     "BakedField",
     "Candidate",
     "Choice",
-    "FieldJudge",
+    "FieldEvaluator",
     "NeuralField",
     "NeuralForm",
     "NeuralSettings",

@@ -1,7 +1,7 @@
 """Baking: a network becomes the separable field that the viewer runs (docs/method.md 5).
 
-The field is asked at nodes, both ends are pinned to what they must be, and the course between is factored.
-Nodes and factors are chosen when the edit is made and kept in its file, with the error that they cost.
+The field is evaluated at nodes, both ends are pinned to what they must be, and the trajectory between them is
+factored. Nodes and factors are chosen when the edit is made and kept in its file, with the error of both.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from .evaluate import Field, sample_strengths
 from .neural import NeuralField
 from .ranks import decibels
 from .rendered import Render
-from .separable import fit_separable, follow, leading_modes, moving_attributes
+from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes
 
 TOLERANCE = 0.01
-"""Root mean square error of the factoring, as a share of the course's own root mean square."""
+"""Root mean square error of the factoring, as a share of the trajectory's own root mean square."""
 
 MOST_NODES, MOST_RANK = 257, 16
 
@@ -39,13 +39,13 @@ class BakePlan:
     Args:
         nodes: strengths at which the field is asked, ascending from 0 to 1. [S] float32
         ranks: bases beside the full offset, by attribute
-        pull: share of what the field misses of the recorded end that is added at each node, by attribute, 0
+        end_correction: how much of what the field misses of the end is added at each node, by attribute, 0
             first and 1 last; no entry: nothing is missed. [S] float32
     """
 
     nodes: Tensor
     ranks: Mapping[str, int]
-    pull: Mapping[str, Tensor]
+    end_correction: Mapping[str, Tensor]
 
     def __post_init__(self) -> None:
         if self.nodes.ndim != 1 or not 2 <= len(self.nodes) <= MOST_NODES:
@@ -53,10 +53,10 @@ class BakePlan:
         for name, rank in self.ranks.items():
             if not 0 <= rank <= MOST_RANK:
                 raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MOST_RANK}")
-        for name, share in self.pull.items():
+        for name, share in self.end_correction.items():
             if share.shape != self.nodes.shape or share.dtype != torch.float32:
                 raise ValueError(
-                    f"the pull of {name} is {list(share.shape)}, expected {len(self.nodes)} nodes"
+                    f"the end correction of {name} is {list(share.shape)}, expected {len(self.nodes)} nodes"
                 )
 
 
@@ -84,8 +84,8 @@ class NeuralForm:
             ValueError: not as many Gaussians, or a number of the network is not usable.
         """
         network = self.network
-        course = pinned_course(network.bound(rows), full_end(network), self.plan)
-        baked = fit_separable(self.plan.nodes, course, self.plan.ranks, recorded=network.recorded)
+        trajectory = pinned_trajectory(network.bound(rows), full_end(network), self.plan)
+        baked = fit_separable(self.plan.nodes, trajectory, self.plan.ranks, recorded=network.recorded)
         return replace(baked, kind="neural", origin=self)
 
 
@@ -115,16 +115,16 @@ def baked_neural(
         network: trained
         rows: raw values of the members before the edit, packed. [M,≥14]
         truth: the recorded offsets at any strength; tells how the network's error at the end goes with that
-            on the way. None: as its course goes
+            on the way. None: as its trajectory goes
         render: of some views; None leaves the error in decibels out
         tolerance: see `TOLERANCE`
     """
     field, end = network.bound(rows), full_end(network)
     large = network.parameters - network.codes.numel() > _LARGE
     nodes = bake_nodes(network.shape.bins, network.shape.hard, _FEW_PER_BIN if large else _PER_BIN)
-    plan = BakePlan(nodes, {}, _pull(field, end, nodes, truth))
-    course = pinned_course(field, end, plan)
-    plan = replace(plan, ranks=_ranks(course, tolerance))
+    plan = BakePlan(nodes, {}, _end_corrections(field, end, nodes, truth))
+    trajectory = pinned_trajectory(field, end, plan)
+    plan = replace(plan, ranks=_ranks(trajectory, tolerance))
     own = network.shape.inputs == "own"
     form = NeuralForm(network, plan, rows_hash(rows) if own else "")
     baked = form.baked(rows)
@@ -140,7 +140,7 @@ def bake_nodes(bins: int, hard: bool, per_bin: int = _PER_BIN) -> Tensor:
     return torch.cat([torch.tensor([0.0, _JUMP]), inner, torch.tensor([1.0 - _JUMP, 1.0])])
 
 
-def pinned_course(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
+def pinned_trajectory(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
     """The field at the nodes, zero at the first and the recorded end at the last. [S,M,C] float32
 
     What the field misses of the end is spread over the way, so that nothing jumps where the slider arrives.
@@ -149,8 +149,8 @@ def pinned_course(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
     asked[0] = 0.0
     missing = end - asked[-1]
     for name, columns in moving_attributes(asked).items():
-        if name in plan.pull:
-            asked[:, :, columns] += plan.pull[name][:, None, None] * missing[:, columns]
+        if name in plan.end_correction:
+            asked[:, :, columns] += plan.end_correction[name][:, None, None] * missing[:, columns]
     asked[-1] = end
     return asked
 
@@ -160,29 +160,31 @@ def bake_error(field: Field, baked: BakedField, plan: BakePlan, render: Render |
     end = baked.offsets(1.0)
     missing = end - field.offsets(1.0)
     wrong = whole = 0.0
-    heard = []
+    psnrs = []
     for s in sample_strengths():
         pinned = field.offsets(s)
         right = int(torch.searchsorted(plan.nodes, torch.tensor(s)).clamp(1, len(plan.nodes) - 1))
         share = (s - float(plan.nodes[right - 1])) / float(plan.nodes[right] - plan.nodes[right - 1])
         for name, columns in moving_attributes(end[None]).items():
-            if name in plan.pull:
-                pull = torch.lerp(plan.pull[name][right - 1], plan.pull[name][right], share)
-                pinned[:, columns] += pull * missing[:, columns]
+            if name in plan.end_correction:
+                end_correction = torch.lerp(
+                    plan.end_correction[name][right - 1], plan.end_correction[name][right], share
+                )
+                pinned[:, columns] += end_correction * missing[:, columns]
         found = baked.offsets(s)
         wrong += float((found - pinned).double().square().sum())
         whole += float(pinned.double().square().sum())
         if render is not None:
             with torch.no_grad():
                 difference = render(found) - render(pinned)
-            heard.append(decibels(float(difference.double().square().mean()) if len(difference) else 0.0))
+            psnrs.append(decibels(float(difference.double().square().mean()) if len(difference) else 0.0))
     error = {"rms": (wrong / whole) ** 0.5 if whole > 0 else 0.0}
-    if heard:
-        error |= {"psnr_mean": sum(heard) / len(heard), "psnr_worst": min(heard)}
+    if psnrs:
+        error |= {"psnr_mean": sum(psnrs) / len(psnrs), "psnr_worst": min(psnrs)}
     return {name: float(f"{value:.4g}") for name, value in error.items()}
 
 
-def _pull(
+def _end_corrections(
     field: Field, end: Tensor, nodes: Tensor, truth: Callable[[float], Tensor] | None
 ) -> dict[str, Tensor]:
     """How much of what is missing at the end is missing at each node, by attribute; see `BakePlan`."""
@@ -195,7 +197,7 @@ def _pull(
         if power == 0.0:
             continue
         if truth is None:
-            share = follow(asked[:, :, columns], torch.ones_like(end[:, columns])).lead
+            share = fit_amplitude(asked[:, :, columns], torch.ones_like(end[:, columns])).amplitude
         else:
             errors = [truth(float(s))[:, columns] - a[:, columns] for s, a in zip(nodes, asked, strict=True)]
             share = torch.tensor([float((e.double() * least).sum()) / power for e in errors])
@@ -204,14 +206,14 @@ def _pull(
     return found
 
 
-def _ranks(course: Tensor, tolerance: float) -> dict[str, int]:
-    """The fewest bases with which each attribute's course is met to `tolerance`. [S,M,C]"""
+def _ranks(trajectory: Tensor, tolerance: float) -> dict[str, int]:
+    """The fewest bases with which each attribute's trajectory is met to `tolerance`. [S,M,C]"""
     ranks = {}
-    for name, columns in moving_attributes(course).items():
-        own = follow(course[:, :, columns], torch.ones_like(course[0, :, columns]))
+    for name, columns in moving_attributes(trajectory).items():
+        own = fit_amplitude(trajectory[:, :, columns], torch.ones_like(trajectory[0, :, columns]))
         allowed = tolerance**2 * float(own.offsets.double().square().sum())
         power = torch.linalg.eigvalsh(own.gram).flip(0).clamp(min=0)
         left = float(power.sum()) - power.cumsum(0)
         needed = 0 if float(power.sum()) <= allowed else 1 + int((left > allowed).sum())
-        ranks[name] = min(needed, MOST_RANK, leading_modes(own.gram)[0].shape[1])
+        ranks[name] = min(needed, MOST_RANK, principal_modes(own.gram)[0].shape[1])
     return ranks

@@ -1,7 +1,7 @@
 """Which field to ship: ranks by rendered error per byte, kinds by the fewest bytes that meet the target
 (docs/method.md 5).
 
-Nothing is fitted and rendered only to be thrown away: `rendered_courses` looks at the trajectory once,
+Nothing is fitted and rendered only to be thrown away: `rendered_trajectories` looks at the trajectory once,
 ranks are grown on what that predicts, and the pictures have the last word.
 """
 
@@ -16,16 +16,16 @@ import torch
 from torch import Tensor
 
 from .baked import BakedField
-from .evaluate import Candidate, FieldJudge, sample_strengths
+from .evaluate import Candidate, FieldEvaluator, sample_strengths
 from .keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
-from .ranks import emphasised_modes, expected_worst, grown_ranks
-from .rendered import Render, RenderedCourses, picture_gram, rendered_courses
-from .separable import channel_weights, check_trajectory, leading_modes, moving_attributes, stored_attribute
+from .ranks import emphasized_modes, expected_worst, grown_ranks
+from .rendered import Render, RenderedTrajectories, picture_gram, rendered_trajectories
+from .separable import channel_weights, check_trajectory, moving_attributes, principal_modes, stored_attribute
 
 __all__ = [
     "Candidate",
     "Choice",
-    "FieldJudge",
+    "FieldEvaluator",
     "Kind",
     "choose_field",
     "sample_strengths",
@@ -71,7 +71,7 @@ def choose_field(
     kind: Kind = "auto",
     target: float = 40.0,
     budget: float | None = None,
-    judge: FieldJudge | None = None,
+    evaluator: FieldEvaluator | None = None,
     recorded: Sequence[float] | None = None,
 ) -> Choice:
     """The smallest field whose worst PSNR against the trajectory reaches the target, or the best in a budget.
@@ -94,24 +94,26 @@ def choose_field(
         ValueError: no trajectory, or weights that do not fit.
     """
     check_trajectory(strengths, offsets)
-    judge = judge or FieldJudge(strengths, offsets, render)
+    evaluator = evaluator or FieldEvaluator(strengths, offsets, render)
     tried: list[Candidate] = []
     gram: Tensor | None = None
     if kind == "lossless":
         everything = fit_lossless(strengths, offsets, recorded)
-        found = judge.candidate(everything, f"all {len(strengths)} snapshots")
+        found = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
         fits = budget is None or everything.bytes_per_member <= budget
         met = fits and (not math.isfinite(target) or found.worst >= target)
         return Choice(found, met, (found,), "nothing is left out")
     if kind in ("auto", "separable"):
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
-        seen = rendered_courses(offsets, spread, render)
+        seen = rendered_trajectories(offsets, spread, render)
         gram = seen.pictures
-        tried += _grown(seen, strengths, target, budget, judge, recorded)
+        tried += _grown(seen, strengths, target, budget, evaluator, recorded)
     if kind in ("auto", "keyframes"):
         limit = min([budget or math.inf, *(c.field.bytes_per_member for c in tried if c.worst >= target)])
         gram = picture_gram(offsets, render) if gram is None else gram
-        tried += _keyframes(strengths, offsets, gram, target, limit, judge, recorded, curves=kind != "auto")
+        tried += _keyframes(
+            strengths, offsets, gram, target, limit, evaluator, recorded, curves=kind != "auto"
+        )
     return _chosen(tuple(tried), target, budget)
 
 
@@ -134,34 +136,34 @@ def _chosen(tried: tuple[Candidate, ...], target: float, budget: float | None) -
 
 
 def separable_within(
-    seen: RenderedCourses,
+    seen: RenderedTrajectories,
     strengths: Tensor,
     budget: float,
-    judge: FieldJudge,
+    evaluator: FieldEvaluator,
     recorded: Sequence[float] | None = None,
 ) -> Candidate:
     """The separable field with the ranks expected to be best within `budget` bytes a member."""
-    return _separable(seen, strengths, grown_ranks(seen, budget)[-1], judge, recorded)
+    return _separable(seen, strengths, grown_ranks(seen, budget)[-1], evaluator, recorded)
 
 
 def _grown(
-    seen: RenderedCourses,
+    seen: RenderedTrajectories,
     strengths: Tensor,
     target: float,
     budget: float | None,
-    judge: FieldJudge,
+    evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
 ) -> list[Candidate]:
     """Separable fields along the path of growing ranks, until one just meets the target."""
     path = grown_ranks(seen, budget or MOST_BYTES)
     expected = expected_worst(seen, path)
-    widths = {name: course.offsets.shape[2] for name, course in seen.courses.items()}
+    widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     stored = [sum((4 + ranks[name]) * width for name, width in widths.items()) for ranks in path]
     tried: dict[int, Candidate] = {}
 
     def look(i: int) -> Candidate:
         if i not in tried:
-            tried[i] = _separable(seen, strengths, path[i], judge, recorded, target)
+            tried[i] = _separable(seen, strengths, path[i], evaluator, recorded, target)
         return tried[i]
 
     # the prediction leads to the place, each look corrects it, until the smallest that holds is cornered
@@ -181,10 +183,10 @@ def _grown(
 
 
 def _separable(
-    seen: RenderedCourses,
+    seen: RenderedTrajectories,
     strengths: Tensor,
     ranks: Mapping[str, int],
-    judge: FieldJudge,
+    evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
     enough: float = math.inf,
 ) -> Candidate:
@@ -196,13 +198,16 @@ def _separable(
     ticks = tuple(strengths.tolist() if recorded is None else recorded)
     label = ", ".join(f"{name} {rank}" for name, rank in ranks.items() if rank) or "rank 0"
     found = []
-    for modes in (emphasised_modes(seen, ranks), {n: leading_modes(c.gram) for n, c in seen.courses.items()}):
+    for modes in (
+        emphasized_modes(seen, ranks),
+        {n: principal_modes(c.gram) for n, c in seen.trajectories.items()},
+    ):
         attributes = {
-            name: stored_attribute(course, modes[name][0][:, : ranks[name]])
-            for name, course in seen.courses.items()
+            name: stored_attribute(trajectory, modes[name][0][:, : ranks[name]])
+            for name, trajectory in seen.trajectories.items()
         }
         field = BakedField("separable", strengths.float(), attributes, seen.channels, ticks)
-        found.append(judge.candidate(field, f"separable ({label})"))
+        found.append(evaluator.candidate(field, f"separable ({label})"))
         if found[-1].worst >= enough or not any(ranks.values()):
             break
     return max(found, key=lambda candidate: candidate.worst)
@@ -214,7 +219,7 @@ def _keyframes(
     gram: Tensor,
     target: float,
     most_bytes: float,
-    judge: FieldJudge,
+    evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
     curves: bool,
 ) -> list[Candidate]:
@@ -229,7 +234,7 @@ def _keyframes(
         kept = bending_snapshots(strengths, gram, count)
         forms: tuple[Between, ...] = ("linear", "cubic") if curves and count > 2 else ("linear",)
         here = [
-            judge.candidate(
+            evaluator.candidate(
                 fit_keyframes(strengths, offsets, count, recorded, torch.int8, kept, between),
                 f"{count} keyframes" + (", cubic" if between == "cubic" else ""),
             )

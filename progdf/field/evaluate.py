@@ -59,7 +59,7 @@ def sample_strengths() -> tuple[float, ...]:
     return tuple((i + 1) / (SAMPLES + 1) for i in range(SAMPLES))
 
 
-class FieldJudge:
+class FieldEvaluator:
     """Renders fields and compares them with the trajectory, whose pictures are made once.
 
     Args:

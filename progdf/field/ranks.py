@@ -8,18 +8,18 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from .rendered import Modes, RenderedCourses
+from .rendered import Modes, RenderedTrajectories
 
 NO_DIFFERENCE = 99.0
 """PSNR, dB, that stands for pictures which do not differ."""
 
 
-def grown_ranks(seen: RenderedCourses, most_bytes: float) -> list[dict[str, int]]:
+def grown_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
     """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
-    widths = {name: course.offsets.shape[2] for name, course in seen.courses.items()}
+    widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     evenly = torch.ones(seen.gram.shape[1], dtype=torch.float64)
     modes = seen.modes(evenly)
-    ranks = dict.fromkeys(seen.courses, 0)
+    ranks = dict.fromkeys(seen.trajectories, 0)
     stored = 4.0 * sum(widths.values())
     path = [dict(ranks)]
     now = _hardness(seen.mse(modes, ranks))
@@ -46,7 +46,7 @@ def _hardness(mse: Tensor) -> float:
     return float(mse.pow(4).mean().pow(0.25))
 
 
-def emphasised_modes(seen: RenderedCourses, ranks: Mapping[str, int]) -> Modes:
+def emphasized_modes(seen: RenderedTrajectories, ranks: Mapping[str, int]) -> Modes:
     """Bases for these ranks, with snapshots of large error made to count more until the worst is least."""
     emphasis = torch.ones(seen.gram.shape[1], dtype=torch.float64)
     best = modes = seen.modes(emphasis)
@@ -64,7 +64,7 @@ def emphasised_modes(seen: RenderedCourses, ranks: Mapping[str, int]) -> Modes:
     return best
 
 
-def expected_worst(seen: RenderedCourses, path: Sequence[Mapping[str, int]]) -> list[float]:
+def expected_worst(seen: RenderedTrajectories, path: Sequence[Mapping[str, int]]) -> list[float]:
     """Least PSNR over the slider that each of these ranks should give at least, dB."""
     modes = seen.modes(torch.ones(seen.gram.shape[1], dtype=torch.float64))
     return [decibels(float(seen.mse(modes, ranks).max())) for ranks in path]

@@ -14,7 +14,7 @@ _NEAR = 1 / 80
 
 
 @dataclass(frozen=True)
-class Dial:
+class SliderRemap:
     """Where on a new slider lies what the old one showed, linear between knots.
 
     Args:
@@ -32,38 +32,38 @@ class Dial:
             raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
         for knots in (self.old, self.new):
             if float(knots[0]) != 0.0 or float(knots[-1]) != 1.0 or bool((knots.diff() <= 0).any()):
-                raise ValueError("the knots of a dial must ascend from 0 to 1")
+                raise ValueError("the knots of a remap must ascend from 0 to 1")
 
     def __call__(self, s: Tensor) -> Tensor:
         """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
-        return interpolated(s.double(), self.old, self.new)
+        return interpolate(s.double(), self.old, self.new)
 
     def at(self, s: float) -> float:
         """The same of one strength."""
         return float(self(torch.tensor([s], dtype=torch.float64)))
 
 
-def same() -> Dial:
-    """The dial that changes nothing."""
+def identity_remap() -> SliderRemap:
+    """The slider remap that changes nothing."""
     ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
-    return Dial(ends, ends)
+    return SliderRemap(ends, ends)
 
 
-def interpolated(x: Tensor, nodes: Tensor, values: Tensor) -> Tensor:
+def interpolate(x: Tensor, nodes: Tensor, values: Tensor) -> Tensor:
     """Piecewise linear through (nodes, values). [n], [k], [k] -> [n]"""
     right = torch.searchsorted(nodes, x).clamp(1, len(nodes) - 1)
     share = (x - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
     return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
 
 
-def dialled(field: BakedField, dial: Dial) -> BakedField:
-    """The field under another dial: its nodes move, and where the dial bends far from any, it gets one more.
+def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
+    """The field under another slider: its nodes move, and where the remap bends far from any, one is added.
 
     No base is touched: the bytes per member are the same, and so are both ends, bit for bit.
 
     Args:
         field: no network, whose slider is learned
-        dial: from the field's strengths to the wanted ones
+        remap: from the field's strengths to the wanted ones
 
     Raises:
         ValueError: the field is a network's.
@@ -71,9 +71,9 @@ def dialled(field: BakedField, dial: Dial) -> BakedField:
     if field.origin is not None:
         raise ValueError("a network's slider is its own; only separable and keyframe fields take another")
     nodes = field.nodes.double()
-    far = (dial.old[:, None] - nodes).abs().amin(dim=1) > _NEAR
-    asked = torch.cat([nodes, dial.old[far]]).sort().values
-    moved = dial(asked).float()
+    far = (remap.old[:, None] - nodes).abs().amin(dim=1) > _NEAR
+    asked = torch.cat([nodes, remap.old[far]]).sort().values
+    moved = remap(asked).float()
     kept = torch.ones(len(asked), dtype=torch.bool)
     kept[1:] = moved.diff() > 0  # single precision may close a gap
     kept[:-1] &= moved[:-1] < 1.0
@@ -84,5 +84,5 @@ def dialled(field: BakedField, dial: Dial) -> BakedField:
         )
         for name, bases in field.attributes.items()
     }
-    ticks = dial(torch.tensor(field.recorded, dtype=torch.float64)).tolist()
+    ticks = remap(torch.tensor(field.recorded, dtype=torch.float64)).tolist()
     return replace(field, nodes=moved[kept], attributes=attributes, recorded=tuple(ticks))

@@ -1,4 +1,4 @@
-"""The trajectory as pictures see it: how much each attribute's course beside its straight end shows, and
+"""The trajectory as pictures see it: how much each attribute's trajectory beside its straight end shows, and
 with what.
 
 Numbers of different attributes cannot be compared, and an error that no picture shows is none. So every
@@ -17,7 +17,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from .separable import Course, follow, leading_modes, moving_attributes
+from .separable import AttributeTrajectory, fit_amplitude, moving_attributes, principal_modes
 
 Render = Callable[[Tensor], Tensor]
 """Offsets of the members -> the pixels that count, of some views side by side. [M,C] -> [P,3]"""
@@ -32,22 +32,22 @@ UNSEEN = 0.1
 """Say of the bare numbers beside the pictures, for members that these views do not show."""
 
 Modes = Mapping[str, tuple[Tensor, Tensor]]
-"""By attribute, as `separable.leading_modes` gives them."""
+"""By attribute, as `separable.principal_modes` gives them."""
 
 
 @dataclass(frozen=True)
-class RenderedCourses:
+class RenderedTrajectories:
     """What straightening each attribute changes in the pictures.
 
     Args:
-        courses: by attribute
+        trajectories: by attribute
         gram: inner products of these changes over pixels and colours. [A,T,A,T] float64
         pictures: inner products of what the snapshots change in the pictures. [T,T] float64
         values: numbers that each inner product sums over
         channels: width of a packed row
     """
 
-    courses: Mapping[str, Course]
+    trajectories: Mapping[str, AttributeTrajectory]
     gram: Tensor
     pictures: Tensor
     values: int
@@ -56,25 +56,25 @@ class RenderedCourses:
     def modes(self, emphasis: Tensor) -> Modes:
         """Each attribute's best bases, when the snapshots count as `emphasis` says. [T] float64, > 0"""
         found = {}
-        for i, (name, course) in enumerate(self.courses.items()):
+        for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
-            parameters = float(course.gram.diagonal().sum())
+            parameters = float(trajectory.gram.diagonal().sum())
             share = UNSEEN * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
-            found[name] = leading_modes(seen + share * course.gram, emphasis)
+            found[name] = principal_modes(seen + share * trajectory.gram, emphasis)
         return found
 
     def mse(self, modes: Modes, ranks: Mapping[str, int]) -> Tensor:
         """Expected mean squared error of the pictures at each snapshot. [T] float64"""
         snapshots = self.gram.shape[1]
-        left = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.courses), 1, 1)
-        for i, name in enumerate(self.courses):
+        left = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.trajectories), 1, 1)
+        for i, name in enumerate(self.trajectories):
             mix, table = (part[:, : ranks.get(name, 0)] for part in modes[name])
             left[i] -= table @ mix.T  # row t: what remains there, as a sum of the rows of pixels
         half = torch.einsum("ats,asbu->atbu", left, self.gram)
         return torch.einsum("atbu,btu->t", half, left).clamp(min=0) / self.values
 
 
-def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> RenderedCourses:
+def rendered_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> RenderedTrajectories:
     """Straighten every attribute at every snapshot, and look.
 
     Args:
@@ -83,8 +83,9 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
         render: called 2 + (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
     """
     attributes = moving_attributes(offsets)
-    courses = {
-        name: follow(offsets[:, :, columns], weights[:, columns]) for name, columns in attributes.items()
+    trajectories = {
+        name: fit_amplitude(offsets[:, :, columns], weights[:, columns])
+        for name, columns in attributes.items()
     }
     snapshots = len(offsets)
     looked = _looked_at(snapshots)
@@ -98,7 +99,7 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
             seen.append((pixels - original)[::stride].flatten())
             for i, (name, columns) in enumerate(attributes.items()):
                 straight = offsets[t].clone()
-                straight[:, columns] = courses[name].lead[t] * offsets[-1, :, columns]
+                straight[:, columns] = trajectories[name].amplitude[t] * offsets[-1, :, columns]
                 changes[i].append((pixels - render(straight))[::stride].flatten())
         seen.append((render(offsets[-1]) - original)[::stride].flatten())
     spread = _between(looked, snapshots)
@@ -106,11 +107,11 @@ def rendered_courses(offsets: Tensor, weights: Tensor, render: Render) -> Render
     pictures = spread @ (shown @ shown.T).double() @ spread.T
     gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
     if not attributes or snapshots < 3:
-        return RenderedCourses(courses, gram, pictures, 1, offsets.shape[2])
+        return RenderedTrajectories(trajectories, gram, pictures, 1, offsets.shape[2])
     rows = torch.cat([torch.stack([*own, still]) for own in changes])
     products = (rows @ rows.T).double().reshape(len(attributes), len(looked), len(attributes), len(looked))
     gram = torch.einsum("ts,asbu,vu->atbv", spread, products, spread)
-    return RenderedCourses(courses, gram, pictures, max(1, rows.shape[1]), offsets.shape[2])
+    return RenderedTrajectories(trajectories, gram, pictures, max(1, rows.shape[1]), offsets.shape[2])
 
 
 def picture_gram(offsets: Tensor, render: Render) -> Tensor:

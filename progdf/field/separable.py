@@ -26,7 +26,7 @@ LEVELS = 127
 
 
 @dataclass(frozen=True)
-class Course:
+class AttributeTrajectory:
     """One attribute's trajectory beside its full offset.
 
     Args:
@@ -38,13 +38,13 @@ class Course:
 
     offsets: Tensor
     weights: Tensor
-    lead: Tensor
+    amplitude: Tensor
     gram: Tensor
 
     @property
     def residual(self) -> Tensor:
         """What a_0 times the full offset leaves; 0 at both ends. [T,M,c]"""
-        left = torch.addcmul(self.offsets, self.lead[:, None, None], self.offsets[-1], value=-1)
+        left = torch.addcmul(self.offsets, self.amplitude[:, None, None], self.offsets[-1], value=-1)
         left[[0, -1]] = 0.0
         return left
 
@@ -90,21 +90,21 @@ def moving_attributes(offsets: Tensor) -> dict[str, slice]:
     }
 
 
-def follow(offsets: Tensor, weights: Tensor) -> Course:
-    """One attribute's course. [T,M,c] float32, [M,c] ≥ 0"""
+def fit_amplitude(offsets: Tensor, weights: Tensor) -> AttributeTrajectory:
+    """One attribute's trajectory. [T,M,c] float32, [M,c] ≥ 0"""
     root = weights.sqrt()
     end = (offsets[-1] * root).flatten()
     power = float(end.double() @ end.double())
-    lead = torch.linspace(0, 1, len(offsets)).double()
+    amplitude = torch.linspace(0, 1, len(offsets)).double()
     if power > 0:
-        lead = ((offsets * root).flatten(1) @ end).double() / power
-    lead[0], lead[-1] = 0.0, 1.0
-    course = Course(offsets, weights, lead.float(), torch.zeros(0))
-    rows = (course.residual * root).flatten(1)
-    return replace(course, gram=(rows @ rows.T).double())
+        amplitude = ((offsets * root).flatten(1) @ end).double() / power
+    amplitude[0], amplitude[-1] = 0.0, 1.0
+    trajectory = AttributeTrajectory(offsets, weights, amplitude.float(), torch.zeros(0))
+    rows = (trajectory.residual * root).flatten(1)
+    return replace(trajectory, gram=(rows @ rows.T).double())
 
 
-def leading_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def principal_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The best bases of any number, by the inner products of the rows they shall explain (a weighted SVD).
 
     Args:
@@ -124,18 +124,20 @@ def leading_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tensor,
     return root[:, None] * vectors, vectors / root[:, None]
 
 
-def stored_attribute(course: Course, mix: Tensor, rest_type: torch.dtype = torch.int8) -> AttributeBases:
+def stored_attribute(
+    trajectory: AttributeTrajectory, mix: Tensor, rest_type: torch.dtype = torch.int8
+) -> AttributeBases:
     """Bases as stored, with coefficients solved for them as they are stored.
 
     Args:
-        course: the attribute's course
+        trajectory: the attribute's trajectory
         mix: how each basis beside the full offset is mixed from what that leaves. [T,R]
         rest_type: int8, float16 or float32
     """
-    full = course.offsets[-1].contiguous()
-    exact = (mix.T.float() @ course.residual.flatten(1)).reshape(-1, *full.shape)
+    full = trajectory.offsets[-1].contiguous()
+    exact = (mix.T.float() @ trajectory.residual.flatten(1)).reshape(-1, *full.shape)
     rest, step = stored_bases(exact, rest_type)
-    table = solved_coefficients(course.offsets, full, rest.float() * step[:, None], course.weights)
+    table = solved_coefficients(trajectory.offsets, full, rest.float() * step[:, None], trajectory.weights)
     return AttributeBases(full, rest, step, table)
 
 
@@ -202,13 +204,15 @@ def fit_separable(
     check_trajectory(strengths, offsets)
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     attributes = {
-        name: _fitted(follow(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type)
+        name: _fitted(
+            fit_amplitude(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type
+        )
         for name, columns in moving_attributes(offsets).items()
     }
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
 
 
-def _fitted(course: Course, rank: int, rest_type: torch.dtype) -> AttributeBases:
-    mix, _ = leading_modes(course.gram)
-    return stored_attribute(course, mix[:, :rank], rest_type)
+def _fitted(trajectory: AttributeTrajectory, rank: int, rest_type: torch.dtype) -> AttributeBases:
+    mix, _ = principal_modes(trajectory.gram)
+    return stored_attribute(trajectory, mix[:, :rank], rest_type)

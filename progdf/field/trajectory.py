@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import open_failure, written_whole
+from progdf.io.atomic import atomic_write, open_failure
 from progdf.io.json_values import decode_json, typed
 from progdf.io.tensors import read_tensors, write_tensors
 
@@ -101,8 +101,8 @@ def save_trajectory(
         **extra,
     }
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
-    with written_whole(path) as beside:
-        write_tensors(beside, tensors, header, checksum=True)
+    with atomic_write(path) as temporary_file:
+        write_tensors(temporary_file, tensors, header, checksum=True)
 
 
 def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:

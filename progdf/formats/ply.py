@@ -20,7 +20,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.io.atomic import open_failure, written_whole
+from progdf.io.atomic import atomic_write, open_failure
 
 from .load_report import LoadReport
 from .ply_header import ANTIALIASED_COMMENT, Element, PlyHeader, read_header
@@ -119,7 +119,7 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     head += [f"comment {ANTIALIASED_COMMENT}"] if scene.antialiased else []
     head += [f"element vertex {len(scene)}"]
     head += [f"property float {name}" for name in names]
-    with written_whole(path) as beside, beside.open("wb") as file:
+    with atomic_write(path) as temporary_file, temporary_file.open("wb") as file:
         file.write(("\n".join([*head, "end_header"]) + "\n").encode("ascii"))
         for start in range(0, len(scene), BLOCK_ROWS):
             part = {key: array[start : start + BLOCK_ROWS] for key, array in arrays.items()}

@@ -38,7 +38,7 @@ def packed_field(field: BakedField) -> tuple[dict[str, Tensor], dict[str, Any]]:
     network, plan = form.network, form.plan
     tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
     tensors |= {"nodes": plan.nodes, "end": network.end}
-    tensors |= {f"pull.{name}": share for name, share in plan.pull.items()}
+    tensors |= {f"pull.{name}": share for name, share in plan.end_correction.items()}
     if network.shape.code:
         tensors |= {"codes": network.codes, "code_step": network.code_step}
     described["network"] = {
@@ -87,6 +87,8 @@ def _unpacked_network(
         tensors.get("code_step", torch.zeros(0)),
         recorded,
     )
-    pull = {name.removeprefix("pull."): t for name, t in tensors.items() if name.startswith("pull.")}
-    plan = BakePlan(tensors["nodes"], table.ranks, pull)
+    end_correction = {
+        name.removeprefix("pull."): t for name, t in tensors.items() if name.startswith("pull.")
+    }
+    plan = BakePlan(tensors["nodes"], table.ranks, end_correction)
     return NeuralForm(network, plan, table.rows_sha256, table.bake_error)

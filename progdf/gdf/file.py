@@ -27,7 +27,7 @@ from progdf.errors import ProgdfError
 from progdf.field.bake import rows_hash
 from progdf.field.baked import BakedField
 from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
-from progdf.io.atomic import open_failure, written_whole
+from progdf.io.atomic import atomic_write, open_failure
 from progdf.io.tensors import table_of, write_tensors
 from progdf.region import Region
 
@@ -155,8 +155,8 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         allow_nan=False,
     )
     try:
-        with written_whole(path) as beside:
-            write_tensors(beside, tensors, file_metadata(header, tensors))
+        with atomic_write(path) as temporary_file:
+            write_tensors(temporary_file, tensors, file_metadata(header, tensors))
     except OSError as error:
         raise ProgdfError(
             f"{path} cannot be written ({error.strerror or error}); choose another place"

@@ -26,10 +26,10 @@ _A_DAY = 86400.0
 
 
 @contextmanager
-def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary file beside `path`, renamed to it when the block ends well and removed when it does not.
 
-        with written_whole("scene.ply") as beside:
+        with atomic_write("scene.ply") as beside:
             beside.write_bytes(…)
 
     A link stays and the file it leads to is replaced. A pipe or a device gets the bytes when all are there.
@@ -43,8 +43,8 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.is_dir():
         raise ProgdfError(f"{target} is a folder; give the name of a file in it")
     if target.exists() and not target.is_file():
-        with _copied_into(target) as beside:
-            yield beside
+        with _copied_into(target) as temporary_file:
+            yield temporary_file
         return
     if target.is_symlink():
         target = Path(os.path.realpath(target))
@@ -52,21 +52,21 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise ProgdfError(f"the folder {target.parent} does not exist; make it first")
     remove_abandoned(target.parent)
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
-    beside = target.parent / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}"
+    temporary_file = target.parent / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}"
     try:
-        _create(beside, target.stat().st_mode & 0o777 if target.exists() else None)
+        _create(temporary_file, target.stat().st_mode & 0o777 if target.exists() else None)
     except OSError as error:
         raise unwritable(target, error) from error
     try:
-        yield beside
-        os.replace(beside, target)
-    except (OSError, ProgdfError) as error:  # the latter of one within, which knows `beside` alone
+        yield temporary_file
+        os.replace(temporary_file, target)
+    except (OSError, ProgdfError) as error:  # the latter of one within, which knows `temporary_file` alone
         full = disk_full(error)
         if full is None:
             raise
         raise unwritable(target, full) from full
     finally:
-        beside.unlink(missing_ok=True)
+        temporary_file.unlink(missing_ok=True)
 
 
 def _create(path: Path, mode: int | None) -> None:
@@ -93,7 +93,7 @@ def _copied_into(target: Path) -> Iterator[Path]:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file's name is one that `written_whole` gives while it writes."""
+    """Whether a file's name is one that `atomic_write` gives while it writes."""
     return _TEMPORARY.fullmatch(name) is not None
 
 

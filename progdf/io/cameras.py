@@ -21,7 +21,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.lens import Lens
 
-from .atomic import check_regular, open_failure, written_whole
+from .atomic import atomic_write, check_regular, open_failure
 from .colmap import find_model, load_model
 from .json_values import angle_at, decode_json, matrix_at, number_at, pixels_at, table_at
 
@@ -164,8 +164,10 @@ def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> Non
         }
         for camera in cameras
     ]
-    with written_whole(path) as beside:
-        beside.write_text(json.dumps({"format": _FORMAT, "cameras": entries}, indent=1), encoding="utf-8")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text(
+            json.dumps({"format": _FORMAT, "cameras": entries}, indent=1), encoding="utf-8"
+        )
 
 
 def _own(file: str, index: int, entry: object) -> Camera:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 
-from .atomic import check_regular, make_folder, written_whole
+from .atomic import atomic_write, check_regular, make_folder
 
 _PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -166,9 +166,9 @@ def to_picture(image: Tensor) -> Image.Image:
 def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
     """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
     make_folder(Path(path).parent)
-    with written_whole(path) as beside:
+    with atomic_write(path) as temporary_file:
         # zlib's level 2 takes half the time of Pillow's own 6 for files 5 % larger
-        to_picture(image).save(beside, compress_level=2)
+        to_picture(image).save(temporary_file, compress_level=2)
 
 
 def _font(size: int) -> _Font:

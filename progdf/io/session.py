@@ -29,7 +29,7 @@ import msgspec
 
 from progdf.errors import ProgdfError
 
-from .atomic import check_regular, open_failure, written_whole
+from .atomic import atomic_write, check_regular, open_failure
 from .json_values import decode_json, typed
 
 VERSION = 1
@@ -119,8 +119,8 @@ def write_session(path: Path, session: SessionFile) -> None:
     text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False)
     # short lists of numbers on one line; a text holds no line break of its own, so none is hit
     text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
-    with written_whole(path) as beside:
-        beside.write_text(text + "\n", encoding="utf-8")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text(text + "\n", encoding="utf-8")
 
 
 def read_session(path: str | os.PathLike[str]) -> SessionFile:

@@ -45,7 +45,7 @@ def write_tensors(
     """Write a safetensors file: header size (8 bytes, little endian), JSON header, the tensors' bytes.
 
     Args:
-        path: where to; see `files.written_whole` for a file that is whole or absent
+        path: where to; see `files.atomic_write` for a file that is whole or absent
         tensors: by name, of the types in the table above; on the CPU
         metadata: texts by name
         checksum: add one of everything, which `read_tensors` compares

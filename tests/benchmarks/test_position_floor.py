@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from benchmarks.position_floor import position_floor
-from progdf.field.evaluate import FieldJudge
+from progdf.field.evaluate import FieldEvaluator
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import smooth_trajectory
 
@@ -23,7 +23,7 @@ def test_the_floor_in_pictures_is_that_of_the_neighbors() -> None:
     strengths = torch.tensor([0.0, 1.0])
     offsets = torch.zeros(2, 6, 14)
     offsets[1, :, 11] = torch.tensor([1.0, 1.1, 2.0, 2.1, 5.0, 5.1])
-    judge = FieldJudge(strengths, offsets, lambda moved: moved[:, 11:14] / 10)
+    judge = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14] / 10)
     found = position_floor(strengths, offsets, places, judge=judge)
     assert found.neighbors in (1, 2, 4)
     assert found.psnr_worst < found.psnr_mean < 60.0
@@ -57,5 +57,5 @@ def test_as_many_neighbors_are_asked_as_tell_most() -> None:
 def test_members_that_move_together_are_predicted_between_snapshots_too() -> None:
     strengths = torch.tensor([0.0, 1.0])
     offsets = strengths[:, None, None].expand(2, 9, 14).clone()
-    judge = FieldJudge(strengths, offsets, lambda moved: moved[:, 11:14])
+    judge = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14])
     assert position_floor(strengths, offsets, torch.rand(9, 3), judge=judge).psnr_worst == 99.0

@@ -20,7 +20,7 @@ import numpy as np
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.io.images import to_picture, write_image
 from progdf.io.json_values import decode_json
 from trainer.store.images import read_picture
@@ -73,8 +73,10 @@ class KeptPictures:
         painted = paint(source)
         note.unlink(missing_ok=True)  # a new picture never lies beside an old note
         write_image(path, painted)
-        with written_whole(note) as beside:
-            beside.write_text(json.dumps(wanted, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        with atomic_write(note) as temporary_file:
+            temporary_file.write_text(
+                json.dumps(wanted, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+            )
         assert self.folder is not None
         add_pictures(self.folder, [path, note])
         return _eight_bits(painted)

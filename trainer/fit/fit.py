@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField, Candidate, FieldJudge, choose_field, fit_keyframes
+from progdf.field import BakedField, Candidate, FieldEvaluator, choose_field, fit_keyframes
 from progdf.field.choose import Kind
 from progdf.field.evaluate import SAMPLES
 from progdf.field.rendered import MOST_SNAPSHOTS
@@ -67,7 +67,7 @@ def fit_field(
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
-    errors = FieldJudge(trajectory.s, offsets, evaluator.counted_pixels)
+    errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
     target = target_psnr if budget is None else math.inf
     choice = choose_field(
         trajectory.s,
@@ -77,7 +77,7 @@ def fit_field(
         kind,
         target,
         budget,
-        judge=errors,
+        evaluator=errors,
         recorded=ticks,
     )
     baselines = _baselines(trajectory, offsets, errors)
@@ -98,13 +98,13 @@ def evaluate_field(
 ) -> Fitted:
     """A field that is there already, a network's, beside the same baselines."""
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    errors = FieldJudge(trajectory.s, offsets, evaluator.counted_pixels)
+    errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
     measured = errors.candidate(field, field.kind)
     baselines = _baselines(trajectory, offsets, errors)
     return Fitted(measured, measured.worst >= target_psnr, (measured,), baselines, "a network was asked for")
 
 
-def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldJudge) -> dict[str, Candidate]:
+def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldEvaluator) -> dict[str, Candidate]:
     return {
         f"keyframes{count}": errors.candidate(
             fit_keyframes(trajectory.s, offsets, count, [float(s) for s in trajectory.s]),

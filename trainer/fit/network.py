@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, baked_neural
-from progdf.field.evaluate import FieldJudge
+from progdf.field.evaluate import FieldEvaluator
 from progdf.field.neural import Inputs, NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
 from progdf.field.separable import moving_attributes
@@ -160,7 +160,7 @@ def fit_network(
     except FloatingPointError as error:
         raise ProgdfError(f"{error}; try another --size, or --field auto") from error
     network = fit.field(tuple(float(s) for s in trajectory.s))
-    errors = FieldJudge(trajectory.s, offsets, evaluator.counted_pixels)
+    errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
     return NetworkFit(
         baked_neural(network, rows, trajectory.at, evaluator.counted_pixels),
         errors.curve(network.bound(rows)),

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.remap import Dial, dialled, interpolated, same
+from progdf.field.remap import SliderRemap, identity_remap, interpolate, remap_slider
 from progdf.gaussians import BASE_CHANNELS, pack
 from trainer.editors import COSTLY_DIAL, check_editor
 from trainer.editors.base import ImageEditor
@@ -65,7 +65,7 @@ def equalized_strengths(
     if max(steps) > _JUMP * sum(steps):
         return plain
     _, due = _spread(even, pictures, 1)
-    asked = interpolated(torch.tensor(plain, dtype=torch.float64), even, due)
+    asked = interpolate(torch.tensor(plain, dtype=torch.float64), even, due)
     found = (*(round(float(s), 3) for s in asked[:-1]), 1.0)
     rises = all(b - a > 5e-4 for a, b in zip((0.0, *found), found, strict=False))
     return found if rises else plain
@@ -73,13 +73,13 @@ def equalized_strengths(
 
 def equalize_slider(
     field: BakedField, setup: TrainingSetup, log: RunLog | None = None
-) -> tuple[BakedField, Dial]:
+) -> tuple[BakedField, SliderRemap]:
     """The field with a slider whose equal steps look equally large in training views, and where it all went.
 
     A network keeps its slider.
     """
     if field.origin is not None or not field.attributes:
-        return field, same()
+        return field, identity_remap()
     moving = list(field.attributes)
     small = probe_views(setup, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
     rows = pack(setup.scene[setup.region.members], with_shN=field.channels > BASE_CHANNELS)
@@ -96,15 +96,15 @@ def equalize_slider(
         if log is None
         else log.steps("even the slider", _LOOKS * (STEPS * _FINE + 1)) as advance
     ):
-        dial = equalizing_remap(seen)
-    return dialled(field, dial), dial
+        remap = equalizing_remap(seen)
+    return remap_slider(field, remap), remap
 
 
 def _silent(done: int, word: str) -> None:
     pass
 
 
-def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> Dial:
+def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> SliderRemap:
     """The dial under which equal steps change what is seen equally, wherever they begin.
 
     Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
@@ -126,7 +126,7 @@ def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> 
             evenness, following = _spread(current, shown, _FINE)
             if evenness > best:
                 best, places = evenness, current
-    return Dial(places[::_FINE].contiguous(), even[::_FINE].contiguous())
+    return SliderRemap(places[::_FINE].contiguous(), even[::_FINE].contiguous())
 
 
 def _spread(places: Tensor, pictures: Sequence[Tensor], reach: int) -> tuple[float, Tensor]:
@@ -149,6 +149,6 @@ def _spread(places: Tensor, pictures: Sequence[Tensor], reach: int) -> tuple[flo
     floor = 1e-3 * max(pace)  # so that the places stay apart
     way = torch.tensor([0.0, *accumulate(max(p, floor) for p in pace)], dtype=torch.float64)
     even = torch.linspace(0, 1, count + 1, dtype=torch.float64)
-    due = interpolated(even, way / way[-1], places)
+    due = interpolate(even, way / way[-1], places)
     due[0], due[-1] = 0.0, 1.0
     return min(steps) / max(steps), due

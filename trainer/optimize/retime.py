@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from progdf.field.remap import Dial, interpolated
+from progdf.field.remap import SliderRemap, interpolate
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from trainer.options import Slider
 
@@ -84,7 +84,7 @@ def retime(
             count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
             progress = _cumulative(_chords([blend_images(pictures, before, float(x)) for x in even]))
-            s[nodes] = _placed(low, high, interpolated(s[nodes], even, progress))
+            s[nodes] = _placed(low, high, interpolate(s[nodes], even, progress))
     return replace(trajectory, s=s.float())
 
 
@@ -157,13 +157,13 @@ def undo_retiming(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajec
     return replace(trajectory, s=s)
 
 
-def retime_recording(path: Path, dial: Dial) -> Trajectory:
+def retime_recording(path: Path, remap: SliderRemap) -> Trajectory:
     """Move the recordings in a trajectory's file to where the fitted field shows them, so that one can be
     held against the other; and keep where they were, from which the next field is fitted.
     """
     trajectory, extra, about = load_trajectory(path)
     before = undo_retiming(trajectory, extra)
-    moved = replace(before, s=dial(before.s).float())
+    moved = replace(before, s=remap(before.s).float())
     if not torch.equal(moved.s, trajectory.s):
         save_trajectory(path, moved, {**extra, _BEFORE: before.s}, about)
     return moved

@@ -23,7 +23,7 @@ from progdf.demo_scenes import DemoScene, bear, room
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import Gdf, load_gdf
-from progdf.io.atomic import make_folder, written_whole
+from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet, write_image
 from progdf.rasterize import render
@@ -174,8 +174,8 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
     """
     make_folder(folder)
     save_ply(folder / "scene.ply", scene.gaussians)
-    with written_whole(folder / "labels.npy") as beside:
-        np.save(beside, scene.labels.numpy())
+    with atomic_write(folder / "labels.npy") as temporary_file:
+        np.save(temporary_file, scene.labels.numpy())
     save_cameras(folder / "cameras.json", scene.cameras)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
-from progdf.field.remap import same
+from progdf.field.remap import identity_remap
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
@@ -94,10 +94,10 @@ def finish_run(
                 )
     with log.stage("even"):
         slider = resolve_slider(options.get("slider", "stages"), options["editor"], trajectory.strengths)
-        field, dial = fitted.chosen.field, same()
+        field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
-            field, dial = equalize_slider(field, setup, log)
-        laid = retime_recording(folder.trajectory, dial)
+            field, remap = equalize_slider(field, setup, log)
+        laid = retime_recording(folder.trajectory, remap)
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
@@ -114,7 +114,7 @@ def finish_run(
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
             watched = replace(evaluator, looked=looked)
-            measured = measure(watched, trajectory, fitted, field, dial, perceptual, clip)
+            measured = measure(watched, trajectory, fitted, field, remap, perceptual, clip)
         gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{options['name']}: {options['editor']}"

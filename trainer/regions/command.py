@@ -18,7 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.load_report import counted, grouped
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.io.cameras import load_cameras, read_camera
 from progdf.io.images import write_image
 from progdf.region import Region
@@ -67,8 +67,8 @@ def show(options: RegionOptions) -> str:
     if suffix == ".npy":
         stored = io.BytesIO()
         np.save(stored, region.members.numpy())
-        with written_whole(options.out) as beside:
-            beside.write_bytes(stored.getvalue())
+        with atomic_write(options.out) as temporary_file:
+            temporary_file.write_bytes(stored.getvalue())
     else:
         given = [] if options.cameras is None else load_cameras(options.cameras)
         up = find_up(scene, given, options.up).direction

@@ -12,7 +12,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
 from progdf.field.evaluate import sample_strengths
-from progdf.field.remap import Dial
+from progdf.field.remap import SliderRemap
 from progdf.field.trajectory import Trajectory
 from progdf.metrics.slider import SliderStatistics, slider_statistics
 from trainer.fit.evaluate import Evaluator
@@ -92,7 +92,7 @@ class Measured:
 
     fitted: Fitted
     shown: BakedField
-    dial: Dial
+    remap: SliderRemap
     asked: Sequence[tuple[float, float]]
     slider: SliderStatistics
     at_recordings: float
@@ -107,7 +107,7 @@ def measure(
     trajectory: Trajectory,
     fitted: Fitted,
     shown: BakedField,
-    dial: Dial,
+    remap: SliderRemap,
     perceptual: Perceptual,
     clip: Direction,
 ) -> Measured:
@@ -127,8 +127,8 @@ def measure(
     slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
     recorded = courses(evaluator, fields, samples, lambda s: evaluator.pictures(trajectory.at(s)), perceptual)
-    recorded = {n: replace(c, s=tuple(dial.at(s) for s in c.s)) for n, c in recorded.items()}
-    asked = tuple((dial.at(s), strength) for s, strength in trajectory.asked)
+    recorded = {n: replace(c, s=tuple(remap.at(s) for s in c.s)) for n, c in recorded.items()}
+    asked = tuple((remap.at(s), strength) for s, strength in trajectory.asked)
     drawn = against_editor(evaluator, {**fields, "slider": shown}, asked, perceptual)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
@@ -138,7 +138,7 @@ def measure(
         ),
         default=fitted.chosen.worst,
     )
-    return Measured(fitted, shown, dial, asked, slider, worst, recorded, drawn, perceptual.name, clip)
+    return Measured(fitted, shown, remap, asked, slider, worst, recorded, drawn, perceptual.name, clip)
 
 
 def expected_measures(trajectory: Trajectory) -> int:

@@ -106,7 +106,7 @@ def thumbnail(image: Tensor, width: int) -> Tensor:
 
 def _against_trajectory(measured: Measured) -> list[Plot]:
     fitted = measured.fitted
-    s = [measured.dial.at(s) for s in sample_strengths()]
+    s = [measured.remap.at(s) for s in sample_strengths()]
     fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
     curves: dict[str, Points] = {
         f"{_words(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Collection, Iterable
 from pathlib import Path, PurePosixPath
 
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 
 NAME = "pictures.txt"
 
@@ -53,5 +53,5 @@ def _is_inside(folder: Path, line: str) -> bool:
 
 
 def _write(folder: Path, lines: Iterable[str]) -> None:
-    with written_whole(folder / NAME) as beside:
-        beside.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    with atomic_write(folder / NAME) as temporary_file:
+        temporary_file.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME
-from progdf.io.atomic import is_temporary, remove_abandoned, written_whole
+from progdf.io.atomic import atomic_write, is_temporary, remove_abandoned
 from progdf.io.images import write_image
 from progdf.io.json_values import decode_json
 
@@ -141,9 +141,9 @@ def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
 
 def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
     """A new log.txt; its first line tells that the folder is a run, and of which edit."""
-    with written_whole(folder.log) as beside:
+    with atomic_write(folder.log) as temporary_file:
         line = f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n"
-        beside.write_text(line, encoding="utf-8")
+        temporary_file.write_text(line, encoding="utf-8")
 
 
 @contextlib.contextmanager
@@ -211,8 +211,8 @@ def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, whole or not at all."""
-    with written_whole(path) as beside:
-        beside.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _json_or_nothing(text: str) -> dict[str, Any]:

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.io.json_values import decode_json, typed
 from progdf.io.tensors import read_tensors, write_tensors
 
@@ -99,9 +99,11 @@ class StateFolder:
             raise ProgdfError(f"{self.path} is a link, and nothing behind it is touched; remove the link")
         self.clear()
         self.path.mkdir(exist_ok=True)
-        with written_whole(self._run) as beside:
-            beside.write_text(json.dumps(identity, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-            _flush(beside)
+        with atomic_write(self._run) as temporary_file:
+            temporary_file.write_text(
+                json.dumps(identity, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+            )
+            _flush(temporary_file)
 
     def save(
         self, part: str, tensors: Mapping[str, Tensor], values: Mapping[str, Any], index: int | None = None
@@ -115,9 +117,9 @@ class StateFolder:
         if index is not None and self.path.is_dir():
             path.parent.mkdir(exist_ok=True)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
-        with written_whole(path) as beside:
-            write_tensors(beside, tensors, header, checksum=True)
-            _flush(beside)
+        with atomic_write(path) as temporary_file:
+            write_tensors(temporary_file, tensors, header, checksum=True)
+            _flush(temporary_file)
 
     def load(self, part: str, index: int | None = None) -> Saved | None:
         """What was saved of a part; None where nothing was.

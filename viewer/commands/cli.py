@@ -17,7 +17,7 @@ from progdf.formats.load_report import counted
 from progdf.formats.ply import GEOMETRY, load_ply, save_ply
 from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.terminal import say
 from viewer.camera.view_camera import first_camera
 from viewer.render.threads import one_thread
@@ -58,10 +58,10 @@ def export(argv: Sequence[str]) -> int:
     gdfs, states = found.document.gdfs, shown(found.view)
     layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
     edited = compose_layers(found.document.scene, layers, found.view.blend)
-    with written_whole(options.out) as beside:
-        save_ply(beside, edited)
-        _check_reloaded(edited, load_ply(beside))
-        _check_by_plyfile(edited, beside)
+    with atomic_write(options.out) as temporary_file:
+        save_ply(temporary_file, edited)
+        _check_reloaded(edited, load_ply(temporary_file))
+        _check_by_plyfile(edited, temporary_file)
     told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
     say(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
     source = found.document.path

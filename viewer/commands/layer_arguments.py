@@ -47,7 +47,7 @@ def stack_of(
     layers = {layer.name: layer for layer in layers_of(gdfs, settings, most, unset)}
     for text in gains:
         name, kind, gain = _gain(text, gdfs)
-        layers[name] = stack.dialled(layers[name], kind, gain)
+        layers[name] = stack.remap_slider(layers[name], kind, gain)
     for name in solo:
         known_edit(name, gdfs, "--solo")
         layers[name] = replace(layers[name], solo=True)

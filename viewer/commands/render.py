@@ -13,7 +13,7 @@ from progdf.cli.options import parsed
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.terminal import say
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
@@ -77,15 +77,15 @@ def _moving(
     def picture(wanted: ViewState) -> film.Pixels:
         return film.to_pixels(engine.image(wanted, camera=camera))
 
-    with written_whole(options.out) as beside:
+    with atomic_write(options.out) as temporary_file:
         if options.sweep is not None:
             frames = (picture(moved) for moved in film.sweep(view, swept[0]))
             write = film.write_gif if options.out.suffix.lower() == ".gif" else film.write_mp4
-            write(beside, frames)
+            write(temporary_file, frames)
         elif len(swept) == 2:
-            Image.fromarray(film.grid(swept[0], swept[1], picture, view)).save(beside)
+            Image.fromarray(film.grid(swept[0], swept[1], picture, view)).save(temporary_file)
         else:
-            Image.fromarray(film.contact_sheet(swept[0], picture, view)).save(beside)
+            Image.fromarray(film.contact_sheet(swept[0], picture, view)).save(temporary_file)
 
 
 def _still(options: RenderOptions, found: Opened, view: ViewState, camera: Camera, engine: Engine) -> str:
@@ -97,8 +97,8 @@ def _still(options: RenderOptions, found: Opened, view: ViewState, camera: Camer
     comparer = Comparer(engine, engine.ctx, where)
     try:
         image = comparer.image(view, camera=camera)
-        with written_whole(options.out) as beside:
-            Image.fromarray(labelled(image, view.compare, comparer.labels(view))).save(beside)
+        with atomic_write(options.out) as temporary_file:
+            Image.fromarray(labelled(image, view.compare, comparer.labels(view))).save(temporary_file)
         if view.compare.mode == "off":
             return ""
         if comparer.against(view) == "original":

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 
 
 def save_picture(folder: Path, stem: str, image: NDArray[np.uint8]) -> Path:
@@ -19,8 +19,8 @@ def save_picture(folder: Path, stem: str, image: NDArray[np.uint8]) -> Path:
         OSError: it cannot be written.
     """
     path = free_path(folder, stem, ".png")
-    with written_whole(path) as beside:
-        Image.fromarray(image).save(beside)
+    with atomic_write(path) as temporary_file:
+        Image.fromarray(image).save(temporary_file)
     return path
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.io.user_folders import state_folder
 
 MOST = 8
@@ -27,8 +27,8 @@ def remember(paths: Sequence[Path], folder: Path | None = None) -> tuple[Path, .
     files = tuple(path for path in kept if "\n" not in str(path))[:MOST]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with written_whole(folder / "recent.txt") as beside:
-            beside.write_text(
+        with atomic_write(folder / "recent.txt") as temporary_file:
+            temporary_file.write_text(
                 "".join(f"{path}\n" for path in files), encoding="utf-8", errors="surrogateescape"
             )
     except OSError:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from progdf.cli.info import TIMELINE_MARK as MARK
 from progdf.errors import ProgdfError
-from progdf.io.atomic import check_regular, open_failure, written_whole
+from progdf.io.atomic import atomic_write, check_regular, open_failure
 from progdf.io.json_values import decode_json
 from viewer.camera.view_camera import FARTHEST, ViewCamera
 from viewer.state import timeline
@@ -78,8 +78,8 @@ def save(path: Path, shown: Timeline, layers: Sequence[LayerState]) -> None:
         for key in shown.keys
     )
     file = TimelineFile(VERSION, keys, shown.length, shown.fps, shown.ping_pong)
-    with written_whole(path) as beside:
-        beside.write_text(json.dumps(plain.plain(file), indent=2) + "\n", encoding="utf-8")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text(json.dumps(plain.plain(file), indent=2) + "\n", encoding="utf-8")
 
 
 def load(path: Path, layers: Sequence[LayerState]) -> Timeline:

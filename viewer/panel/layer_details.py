@@ -35,12 +35,12 @@ def draw(layer: LayerState, row: LayerRow, dial: str | None, most: float, ui: Ui
     return layer
 
 
-def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContext) -> LayerState:
+def _gain(layer: LayerState, kind: str, moves: bool, remap_slider: bool, ui: UiContext) -> LayerState:
     """One gain: a slider as the others of the panel."""
-    if dialled:
+    if remap_slider:
         imgui.push_style_color(imgui.Col_.text_disabled, imgui.ImVec4(*PALETTE.accent))
     label(kind.capitalize(), 84.0 * ui.scale)
-    if dialled:
+    if remap_slider:
         imgui.pop_style_color()
     imgui.begin_disabled(not moves)
     value = stack.dial_value(layer, kind)
@@ -50,7 +50,7 @@ def _gain(layer: LayerState, kind: str, moves: bool, dialled: bool, ui: UiContex
         tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
     else:
         tip(f"This edit does not change the {kind}")
-    return layer if new == value else stack.dialled(layer, kind, new)
+    return layer if new == value else stack.remap_slider(layer, kind, new)
 
 
 def value_at(curve: Sequence[float], strength: float) -> float:

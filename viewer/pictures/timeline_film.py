@@ -12,7 +12,7 @@ from PIL import Image
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io import images as pictures
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from viewer.camera.view_camera import to_camera
 from viewer.render.engine import Engine
 from viewer.state import timeline
@@ -87,15 +87,15 @@ def write(out: Path, shown: Timeline, view: ViewState, still: Camera, engine: En
     size = f"{still.width}x{still.height}"
     if count:
         page = sheet(shown, view, still, engine, count)
-        with written_whole(out) as beside:
-            Image.fromarray(page).save(beside)
+        with atomic_write(out) as temporary_file:
+            Image.fromarray(page).save(temporary_file)
         count = len(sheet_frames(shown, count))
         return f"wrote {out} ({count} pictures of {size}, drawn by {engine.draws_with})"
     check_output(out)
     drawn = frames(shown, view, still, engine, timeline.film_frames(shown))
     if out.suffix:
-        with written_whole(out) as beside:
-            film.write_film(beside, drawn, shown.fps)
+        with atomic_write(out) as temporary_file:
+            film.write_film(temporary_file, drawn, shown.fps)
     else:
         film.write_sequence(out, drawn)
     count = sum(1 for _ in timeline.film_frames(shown))

@@ -39,7 +39,7 @@ def changed(view: ViewState, index: int, change: Callable[[LayerState], LayerSta
     return replace(view, layers=tuple(layers))
 
 
-def dialled(layer: LayerState, dial: str, value: float, upper: float = 1.0) -> LayerState:
+def remap_slider(layer: LayerState, dial: str, value: float, upper: float = 1.0) -> LayerState:
     """The layer with its strength or a gain at `value`, held to 0..1 (a strength to 0..`upper`).
 
     A locked layer stays as it is.
@@ -61,7 +61,7 @@ def nudged(view: ViewState, index: int, dial: str, by: float) -> ViewState:
 
     def further(layer: LayerState) -> LayerState:
         # rounded, so that steps forth and back end on the number they began with
-        return dialled(layer, dial, round(dial_value(layer, dial) + by, 6), most(view))
+        return remap_slider(layer, dial, round(dial_value(layer, dial) + by, 6), most(view))
 
     return changed(view, index, further)
 

@@ -24,7 +24,7 @@ import numba
 from numba import config
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from progdf.io.user_folders import cache_folder, is_private, temporary_folder
 
 log = logging.getLogger("progdf")
@@ -82,8 +82,8 @@ def record_cache(folder: Path) -> None:
     with suppress(OSError, ProgdfError):
         sums = _checksums(folder)
         if sums != _recorded(folder):
-            with written_whole(folder / _SUMS) as beside:
-                beside.write_text(json.dumps(sums, indent=0), encoding="utf-8")
+            with atomic_write(folder / _SUMS) as temporary_file:
+                temporary_file.write_text(json.dumps(sums, indent=0), encoding="utf-8")
 
 
 def drop_damaged(folder: Path) -> bool:

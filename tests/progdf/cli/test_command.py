@@ -14,7 +14,7 @@ import pytest
 import progdf
 from progdf.__main__ import COMMANDS, main
 from progdf.formats.ply import save_ply
-from progdf.io.atomic import written_whole
+from progdf.io.atomic import atomic_write
 from tests.helpers.scenes import random_gaussians
 
 
@@ -180,8 +180,8 @@ def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
     number: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def writing(argv: object) -> None:
-        with written_whole(tmp_path / "a.txt") as beside:
-            beside.write_text("half")
+        with atomic_write(tmp_path / "a.txt") as temporary_file:
+            temporary_file.write_text("half")
             os.kill(os.getpid(), getattr(signal, number))
 
     monkeypatch.setattr("progdf.cli.check.main", writing)

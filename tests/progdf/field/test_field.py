@@ -10,9 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from progdf.field import AttributeBases, BakedField, FieldJudge, choose_field, fit_keyframes, fit_separable
+from progdf.field import (
+    AttributeBases,
+    BakedField,
+    FieldEvaluator,
+    choose_field,
+    fit_keyframes,
+    fit_separable,
+)
 from progdf.field.choose import separable_within
-from progdf.field.rendered import rendered_courses
+from progdf.field.rendered import rendered_trajectories
 from progdf.field.separable import channel_weights, stored_bases
 from progdf.gaussians import ATTRIBUTES, attribute_slices
 from tests.helpers.edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
@@ -281,7 +288,7 @@ def test_an_edit_that_no_view_shows_gets_the_fewest_bytes() -> None:
 def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> None:
     strengths, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)
-    seen = rendered_courses(offsets, channel_weights(None, 40, 14), render)
+    seen = rendered_trajectories(offsets, channel_weights(None, 40, 14), render)
     expected = seen.mse(seen.modes(torch.ones(17, dtype=torch.float64)), {})
     field = fit_separable(strengths, offsets, {})
     found = [
@@ -294,12 +301,12 @@ def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> N
 def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
     _, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)
-    seen = rendered_courses(offsets, channel_weights(None, 40, 14), render)
+    seen = rendered_trajectories(offsets, channel_weights(None, 40, 14), render)
     modes = seen.modes(torch.ones(17, dtype=torch.float64))
     left = torch.zeros_like(offsets)
     for name, columns in attribute_slices(14).items():
         mix, table = (part[:, :1].float() for part in modes[name])
-        residual = seen.courses[name].residual.flatten(1)
+        residual = seen.trajectories[name].residual.flatten(1)
         left[:, :, columns] = (residual - table @ (mix.T @ residual)).reshape(left[:, :, columns].shape)
     found = torch.stack([render(o).double().square().mean() for o in left])
     expected = seen.mse(modes, dict.fromkeys(ATTRIBUTES, 1))
@@ -309,8 +316,8 @@ def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
 def test_bytes_go_first_to_what_shows_most() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
-    judge = FieldJudge(strengths, offsets, render)
-    seen = rendered_courses(offsets, channel_weights(None, 60, 14), render)
+    judge = FieldEvaluator(strengths, offsets, render)
+    seen = rendered_trajectories(offsets, channel_weights(None, 60, 14), render)
     best = separable_within(seen, strengths, 62, judge)
     assert best.field.bytes_per_member <= 62
     for ranks in ({"means": 2}, {"means": 1, "log_scales": 1}, {"quats": 1, "logit_opacities": 2}):
@@ -320,7 +327,7 @@ def test_bytes_go_first_to_what_shows_most() -> None:
 
 def test_the_judge_finds_no_error_in_all_snapshots() -> None:
     strengths, offsets = curved_trajectory(20)
-    judge = FieldJudge(strengths, offsets, linear_pictures(20, 14))
+    judge = FieldEvaluator(strengths, offsets, linear_pictures(20, 14))
     assert min(judge.curve(fit_keyframes(strengths, offsets, 9))) > 90
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from progdf.field import baked_neural
 from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
-from progdf.field.evaluate import FieldJudge, sample_strengths
+from progdf.field.evaluate import FieldEvaluator, sample_strengths
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import FORMS, MEMBERS, baked, network, rows
 
@@ -45,8 +45,8 @@ def test_what_a_network_misses_of_the_end_is_spread_over_the_way() -> None:
 
 def test_the_pull_follows_the_recorded_errors_where_they_are_known() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
-    judge = FieldJudge(strengths, offsets, lambda moved: moved[:, 11:14])
-    follows = FieldJudge.curve
+    judge = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14])
+    follows = FieldEvaluator.curve
     known = baked_neural(network("position"), rows(), lambda s: _at(strengths, offsets, s))
     assert sum(follows(judge, known)) >= sum(follows(judge, baked("position"))) - 1e-6
 

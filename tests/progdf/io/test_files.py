@@ -15,7 +15,7 @@ from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gdf.file import load_gdf
-from progdf.io.atomic import is_temporary, written_whole
+from progdf.io.atomic import atomic_write, is_temporary
 from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.io.npy import open_npy
@@ -26,10 +26,10 @@ from tests.helpers.refused import refusal
 
 def test_a_file_appears_when_it_is_complete_and_not_before(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
-    with written_whole(path) as beside:
-        beside.write_text("half")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text("half")
         assert not path.exists()
-        beside.write_text("whole")
+        temporary_file.write_text("whole")
     assert path.read_text() == "whole"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -42,8 +42,8 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_beside_it(
     path.write_text("old")
 
     def write() -> None:
-        with written_whole(path) as beside:
-            beside.write_text("half")
+        with atomic_write(path) as temporary_file:
+            temporary_file.write_text("half")
             raise error
 
     with pytest.raises(error):
@@ -56,7 +56,12 @@ def test_a_full_disk_is_told_with_the_name_of_the_file_and_leaves_the_old_one(tm
     path = tmp_path / "out.txt"
     path.write_text("old")
     told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); give a place")
-    with told as caught, files_up_to(100), written_whole(path) as beside, written_whole(beside) as within:
+    with (
+        told as caught,
+        files_up_to(100),
+        atomic_write(path) as temporary_file,
+        atomic_write(temporary_file) as within,
+    ):
         within.write_text("x" * 1000)
     assert isinstance(caught.value.__cause__, OSError), "training tells a full disk by it"
     assert path.read_text() == "old"
@@ -67,8 +72,8 @@ def test_whoever_still_reads_the_old_file_keeps_it(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     path.write_text("old")
     with path.open() as reader:
-        with written_whole(path) as beside:
-            beside.write_text("new")
+        with atomic_write(path) as temporary_file:
+            temporary_file.write_text("new")
         assert reader.read() == "old"
     assert path.read_text() == "new"
 
@@ -80,8 +85,8 @@ def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: P
     old.chmod(0o640)
     for path, expected in ((tmp_path / "new.txt", ordinary), (old, old)):
         mode = expected.stat().st_mode
-        with written_whole(path) as beside:
-            beside.write_text("x")
+        with atomic_write(path) as temporary_file:
+            temporary_file.write_text("x")
         assert path.stat().st_mode == mode
 
 
@@ -94,34 +99,34 @@ def test_a_new_file_obeys_the_umask_and_nobody_elses_is_touched(
         with monkeypatch.context() as patched:
             # the process's umask holds for all its threads: to look at it is to change it for a moment
             patched.setattr(os, "umask", lambda mask: pytest.fail("the umask was changed"))
-            with written_whole(tmp_path / "new.txt") as beside:
-                beside.write_text("x")
+            with atomic_write(tmp_path / "new.txt") as temporary_file:
+                temporary_file.write_text("x")
     finally:
         os.umask(earlier)
     assert (tmp_path / "new.txt").stat().st_mode & 0o777 == 0o666 & ~mask
 
 
 def test_the_suffix_is_kept_for_writers_that_go_by_it(tmp_path: Path) -> None:
-    with written_whole(tmp_path / "picture.png") as beside:
-        assert beside.suffix == ".png"
+    with atomic_write(tmp_path / "picture.png") as temporary_file:
+        assert temporary_file.suffix == ".png"
 
 
 def test_a_missing_folder_and_a_folder_in_place_of_a_file_are_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="does not exist"), written_whole(tmp_path / "no" / "a.txt"):
+    with pytest.raises(ProgdfError, match="does not exist"), atomic_write(tmp_path / "no" / "a.txt"):
         pass
-    with pytest.raises(ProgdfError, match="is a folder"), written_whole(tmp_path):
+    with pytest.raises(ProgdfError, match="is a folder"), atomic_write(tmp_path):
         pass
 
 
 def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(beside: Path, _: int | None) -> None:
-        raise PermissionError(13, "Permission denied", str(beside))
+    def refused(temporary_file: Path, _: int | None) -> None:
+        raise PermissionError(13, "Permission denied", str(temporary_file))
 
     monkeypatch.setattr("progdf.io.atomic._create", refused)
     path = tmp_path / "out.txt"
-    with pytest.raises(ProgdfError) as told, written_whole(path):
+    with pytest.raises(ProgdfError) as told, atomic_write(path):
         pass
     assert str(told.value).startswith(f"{path} cannot be written (Permission denied); ")
 
@@ -133,8 +138,8 @@ def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) ->
         link.symlink_to(Path("there") / real.name)
         if name == "old":
             real.write_text("old")
-        with written_whole(link) as beside:
-            beside.write_text("whole")
+        with atomic_write(link) as temporary_file:
+            temporary_file.write_text("whole")
         assert link.is_symlink()
         assert real.read_text() == "whole"
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["new.txt", "old.txt"]
@@ -161,9 +166,9 @@ def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     handle = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     try:
-        with written_whole(pipe) as beside:
-            beside.write_text("half")
-            beside.write_text("whole")
+        with atomic_write(pipe) as temporary_file:
+            temporary_file.write_text("half")
+            temporary_file.write_text("whole")
         assert os.read(handle, 100) == b"whole"
     finally:
         os.close(handle)
@@ -173,8 +178,8 @@ def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
 
 KILLED = """
 import os, signal, sys
-from progdf.io.atomic import is_temporary, written_whole
-with written_whole(sys.argv[1]) as beside:
+from progdf.io.atomic import is_temporary, atomic_write
+with atomic_write(sys.argv[1]) as beside:
     beside.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -191,20 +196,20 @@ def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_
         mine.write_text("mine")
     elsewhere = tmp_path / ".progdf-00000000-1-abcdefgh.txt"  # another machine's, which may be at work
     elsewhere.write_text("half")
-    with written_whole(tmp_path / "a.txt") as running:
-        with written_whole(path) as beside:
-            beside.write_text("whole")
+    with atomic_write(tmp_path / "a.txt") as running:
+        with atomic_write(path) as temporary_file:
+            temporary_file.write_text("whole")
         assert running.exists(), "a process that runs keeps what it writes"
         running.write_text("whole")
     os.utime(elsewhere, (0, 0))
     assert sorted(tmp_path.iterdir()) == sorted([*own, elsewhere, path, tmp_path / "a.txt"])
-    with written_whole(path) as beside:
-        beside.write_text("whole")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text("whole")
     assert not elsewhere.exists(), "it has not been written to for a day"
 
 
 def test_a_name_as_long_as_names_can_be_is_written(tmp_path: Path) -> None:
     path = tmp_path / ("n" * 251 + ".txt")
-    with written_whole(path) as beside:
-        beside.write_text("whole")
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text("whole")
     assert path.read_text() == "whole"

@@ -62,7 +62,7 @@ def test_more_words_than_columns_are_refused() -> None:
         contact_sheet([[_plain(0.1)]], column_labels=["a", "b"])
 
 
-def test_an_image_is_written_whole_and_cut_to_what_a_file_can_hold(tmp_path: Path) -> None:
+def test_an_image_is_atomic_write_and_cut_to_what_a_file_can_hold(tmp_path: Path) -> None:
     path = tmp_path / "new" / "a.png"
     write_image(path, torch.tensor([[[-1.0, 0.5, 2.0]]]))
     assert np.asarray(Image.open(path)).tolist() == [[[0, 128, 255]]]

@@ -182,7 +182,7 @@ def test_killed_between_picture_and_note_it_is_painted_anew(
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("trainer.editors.cache.written_whole", killed)
+        patched.setattr("trainer.editors.cache.atomic_write", killed)
         with pytest.raises(Killed):
             KeptPictures(tmp_path).picture("v", source, {"style": 2}, lambda picture: 0.5 * picture)
     paint = Counting()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from progdf.field import Candidate, FieldJudge, choose_field, fit_separable
+from progdf.field import Candidate, FieldEvaluator, choose_field, fit_separable
 from progdf.field.choose import _chosen, separable_within
-from progdf.field.rendered import rendered_courses
+from progdf.field.rendered import rendered_trajectories
 from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
 
 
@@ -20,7 +20,7 @@ def test_the_best_field_is_the_one_whose_worst_picture_is_best() -> None:
 def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another() -> None:
     strengths, offsets = curved_trajectory(20, snapshots=3)
     shown = linear_pictures(20, 14)
-    evaluator = FieldJudge(strengths, offsets, shown, lambda s: s**4 * offsets[-1])
+    evaluator = FieldEvaluator(strengths, offsets, shown, lambda s: s**4 * offsets[-1])
     chosen = choose_field(strengths, offsets, shown, kind="lossless", target=80.0, evaluator=evaluator)
     assert chosen.best.worst < 80.0
     assert not chosen.met
@@ -40,8 +40,8 @@ def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:
     def far(moved: Tensor) -> Tensor:
         return (10 * shown(moved)).sin() / 2  # so far from linear that effects do not add up
 
-    evaluator = FieldJudge(strengths, offsets, far)
-    seen = rendered_courses(offsets, torch.ones(40, 14), far)
+    evaluator = FieldEvaluator(strengths, offsets, far)
+    seen = rendered_trajectories(offsets, torch.ones(40, 14), far)
     found = separable_within(seen, strengths, 65.0, evaluator)
     ranks = {name: len(bases.rest) for name, bases in found.field.attributes.items()}
     assert found.worst >= evaluator.candidate(fit_separable(strengths, offsets, ranks), "").worst

@@ -112,8 +112,8 @@ def test_names_stay_apart_on_one_line_and_never_empty() -> None:
 def test_a_lock_holds_strength_and_gains() -> None:
     locked = LayerState(0, "a", 0.5, locked=True)
     for dial in stack.DIALS:
-        assert stack.dialled(locked, dial, 0.1) == locked
-        assert stack.dial_value(stack.dialled(LayerState(0, "a", 0.5), dial, 0.1), dial) == 0.1
+        assert stack.remap_slider(locked, dial, 0.1) == locked
+        assert stack.dial_value(stack.remap_slider(LayerState(0, "a", 0.5), dial, 0.1), dial) == 0.1
 
 
 def test_without_overshoot_nothing_stands_beyond_one() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from progdf.field import BakedField, fit_separable
-from progdf.field.remap import Dial, dialled, same
+from progdf.field.remap import SliderRemap, identity_remap, remap_slider
 
 CHANNELS = 14
 
@@ -23,37 +23,37 @@ def bent(nodes: int = 9) -> BakedField:
     return fit_separable(strengths, offsets, {"means": 3, "sh0": 2})
 
 
-def late() -> Dial:
+def late() -> SliderRemap:
     """Little happens at first on the new slider."""
     old = torch.linspace(0, 1, 21, dtype=torch.float64)
-    return Dial(old, old.sqrt())
+    return SliderRemap(old, old.sqrt())
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0.0, 1.0))
 def test_a_dialled_field_shows_at_the_new_strength_what_it_showed_at_the_old(s: float) -> None:
-    field, dial = bent(), late()
-    expected, found = field.offsets(s), dialled(field, dial).offsets(dial.at(s))
+    field, remap = bent(), late()
+    expected, found = field.offsets(s), remap_slider(field, remap).offsets(remap.at(s))
     assert float((found - expected).abs().max()) < 2e-2 * float(field.offsets(1.0).abs().max())
 
 
 def test_both_ends_of_a_dialled_field_are_the_same_bits() -> None:
     field = bent()
-    found = dialled(field, late())
+    found = remap_slider(field, late())
     assert torch.equal(found.offsets(1.0), field.offsets(1.0))
     assert not bool(found.offsets(0.0).any())
 
 
 def test_a_dial_costs_no_byte_per_member_and_moves_the_ticks() -> None:
     field = replace(bent(), recorded=(0.0, 0.25, 1.0))
-    found = dialled(field, late())
+    found = remap_slider(field, late())
     assert found.bytes_per_member == field.bytes_per_member
     assert found.recorded == pytest.approx((0.0, 0.5, 1.0))
 
 
 def test_the_dial_that_changes_nothing_changes_nothing() -> None:
     field = bent()
-    found = dialled(field, same())
+    found = remap_slider(field, identity_remap())
     assert torch.equal(found.nodes, field.nodes)
     assert all(torch.equal(found.offsets(s), field.offsets(s)) for s in (0.1, 0.33, 0.9))
 
@@ -61,7 +61,7 @@ def test_the_dial_that_changes_nothing_changes_nothing() -> None:
 def test_nodes_that_a_steep_dial_pushes_together_still_ascend() -> None:
     knots = torch.tensor([0.0, 0.4, 0.6, 1.0], dtype=torch.float64)
     steep = torch.tensor([0.0, 0.5, 0.5 + 1e-9, 1.0], dtype=torch.float64)
-    found = dialled(bent(65), Dial(knots, steep))
+    found = remap_slider(bent(65), SliderRemap(knots, steep))
     assert bool((found.nodes.diff() > 0).all())
     assert torch.equal(found.offsets(1.0), bent(65).offsets(1.0))
 
@@ -69,4 +69,4 @@ def test_nodes_that_a_steep_dial_pushes_together_still_ascend() -> None:
 @pytest.mark.parametrize("knots", [[0.0, 0.5, 0.5, 1.0], [0.1, 1.0], [0.0, 0.9], [0.0, 0.6, 0.4, 1.0]])
 def test_knots_that_do_not_ascend_from_0_to_1_are_refused(knots: list[float]) -> None:
     with pytest.raises(ValueError, match="ascend from 0 to 1"):
-        Dial(torch.tensor(knots), torch.tensor(knots))
+        SliderRemap(torch.tensor(knots), torch.tensor(knots))
