@@ -4,6 +4,10 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 APT    := $(if $(shell command -v apt-get),apt,none)
 
+# A worker for each core, each at its own end of the list, so that what a file's tests share is made once; threads
+# that wait let the other workers have the core.
+PYTEST := OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n auto --dist worksteal
+
 EXTRAS := styles,diffusion,segment,clip,colmap,video,formats
 
 .PHONY: setup extras gl window demo test test-all lint bench pictures
@@ -39,10 +43,10 @@ demo: setup
 	$(BIN)/progdf demo --out demo
 
 test: setup extras window
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-all: setup extras window
-	$(BIN)/python -m pytest -m '' --hypothesis-profile=search
+	$(PYTEST) -m '' --hypothesis-profile=search
 
 # With the extras, so that types are checked against the same packages everywhere.
 lint: setup extras

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from hypothesis import settings
 from PIL import Image
 
+from tests.helpers.kernels import run_all_kernels
 from tests.helpers.paths import SHARED_DATA
 
 pytest.register_assert_rewrite(
@@ -36,6 +38,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="write the golden screenshots instead of comparing",
     )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """One worker compiles the kernels, the others wait and find them in the cache."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    shared = tmp_path_factory.getbasetemp().parent
+    with FileLock(shared / "kernels.lock"):
+        if not (shared / "kernels.ready").exists():
+            run_all_kernels()
+            (shared / "kernels.ready").touch()
 
 
 @pytest.fixture(scope="session")

@@ -170,6 +170,7 @@ def test_one_odd_sample_is_no_leak_and_a_steady_rise_is_one() -> None:
 
 @pytest.mark.window
 @pytest.mark.gl
+@pytest.mark.slow
 def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -189,6 +190,7 @@ def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
 
 @pytest.mark.window
 @pytest.mark.gl
+@pytest.mark.slow
 def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path) -> None:
     if not (shutil.which("Xvfb") and shutil.which("xdotool")):
         pytest.skip("Xvfb and xdotool are not installed")

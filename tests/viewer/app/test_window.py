@@ -206,6 +206,7 @@ def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> 
 
 @pytest.mark.window
 @pytest.mark.gl
+@pytest.mark.slow
 def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop: Desktop) -> None:
     first = desktop.shot()
     desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimising does to a window
@@ -250,6 +251,7 @@ def scarf_on_screen() -> tuple[float, float]:
 
 @pytest.mark.window
 @pytest.mark.gl
+@pytest.mark.slow
 def test_escape_takes_a_drag_of_the_real_mouse_back(desktop: Desktop) -> None:
     first = desktop.shot()
     desktop.grip(slider(0, 0.5), slider(0, 1.0))
@@ -263,6 +265,7 @@ def test_escape_takes_a_drag_of_the_real_mouse_back(desktop: Desktop) -> None:
 
 @pytest.mark.window
 @pytest.mark.gl
+@pytest.mark.slow
 def test_ctrl_c_in_the_terminal_closes_an_idle_window(desktop: Desktop) -> None:
     desktop.shot()
     desktop.until_idle("a window at rest")
@@ -322,6 +325,7 @@ def test_closing_the_real_window_with_unsaved_changes_asks_and_saves(desktop: De
 
 @pytest.mark.window
 @pytest.mark.gl
+@pytest.mark.slow
 def test_what_the_real_keyboard_types_fast_arrives_whole(desktop: Desktop) -> None:
     desktop.shot()
     desktop.xdotool("keydown", "ctrl")
