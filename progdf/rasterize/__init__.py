@@ -108,22 +108,10 @@ def render(
     """
     degree = min(gaussians.sh_degree, 3)
     image, _, _ = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        camera.viewmat,
-        camera.K,
-        camera.width,
-        camera.height,
-        background,
-        camera.near,
-        sh_degree=degree,
-        antialiased=gaussians.antialiased,
-        engine=engine,
-        crop=crop,
-    )
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh,
+        camera.viewmat, camera.K, camera.width, camera.height, background, camera.near,
+        sh_degree=degree, antialiased=gaussians.antialiased, engine=engine, crop=crop,
+    )  # fmt: skip
     return image.float()
 
 

@@ -84,7 +84,7 @@ def _all_marked(cells: Array, x0: int, y0: int, x1: int, y1: int) -> bool:
 
 @kernel(contract=True, cache=True)
 def _mark(cells: Array, rows: Array, scene: Scene, camera: Pinhole) -> None:
-    width, height = np.float64(camera.x1), np.float64(camera.y1)
+    width, height = float(camera.window[2]), float(camera.window[3])
     for i in rows:
         usable, px, py, _, wide2, high2 = largest_extents(camera, scene, i)
         if not usable:

@@ -73,7 +73,8 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
     Returns:
         how many there are
     """
-    x0, y0, x1, y1 = float(camera.x0), float(camera.y0), float(camera.x1), float(camera.y1)
+    window = camera.window
+    x0, y0, x1, y1 = float(window[0]), float(window[1]), float(window[2]), float(window[3])
     at = 0
     for i in range(begin, end):
         counts[i] = 0
@@ -99,7 +100,7 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
                 edge = float(row * TILE_H)
                 upper, lower = max(top, edge), min(bottom, edge + (TILE_H - 1.0))
                 left, right = _tile_columns(shape, side, upper, lower, x0, x1)
-            base = (row - camera.row) * camera.columns - camera.column
+            base = (row - camera.grid[1]) * camera.grid[2] - camera.grid[0]
             for column in range(left, right):
                 if at < tiles.size:
                     tiles[at] = base + column

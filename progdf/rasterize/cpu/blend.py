@@ -111,9 +111,9 @@ def blend(
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         _blend_tile(state, x, y, members, splats, bounds, batch)
         spans.tile_bounds(camera, x, y, bounds)  # blending narrowed it
-        left, width = np.uint64(x + bounds[0] - camera.x0), np.uint64(bounds[2] - bounds[0])
+        left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
-            i = np.uint64(y - camera.y0) + row
+            i = np.uint64(y - camera.window[1]) + row
             p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
             for k in range(width):
                 out.transmittance[i, left + k] = abs(state[p + k])

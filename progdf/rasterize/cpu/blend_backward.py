@@ -147,9 +147,9 @@ def blend_backward(
         state[plane : 5 * plane] = _ZERO
         state[5 * plane :] = -_ONE
         spans.tile_bounds(camera, x, y, bounds)
-        left, width = np.uint64(x + bounds[0] - camera.x0), np.uint64(bounds[2] - bounds[0])
+        left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
-            i = np.uint64(y - camera.y0) + row
+            i = np.uint64(y - camera.window[1]) + row
             p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
             for k in range(width):
                 state[p + _G0 + k] = by_image[i, left + k, 0]

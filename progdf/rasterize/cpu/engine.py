@@ -80,11 +80,11 @@ def make_pinhole(view: RasterView) -> Pinhole:
         rows=(tuple(rotation[0][:3]), tuple(rotation[1][:3]), tuple(rotation[2][:3])),
         shift=(rotation[0][3], rotation[1][3], rotation[2][3]),
         fx=fx, fy=fy, cx=cx, cy=cy,
-        low_x=-(cx / fx + margin_x), high_x=(view.width - cx) / fx + margin_x,
-        low_y=-(cy / fy + margin_y), high_y=(view.height - cy) / fy + margin_y,
+        limits_x=(-(cx / fx + margin_x), (view.width - cx) / fx + margin_x),
+        limits_y=(-(cy / fy + margin_y), (view.height - cy) / fy + margin_y),
         near=float(view.near),
-        x0=x0, y0=y0, x1=x1, y1=y1,
-        column=column, row=row, columns=-(-x1 // TILE_W) - column, tile_rows=-(-y1 // TILE_H) - row,
+        window=(x0, y0, x1, y1),
+        grid=(column, row, -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row),
         degree=-1 if view.sh_degree is None else view.sh_degree,
         antialiased=view.antialiased,
     )  # fmt: skip
@@ -106,7 +106,7 @@ def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, Ti
 
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
     """Run `kernel(first, step, scratch, *arguments)` so that every tile is one kernel's."""
-    tiles = camera.columns * camera.tile_rows
+    tiles = camera.grid[2] * camera.grid[3]
     # odd, so that one kernel's tiles are not those of one column
     chunks = 1 if threads() == 1 else min(-(-tiles // _LEAST_TILES), 8 * threads() + 1)
     run_chunks(lambda chunk: kernel(chunk, chunks, new_scratch(), *arguments), chunks)
@@ -158,7 +158,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
         again = _share_gaussians(lambda begin, end: find(begin, end, int(counts[begin:end].sum())), n)
         tiles = np.concatenate(again)
     order = depth_order(splats.depths, splats.visible)
-    return splats, bin_splats(order, tiles, counts, camera.columns * camera.tile_rows, with_slots)
+    return splats, bin_splats(order, tiles, counts, camera.grid[2] * camera.grid[3], with_slots)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -212,7 +212,8 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _new_picture(camera: Pinhole) -> Picture:
-    height, width = camera.y1 - camera.y0, camera.x1 - camera.x0
+    x0, y0, x1, y1 = camera.window
+    height, width = y1 - y0, x1 - x0
     planes = (np.empty((height, width), np.float32) for _ in range(2))
     return Picture(np.empty((height, width, 3), np.float32), *planes)
 

@@ -38,6 +38,8 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
     Returns:
         what the calls returned, by chunk
     """
+    if min(threads(), chunks) <= 1:
+        return [kernel(chunk) for chunk in range(chunks)]
     results: dict[int, _T] = {}
     following = itertools.count()
 

@@ -53,10 +53,10 @@ class Pinhole(NamedTuple):
     Args:
         rows, shift: world → camera: rows of the rotation, translation
         fx, fy, cx, cy: intrinsics, pixels
-        low_x, high_x, low_y, high_y: limits of x/z and y/z in the Jacobian
+        limits_x, limits_y: least and largest x/z and y/z in the Jacobian
         near: least camera z, world units
-        x0, y0, x1, y1: the window of the image that is drawn, pixels
-        column, row, columns, tile_rows: first tile of the window, and how many there are
+        window: x0, y0, x1, y1 of what is drawn, pixels
+        grid: first tile column and row of the window, and how many there are
         degree: of spherical harmonics, -1 for rgb
         antialiased: see `progdf.rasterize.rasterize`
     """
@@ -67,19 +67,11 @@ class Pinhole(NamedTuple):
     fy: float
     cx: float
     cy: float
-    low_x: float
-    high_x: float
-    low_y: float
-    high_y: float
+    limits_x: tuple[float, float]
+    limits_y: tuple[float, float]
     near: float
-    x0: int
-    y0: int
-    x1: int
-    y1: int
-    column: int
-    row: int
-    columns: int
-    tile_rows: int
+    window: tuple[int, int, int, int]
+    grid: tuple[int, int, int, int]
     degree: int
     antialiased: bool
 
@@ -202,8 +194,8 @@ def footprint(camera: Pinhole, scene: Scene, i: int) -> Footprint:
     x, y = dot(camera.rows[0], mean) + camera.shift[0], dot(camera.rows[1], mean) + camera.shift[1]
     inv_z = 1.0 / (dot(camera.rows[2], mean) + camera.shift[2])
     ratio_x, ratio_y = x * inv_z, y * inv_z
-    tan_x = min(max(ratio_x, camera.low_x), camera.high_x)
-    tan_y = min(max(ratio_y, camera.low_y), camera.high_y)
+    tan_x = min(max(ratio_x, camera.limits_x[0]), camera.limits_x[1])
+    tan_y = min(max(ratio_y, camera.limits_y[0]), camera.limits_y[1])
     jx, jy = camera.fx * inv_z, camera.fy * inv_z
     a0 = blend2(jx, camera.rows[0], -jx * tan_x, camera.rows[2])
     a1 = blend2(jy, camera.rows[1], -jy * tan_y, camera.rows[2])
@@ -242,8 +234,8 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
     tan_x = (dot(camera.rows[0], mean) + camera.shift[0]) * inv_z
     tan_y = (dot(camera.rows[1], mean) + camera.shift[1]) * inv_z
     px, py = camera.fx * tan_x + camera.cx, camera.fy * tan_y + camera.cy
-    tan_x = min(max(tan_x, camera.low_x), camera.high_x)
-    tan_y = min(max(tan_y, camera.low_y), camera.high_y)
+    tan_x = min(max(tan_x, camera.limits_x[0]), camera.limits_x[1])
+    tan_y = min(max(tan_y, camera.limits_y[0]), camera.limits_y[1])
     # ln x ≤ x − 1; 1.001: the viewmat's rotation is one only within rounding
     radius2 = 1.001 * (_CUT_RADIUS2 + 2.0 * max(opacity - 1.0, 0.0))
     largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2]))) * inv_z
@@ -277,7 +269,8 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
         basis: scratch. [16] float64
     """
     eye = camera_center(camera)
-    x0, y0, x1, y1 = float(camera.x0), float(camera.y0), float(camera.x1), float(camera.y1)
+    window = camera.window
+    x0, y0, x1, y1 = float(window[0]), float(window[1]), float(window[2]), float(window[3])
     for i in range(begin, end):
         usable, px, py, z, wide2, high2 = largest_extents(camera, scene, i)
         splats.means2d[i, 0], splats.means2d[i, 1], splats.depths[i] = px, py, z

@@ -39,6 +39,9 @@ _PER_UNIT, _PER_UNIT2 = 1.0 / UNIT, 1.0 / (UNIT * UNIT)
 CAMERA = 16
 """Numbers of the camera's gradient: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
 
+BLOCK = 1024
+"""Gaussians whose parts of the camera's gradient are added up first: the same for every number of threads."""
+
 
 @kernel(contract=True, inline=True)
 def _axes_gradient(seen: Footprint, g: tuple[float, ...], antialiased: bool) -> tuple[float, float, Vec, Vec]:
@@ -70,11 +73,9 @@ def _axes_gradient(seen: Footprint, g: tuple[float, ...], antialiased: bool) -> 
 def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, float, float]:
     """Gradient to the quaternion as given; d0, d1: gradients to the rows a0ᵀR, a1ᵀR."""
     q0, q1, q2, q3 = seen.quat
-    v0, v1, v2 = (
-        blend2(seen.a0[0], d0, seen.a1[0], d1),
-        blend2(seen.a0[1], d0, seen.a1[1], d1),
-        blend2(seen.a0[2], d0, seen.a1[2], d1),
-    )
+    v0 = blend2(seen.a0[0], d0, seen.a1[0], d1)
+    v1 = blend2(seen.a0[1], d0, seen.a1[1], d1)
+    v2 = blend2(seen.a0[2], d0, seen.a1[2], d1)
     sym01, sym02, sym12 = v0[1] + v1[0], v0[2] + v2[0], v1[2] + v2[1]
     skew01, skew02, skew12 = v1[0] - v0[1], v0[2] - v2[0], v2[1] - v1[2]
     gw = 2.0 * (q1 * skew12 + q2 * skew02 + q3 * skew01)
@@ -113,22 +114,9 @@ def _point_gradient(
 
 
 @kernel(contract=True, inline=True)
-def _add_four(by_camera: Array, block: int, row: int, a: Vec, b: float) -> None:
-    """Add to four numbers of the camera's gradient."""
-    by_camera[block, 4 * row] += a[0]
-    by_camera[block, 4 * row + 1] += a[1]
-    by_camera[block, 4 * row + 2] += a[2]
-    by_camera[block, 4 * row + 3] += b
-
-
-@kernel(contract=True, inline=True)
 def _set(rows: Array, i: int, value: Vec) -> None:
     """Row i of an [N,3] array."""
     rows[i, 0], rows[i, 1], rows[i, 2] = value
-
-
-BLOCK = 1024
-"""Gaussians whose parts of the camera's gradient are added up first: the same for every number of threads."""
 
 
 class Scratch(NamedTuple):
@@ -207,7 +195,10 @@ def project_backward(
         row0 = blend2(1.0, row0, camera.shift[0], by_ray)
         row1 = blend2(1.0, row1, camera.shift[1], by_ray)
         row2 = blend2(1.0, row2, camera.shift[2], by_ray)
-        _add_four(by_camera, i // BLOCK, 0, row0, point[0] + dot(by_ray, camera.rows[0]))
-        _add_four(by_camera, i // BLOCK, 1, row1, point[1] + dot(by_ray, camera.rows[1]))
-        _add_four(by_camera, i // BLOCK, 2, row2, point[2] + dot(by_ray, camera.rows[2]))
-        _add_four(by_camera, i // BLOCK, 3, (by_focal[0], by_focal[1], by_center[0]), by_center[1])
+        shift0 = point[0] + dot(by_ray, camera.rows[0])
+        shift1 = point[1] + dot(by_ray, camera.rows[1])
+        shift2 = point[2] + dot(by_ray, camera.rows[2])
+        viewmat = row0 + (shift0,) + row1 + (shift1,) + row2 + (shift2,)  # noqa: RUF005  for numba
+        parts = viewmat + by_focal + by_center
+        for k in range(CAMERA):
+            by_camera[i // BLOCK, k] += parts[k]

@@ -90,11 +90,8 @@ def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array
         slopes[13, 0] = _C3[4] * (4 * zz - 3 * xx - yy)
         slopes[13, 1] = -2 * _C3[4] * x * y
         slopes[13, 2] = 8 * _C3[4] * x * z
-        slopes[14, 0], slopes[14, 1], slopes[14, 2] = (
-            2 * _C3[5] * x * z,
-            -2 * _C3[5] * y * z,
-            _C3[5] * (xx - yy),
-        )
+        slopes[14, 0], slopes[14, 1] = 2 * _C3[5] * x * z, -2 * _C3[5] * y * z
+        slopes[14, 2] = _C3[5] * (xx - yy)
         slopes[15, 0], slopes[15, 1] = 3 * _C3[6] * (xx - yy), -6 * _C3[6] * x * y
 
 

@@ -85,15 +85,15 @@ def exp2(x: Vector) -> Vector:
 @kernel(inline=True)
 def tile_corner(camera: Pinhole, tile: int) -> tuple[int, int]:
     """A tile's first pixel in the full image."""
-    x = (camera.column + tile % camera.columns) * TILE_W
-    return x, (camera.row + tile // camera.columns) * TILE_H
+    x = (camera.grid[0] + tile % camera.grid[2]) * TILE_W
+    return x, (camera.grid[1] + tile // camera.grid[2]) * TILE_H
 
 
 @kernel(inline=True)
 def tile_bounds(camera: Pinhole, x: int, y: int, bounds: Array) -> None:
     """left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""
-    bounds[0], bounds[1] = max(0, camera.x0 - x), max(0, camera.y0 - y)
-    bounds[2], bounds[3] = min(TILE_W, camera.x1 - x), min(TILE_H, camera.y1 - y)
+    bounds[0], bounds[1] = max(0, camera.window[0] - x), max(0, camera.window[1] - y)
+    bounds[2], bounds[3] = min(TILE_W, camera.window[2] - x), min(TILE_H, camera.window[3] - y)
 
 
 @kernel(fast=True, inline=True)

@@ -127,9 +127,9 @@ def _list_tile(
 ) -> tuple[int, int]:  # fmt: skip
     """One tile's runs and entries, written from places `run` and `entry` on; the places one past the last."""
     x, y = spans.tile_corner(camera, tile)
-    left, right = max(0, camera.x0 - x), min(TILE_W, camera.x1 - x)
-    top, bottom = max(0, camera.y0 - y), min(TILE_H, camera.y1 - y)
-    width = camera.x1 - camera.x0
+    left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
+    top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
+    width = camera.window[2] - camera.window[0]
     through[: TILE_H * TILE_W] = _ONE
     for s in members:
         shape = splats.shapes[s]
@@ -159,7 +159,7 @@ def _list_tile(
                 through[i * TILE_W + j] = after
                 if rows[s] >= 0:
                     if write:
-                        out.pixels[entry] = (y - camera.y0 + i) * width + x - camera.x0 + j
+                        out.pixels[entry] = (y - camera.window[1] + i) * width + x - camera.window[0] + j
                         out.weights[entry] = alpha * before
                     entry += 1
         if entry > begun:
