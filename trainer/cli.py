@@ -23,7 +23,7 @@ def train(argv: Sequence[str]) -> int:
 def fit(argv: Sequence[str]) -> int:
     """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
     options = parsed(FitOptions, argv, "progdf fit")
-    from trainer.pipeline.run import refit
+    from trainer.pipeline.refit import refit
 
     refit(options)
     return 0

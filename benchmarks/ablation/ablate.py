@@ -32,9 +32,9 @@ from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.settings import objective_line, resolve_slider
 from trainer.options import TrainOptions
 from trainer.pipeline.reopen import reopen_run
-from trainer.pipeline.run import use_threads
+from trainer.pipeline.threads import use_threads
 from trainer.pipeline.training import optimize_members, retime_trajectory
-from trainer.report.measures import against_editor
+from trainer.report.curves import against_editor
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.store.images import read_picture
 from trainer.store.interrupts import interrupt_on_signals

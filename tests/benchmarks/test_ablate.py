@@ -24,7 +24,8 @@ from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, write_bear
-from trainer.options import TrainOptions, resolve_options
+from trainer.option_checks import resolve_options
+from trainer.options import TrainOptions
 from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.run import train
 from trainer.store.run_folder import RunFolder
@@ -137,7 +138,7 @@ def test_a_variant_is_judged_at_strengths_that_it_was_never_shown(run: Path) -> 
 def test_what_is_done_is_not_done_again_until_the_edited_views_change(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", _nothing_trains)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", _nothing_trains)
     again = ablate(AblateOptions(run, only="base,one-target", threads=1), quiet=True)
     assert [outcome.name for outcome in again.outcomes] == ONLY.split(",")
     name = reopen_run(run).about["held_out"][0]
@@ -155,15 +156,15 @@ def test_what_is_done_is_not_done_again_until_the_edited_views_change(
 def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = benchmarks.ablation.ablate.trained
+    real = benchmarks.ablation.ablate.optimize_members
 
     def interrupted(*arguments: object, **more: object) -> object:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", interrupted)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"1 of 2 variants are done and kept in .*; give the same"):
         ablate(AblateOptions(run, only="base,no-sh", threads=1), quiet=True)
-    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", real)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", real)
     done = ablate(AblateOptions(run, only="base,no-sh", threads=1), quiet=True)
     assert "no-sh" in [outcome.name for outcome in done.outcomes]
 
@@ -172,7 +173,7 @@ def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch
     def broken(*_: object, **__: object) -> object:
         raise ProgdfError("training broke down") from FloatingPointError("the loss is nan at step 7")
 
-    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", broken)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", broken)
     done = ablate(AblateOptions(run, only="paper", threads=1), quiet=True)
     assert done.outcomes[-1].failed == "the loss is nan at step 7"
     markdown = (run / "ablation" / "ablation.md").read_text(encoding="utf-8")
@@ -189,7 +190,7 @@ def test_what_is_no_finished_run_is_one_line(tmp_path: Path) -> None:
 def test_the_command_prints_a_table_that_fits_a_terminal(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", _nothing_trains)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", _nothing_trains)
     assert ablate_command([str(run), "--only", "base", "--threads", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
@@ -213,7 +214,7 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
         asked.append(wanted)
         raise ProgdfError("enough") from FloatingPointError("enough")
 
-    monkeypatch.setattr(benchmarks.ablation.ablate, "trained", noted)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", noted)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STEPS", 40)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STAGES", 2)
     monkeypatch.setattr(benchmarks.ablation.ablate, "_keep", _forgets)

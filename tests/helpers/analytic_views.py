@@ -26,7 +26,8 @@ from progdf.io.images import write_image
 from progdf.rasterize import render
 from progdf.scene.region_spec import parse_region
 from tests.helpers.paths import SHARED_DATA
-from trainer.options import TrainOptions, resolve_options
+from trainer.option_checks import resolve_options
+from trainer.options import TrainOptions
 from trainer.setup.training_setup import make_training_setup
 
 PLAYBOT = SHARED_DATA / "playbot_31k.ply"

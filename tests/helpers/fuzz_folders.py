@@ -30,7 +30,8 @@ from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_
 from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.trained import quick_options, write_bear
 from trainer.options import FitOptions, TrainOptions
-from trainer.pipeline.run import refit, train
+from trainer.pipeline.refit import refit
+from trainer.pipeline.run import train
 from trainer.regions.from_pictures import RegionSettings, region_kinds
 from trainer.store.state import PeriodicSave
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, baked_neural
 from progdf.field.evaluate import FieldEvaluator
-from progdf.field.neural import Inputs, NeuralShape
+from progdf.field.neural import NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
@@ -23,7 +23,7 @@ from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
 from trainer.optimize.losses import Perceptual, l1
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.settings import resolve_slider
-from trainer.options import NETWORK_OPTIONS, TrainOptions, plain_options
+from trainer.plan import NetworkPlan, Plan
 from trainer.setup.training_setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import Saved, StateFolder
@@ -62,33 +62,30 @@ class NetworkFit:
         }
 
 
-def network_settings(options: Mapping[str, Any]) -> NeuralSettings:
-    """What the options, JSON values of this or an older run, say of the network."""
-    said = {name: options.get(name, default) for name, default in NETWORK_OPTIONS.items()}
-    inputs: Inputs = "position" if said["fit"] == "joint" else said["inputs"]
-    steps = EFFORT[said["size"]][0] // 3 if options.get("quick") else 0
-    seed = int(options.get("seed", 0))
-    return NeuralSettings(said["size"], inputs, said["code"], said["bins"], steps, seed=seed)
+def network_settings(plan: NetworkPlan) -> NeuralSettings:
+    """What the plan says of the network, as it is trained."""
+    steps = EFFORT[plan.size][0] // 3 if plan.draft else 0
+    return NeuralSettings(plan.size, plan.inputs, plan.code, plan.bins, steps, seed=plan.seed)
 
 
 def begin_joint_training(
-    options: TrainOptions, setup: TrainingSetup, rates: Tensor, stages: Sequence[TargetStage]
+    plan: Plan, setup: TrainingSetup, rates: Tensor, stages: Sequence[TargetStage]
 ) -> JointTraining | None:
-    """The network that is trained beside PGS, where the options ask for one.
+    """The network that is trained beside PGS, where the plan has one.
 
     Args:
-        options: see `TrainOptions`
+        plan: see `Plan`
         setup: scene, region, views
         rates: learning rates of PGS; what has none does not move. [C]
         stages: of PGS
     """
-    if options.field != "neural" or options.fit != "joint":
+    if not plan.field.joint:
         return None
     channels = len(rates)
     slices = attribute_slices(channels)
     attributes = tuple(name for name, columns in slices.items() if bool((rates[columns] > 0).any()))
     rows = pack(setup.scene[setup.region.members], with_shN=channels > BASE_CHANNELS)
-    settings = network_settings(plain_options(options))
+    settings = network_settings(plan.field.network)
     seen = visibility(setup.scene, setup.region.members, setup.train)
     small = probe_views(setup)
 
@@ -98,7 +95,7 @@ def begin_joint_training(
         )
 
     strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
-    if resolve_slider(options.slider, options.editor, strengths) == "even":
+    if resolve_slider(plan.slider, plan.editor, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
     return JointTraining(
         NeuralFit(rows, channels, attributes, settings, seen), channels, strengths, steps, render
@@ -116,7 +113,7 @@ def fit_network(
     seen: Evaluator,
     evaluator: Evaluator,
     weights: Tensor,
-    options: Mapping[str, Any],
+    plan: NetworkPlan,
     perceptual: Perceptual,
     log: RunLog,
     begun: Saved | None = None,
@@ -129,7 +126,7 @@ def fit_network(
         seen: training views, which tell how much each attribute shows
         evaluator: held-out views
         weights: how visible each member is. [M]
-        options: of the run, JSON values
+        plan: see `NetworkPlan`
         perceptual: for the loss of pictures
         log: of the run
         begun: what `save_network` saved
@@ -142,7 +139,7 @@ def fit_network(
     if not attributes:
         raise ProgdfError("the edit moves nothing that a network could learn; use --field auto")
     rows = pack(setup.scene[setup.region.members])
-    settings = network_settings(options)
+    settings = network_settings(plan)
     fit = NeuralFit(rows, offsets.shape[2], attributes, settings, weights)
     steps = fit.settings.steps
     if begun is not None:
@@ -150,7 +147,7 @@ def fit_network(
         fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
         steps = round(_FINISHING * steps)
     fit.scale_to(offsets, rendered_importance(offsets, seen.counted_pixels))
-    weight = float(options.get("picture_loss", NETWORK_OPTIONS["picture_loss"]))
+    weight = plan.picture_loss
     pictures = _picture_loss(setup, trajectory, perceptual, weight, settings.seed) if weight > 0 else None
     try:
         with log.steps("field", steps) as advance:

@@ -27,7 +27,8 @@ from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet, write_image
 from progdf.rasterize import render
-from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions, check_ranges
+from trainer.option_checks import check_ranges
+from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions
 from trainer.store.state import StateFolder
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)

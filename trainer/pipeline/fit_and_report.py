@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
+from progdf.errors import ProgdfError
 from progdf.field.remap import identity_remap
-from progdf.field.trajectory import Trajectory
+from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
-from progdf.gdf.file import Gdf, fingerprint, save_gdf
+from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
-from progdf.io.json_values import decode_json
+from progdf.io.json_values import decode_json, typed
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility
 from trainer.fit.network import fit_network
@@ -24,8 +25,9 @@ from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
 from trainer.optimize.retime import retime_recording
 from trainer.optimize.settings import resolve_slider
-from trainer.options import CLIP_MODEL, FieldKind
-from trainer.report.measures import Texts, clip_course, expected_measures, figures, measure
+from trainer.options import TrainOptions
+from trainer.plan import Plan
+from trainer.report.measures import clip_course, expected_measures, figures, measure
 from trainer.report.report import report_picture
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import RunLog
@@ -62,11 +64,22 @@ def finish_run(
     about: Mapping[str, Any],
     perceptual: Perceptual,
     log: RunLog,
-    choice: FieldKind,
+    plan: Plan,
     begun: Saved | None = None,
 ) -> RunResult:
-    """Fit, measure, and write NAME.gdf, report.json and report.png. `begun`: see `network.fit_network`."""
-    options = about["options"]
+    """Fit, measure, and write NAME.gdf, report.json and report.png.
+
+    Args:
+        folder: of the run
+        setup: scene, region, views
+        trajectory: what was recorded, as it was before a fit
+        about: what the trajectory's file says of the run; the report repeats it
+        perceptual: distance of pictures
+        log: of the run
+        plan: see `Plan`
+        begun: see `network.fit_network`
+    """
+    target, budget = plan.field.target_psnr, plan.field.bytes_budget
     scene, region = setup.scene, setup.region
     with log.stage("fit"):
         evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
@@ -74,26 +87,25 @@ def finish_run(
         seen = load_evaluator(folder, setup, few, trajectory)
         with log.looks("weigh the members", len(setup.train)) as looked:
             weights = visibility(scene, region.members, setup.train, looked)
-        if choice == "neural":
+        if plan.field.kind == "neural":
             network = fit_network(
-                trajectory, setup, seen, evaluator, weights, options, perceptual, log, begun
+                trajectory, setup, seen, evaluator, weights, plan.field.network, perceptual, log, begun
             )
-            fitted = evaluate_field(trajectory, evaluator, network.field, options["target_psnr"])
+            fitted = evaluate_field(trajectory, evaluator, network.field, target)
         else:
             network = None
-            target, budget = options["target_psnr"], options.get("bytes_budget")
-            with log.looks("fit the field", expected_looks(trajectory, choice)) as looked:
+            with log.looks("fit the field", expected_looks(trajectory, plan.field.kind)) as looked:
                 fitted = fit_field(
                     trajectory,
                     replace(seen, looked=looked),
                     replace(evaluator, looked=looked),
                     weights,
-                    choice,
+                    plan.field.kind,
                     target,
                     budget,
                 )
     with log.stage("even"):
-        slider = resolve_slider(options.get("slider", "stages"), options["editor"], trajectory.strengths)
+        slider = resolve_slider(plan.slider, plan.editor, trajectory.strengths)
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, setup, log)
@@ -104,20 +116,20 @@ def finish_run(
         f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
     )
     if not fitted.met:
-        if (budget := options.get("bytes_budget")) is not None and network is None:
+        if budget is not None and network is None:
             log.say(f"no field takes --bytes-budget {budget:g} or less; the smallest was kept")
         else:
-            log.say(f"no field reached --target-psnr {options['target_psnr']:g}; the best was kept")
+            log.say(f"no field reached --target-psnr {target:g}; the best was kept")
     with log.stage("report"):
-        clip = clip_course(evaluator, setup.held_out, field, texts(options))
-        if clip.reason and (options.get("text_before") or options.get("text_after")):
+        clip = clip_course(evaluator, setup.held_out, field, plan.texts)
+        if clip.reason and plan.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
             watched = replace(evaluator, looked=looked)
             measured = measure(watched, trajectory, fitted, field, remap, perceptual, clip)
-        gdf = Gdf(options["name"], region, field, fingerprint(scene), options["editor"], options)
+        gdf = Gdf(plan.name, region, field, fingerprint(scene), plan.editor, about["options"])
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
-        title = f"{options['name']}: {options['editor']}"
+        title = f"{plan.name}: {plan.editor}"
         picture = report_picture(evaluator, measured, about["losses"], title)
     measures = figures(measured, endpoint, outside)
     if network is not None:
@@ -145,11 +157,11 @@ def finish_run(
             **(_earlier(folder, "memory_by_stage_mb") if log.refits else {}),
             **log.memory.by_stage,
         },
-        "options": options,
+        "options": about["options"],
     }
     # the .gdf has the options beside it, is small, and the same training writes the same file
     own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}
-    save_gdf(folder.gdf(options["name"]), replace(gdf, report=own))
+    save_gdf(folder.gdf(plan.name), replace(gdf, report=own))
     write_json(folder.report, report)
     write_image(folder.picture, picture)
     edit = report["edit"]
@@ -160,8 +172,8 @@ def finish_run(
             for s, e in report["between"].items()
         )
     )
-    log.say(f"wrote {folder.gdf(options['name'])}")
-    return RunResult(folder, folder.gdf(options["name"]), report, laid)
+    log.say(f"wrote {folder.gdf(plan.name)}")
+    return RunResult(folder, folder.gdf(plan.name), report, laid)
 
 
 def load_evaluator(
@@ -197,13 +209,6 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     return endpoint, change
 
 
-def texts(options: Mapping[str, Any]) -> Texts:
-    """What CLIP is asked: the options' texts; a learned editor's instruction says what one sees after."""
-    kind, _, instruction = options["editor"].partition(":")
-    after = options.get("text_after") or (instruction.strip().strip("\"'") if kind == "instruct" else "")
-    return Texts(options.get("text_before", ""), after, options.get("clip_model") or CLIP_MODEL)
-
-
 def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
     """Figures of the stages that this command did not run again."""
     try:
@@ -211,3 +216,16 @@ def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
         return {str(stage): figure for stage, figure in stages.items() if isinstance(figure, int | float)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
+
+
+def load_result(folder: RunFolder, options: TrainOptions, scene: Gaussians, log: RunLog) -> RunResult:
+    """The result of a run that is finished."""
+    path = folder.gdf(options.name)
+    load_gdf(path, scene)
+    trajectory, _, _ = load_trajectory(folder.trajectory)
+    log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
+    try:
+        report = typed(decode_json(folder.report.read_bytes()), dict[str, Any])
+    except ValueError as error:
+        raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
+    return RunResult(folder, path, report, trajectory)

@@ -20,7 +20,8 @@ from progdf.io.json_values import typed
 from progdf.region import Region
 from trainer.editors.base import EditKind
 from trainer.optimize.retime import undo_retiming
-from trainer.options import TrainOptions, checked_name
+from trainer.option_checks import checked_name
+from trainer.options import TrainOptions
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import make_view, with_near_plane

@@ -16,7 +16,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
 from progdf.io.json_values import decode_json, typed
 from progdf.region import Region
-from trainer.options import MOST_THREADS, TrainOptions, plain_options, resolve_options
+from trainer.option_checks import plain_options, resolve_options
+from trainer.options import MOST_THREADS, TrainOptions
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
 _ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -14,10 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import BASE_CHANNELS, Gaussians
-from progdf.gdf.file import load_gdf
 from progdf.io.cameras import save_cameras
-from progdf.io.json_values import decode_json, typed
-from progdf.rasterize import set_threads
 from progdf.region import Region
 from progdf.scene.region_spec import parse_region
 from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, make_editor
@@ -31,15 +27,11 @@ from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import undo_retiming
 from trainer.optimize.settings import idle_options, objective_line, resolve_slider, stage_count
 from trainer.optimize.unseen import unseen_members_of
-from trainer.options import (
-    MOST_THREADS,
-    NETWORK_OPTIONS,
-    FitOptions,
-    TrainOptions,
-    check_network_options,
-    plain_options,
-    resolve_options,
-)
+from trainer.option_checks import plain_options, resolve_options
+from trainer.options import TrainOptions
+from trainer.pipeline.fit_and_report import load_result
+from trainer.pipeline.threads import use_threads, wanted_threads
+from trainer.plan import make_plan
 from trainer.regions.from_pictures import region_kinds, region_settings
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.setup.training_setup import (
@@ -70,11 +62,10 @@ from .fit_and_report import RunResult, end_rows, finish_run, load_evaluator
 from .kind_trial import Approach, choose_approach
 from .preflight import check_command
 from .reedit import reedit
-from .reopen import render_run_views, reopen_run
 from .resume import check_exists, decide_resume, explain_stop, load_region
 from .training import optimize_members, retime_trajectory
 
-__all__ = ["RunResult", "refit", "train", "use_threads"]
+__all__ = ["RunResult", "train"]
 
 
 def train(options: TrainOptions, quiet: bool = False) -> RunResult:
@@ -105,7 +96,7 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
             for note in (*session.notes, *notes):
                 log.say(note)
             if session.does == "nothing":
-                return _finished_result(folder, options, scene, log)
+                return load_result(folder, options, scene, log)
             use_threads(session.threads)
             with check_exists(folder):
                 result = _run_training(options, scene, region, folder, log)
@@ -116,19 +107,6 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
             raise
         finally:
             log.close()
-
-
-def _finished_result(folder: RunFolder, options: TrainOptions, scene: Gaussians, log: RunLog) -> RunResult:
-    """The result of a run that is finished."""
-    path = folder.gdf(options.name)
-    load_gdf(path, scene)
-    trajectory, _, _ = load_trajectory(folder.trajectory)
-    log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
-    try:
-        report = typed(decode_json(folder.report.read_bytes()), dict[str, Any])
-    except ValueError as error:
-        raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
-    return RunResult(folder, path, report, trajectory)
 
 
 def _run_training(
@@ -164,7 +142,7 @@ def _run_training(
     trajectory = undo_retiming(trajectory, extra)
     measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
     begun = folder.state.load(NETWORK)
-    return finish_run(folder, setup, trajectory, about, measure, log, options.field, begun)
+    return finish_run(folder, setup, trajectory, about, measure, log, make_plan(options), begun)
 
 
 def _render_originals(
@@ -311,54 +289,3 @@ def _record(
                 finals[view.camera.name] = render_view(edited_scene, view.camera, setup.background)
                 looked()
         write_views(folder, "final", finals)
-
-
-def refit(options: FitOptions, quiet: bool = False) -> RunResult:
-    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimised.
-
-    Raises:
-        ProgdfError: the folder is no finished run, or its scene is gone or another.
-    """
-    check_network_options(options)
-    use_threads(options.threads)
-    run = reopen_run(options.run, options.scene)
-    log = RunLog(run.folder.log, quiet, refits=True)
-    try:
-        with log.stage("views"):
-            setup = render_run_views(run)
-            names = [view.camera.name for view in setup.train]
-            edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
-            # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
-            setup = widen_views(setup, edited)
-        perceptual, warning = perceptual_loss()
-        if warning:
-            log.say(warning)
-        said = {"text_before": options.text_before, "text_after": options.text_after}
-        said = {name: text for name, text in {**said, "clip_model": options.clip_model}.items() if text}
-        network = {name: getattr(options, name) for name in NETWORK_OPTIONS if name != "fit"}
-        asked = ("target_psnr", "bytes_budget")
-        aims = {name: getattr(options, name) for name in asked}
-        now = {"field": options.field, "fit": "after", **aims, **network, **said}
-        about = {**run.about, "options": {**run.about["options"], **now}}
-        return finish_run(run.folder, setup, run.trajectory, about, perceptual, log, options.field)
-    finally:
-        log.close()
-
-
-def use_threads(wanted: int) -> None:
-    """Give torch and the rasteriser `wanted` threads; 0 is all cores."""
-    count = wanted_threads(wanted)
-    torch.set_num_threads(count)
-    set_threads(count)
-
-
-def wanted_threads(wanted: int) -> int:
-    """How many threads `wanted` means.
-
-    Raises:
-        ProgdfError: fewer than none, or more than any machine has.
-    """
-    if not 0 <= wanted <= MOST_THREADS:
-        raise ProgdfError(f"--threads must be between 0 and {MOST_THREADS}, got {wanted}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return wanted or cores

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
-import msgspec
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
-from progdf.io.json_values import typed
 from progdf.scene.bounds import scene_sphere
 from trainer.editors.base import EditKind
 from trainer.fit.network import begin_joint_training, save_network
@@ -22,16 +20,18 @@ from trainer.optimize.groups import Groups, group_path, group_stage, restore_gro
 from trainer.optimize.losses import Perceptual, erode
 from trainer.optimize.objective import Losses, Objective, loss_table
 from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import ParameterSnapshot, Renewal, TargetStage, learning_rates, optimize
+from trainer.optimize.pgs import Renewal, TargetStage, learning_rates, optimize
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.settings import group_steps, loss_weights, pgs_settings, resolve_slider, solves_colors
 from trainer.optimize.unseen import UnseenMembers
 from trainer.optimize.view_dependence import NEEDED, view_dependence
 from trainer.options import TrainOptions
+from trainer.pipeline.recordings import Recordings
+from trainer.plan import make_plan
 from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views
 from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
-from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder
+from trainer.store.state import PeriodicSave, Resumable, StateFolder
 from trainer.views.crops import (
     COLORS,
     GEOMETRY,
@@ -47,72 +47,6 @@ PART = "training"
 """Of the saved state: all that changes while the members are optimised."""
 
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
-
-
-@dataclass(frozen=True)
-class SavedSnapshot:
-    """A snapshot as it is kept.
-
-    Args:
-        step, stage, ends_stage, means: see `ParameterSnapshot`
-        offsets: of the members, in half precision. [M,C] float16
-    """
-
-    step: int
-    stage: int
-    ends_stage: bool
-    offsets: Tensor
-    means: Mapping[str, float]
-
-
-class _Values(msgspec.Struct):
-    """What is saved of a recording beside its offsets."""
-
-    step: int
-    stage: int
-    ends_stage: bool
-    means: dict[str, float]
-
-
-class Recordings:
-    """All recordings so far, a `state.Resumable`: each is written once, to a file of its own.
-
-    Args:
-        folder: where
-        shape: of the offsets
-    """
-
-    def __init__(self, folder: StateFolder, shape: torch.Size) -> None:
-        self.made: list[SavedSnapshot] = []
-        self._folder, self._shape, self._written = folder, shape, 0
-
-    def add(self, found: ParameterSnapshot) -> None:
-        """Keep one."""
-        offsets = found.offsets.half()
-        self.made.append(SavedSnapshot(found.step, found.stage, found.ends_stage, offsets, found.means))
-
-    def saved(self) -> Saved:
-        """How many there are; those that came since the last time are written first."""
-        for index in range(self._written, len(self.made)):
-            kept = self.made[index]
-            values = {"step": kept.step, "stage": kept.stage, "ends_stage": kept.ends_stage}
-            self._folder.save("recordings", {"offsets": kept.offsets}, values | {"means": kept.means}, index)
-        self._written = len(self.made)
-        return Saved({}, {"count": self._written})
-
-    def restore(self, saved: Saved) -> None:
-        """Read as many as there were; what a killed run wrote beyond them will be written again."""
-        self._written = saved.values["count"]
-        found = [self._folder.load("recordings", index) for index in range(self._written)]
-        if None in found:
-            raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
-        self.made = [self._read(kept) for kept in found if kept]
-
-    def _read(self, kept: Saved) -> SavedSnapshot:
-        values, offsets = typed(kept.values, _Values), kept.tensors["offsets"]
-        if offsets.shape != self._shape or offsets.dtype != torch.float16:
-            raise ValueError("a recording is of other members")
-        return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)
 
 
 def optimize_members(
@@ -171,7 +105,7 @@ def optimize_members(
             solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
-    beside = begin_joint_training(options, setup, settings.rates, stages)
+    beside = begin_joint_training(make_plan(options), setup, settings.rates, stages)
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
     kept = PeriodicSave(
         folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every

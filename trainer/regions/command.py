@@ -26,7 +26,7 @@ from progdf.scene.bounds import front
 from progdf.scene.region_spec import parse_region
 from progdf.scene.subject import fitted_eye, subject_rows
 from progdf.scene.up_axis import find_up
-from trainer.options import check_ranges
+from trainer.option_checks import check_ranges
 from trainer.views.view import render_colors, seen_colors, with_near_plane
 
 from .from_pictures import RegionSettings, region_kinds

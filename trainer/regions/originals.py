@@ -15,7 +15,7 @@ from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import parse_region
 from progdf.scene.up_axis import find_up
-from trainer.options import check_ranges
+from trainer.option_checks import check_ranges
 from trainer.views.choose import choose_views
 from trainer.views.view import (
     BACKGROUND,

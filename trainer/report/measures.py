@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,8 @@ from progdf.metrics.slider import SliderStatistics, slider_statistics
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
+from trainer.plan import Texts
+from trainer.report.curves import ErrorCurve, against_editor, courses
 from trainer.views.view import View
 
 from .clip import Clip, direction, load_clip
@@ -28,23 +30,6 @@ COMPARED = "keyframes2"
 _EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
 _NODES = 6  # recordings at which the field is looked at
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
-
-
-@dataclass(frozen=True)
-class ErrorCurve:
-    """Errors of pictures along the slider, over all held-out views.
-
-    Args:
-        s: slider values, ascending
-        psnr: over the pixels that count, dB, at most 99
-        ssim: over the same, at most 1
-        lpips: of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `edit.perceptual`)
-    """
-
-    s: tuple[float, ...]
-    psnr: tuple[float, ...]
-    ssim: tuple[float, ...]
-    lpips: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -62,15 +47,6 @@ class Direction:
     similarity: tuple[float | None, ...] = ()
     model: str = ""
     reason: str = ""
-
-
-@dataclass(frozen=True)
-class Texts:
-    """What the pictures show before and after, in words, and which CLIP reads them."""
-
-    before: str
-    after: str
-    model: str
 
 
 @dataclass(frozen=True)
@@ -229,59 +205,6 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             "clip_direction": {"s": measured.clip.s, "similarity": similarity} if similarity else None,
         },
     }
-
-
-def courses(
-    evaluator: Evaluator,
-    fields: Mapping[str, BakedField],
-    strengths: Sequence[float],
-    truth: Callable[[float], Sequence[Tensor]],
-    perceptual: Perceptual,
-) -> dict[str, ErrorCurve]:
-    """Each field's errors on held-out views, over the slider.
-
-    Args:
-        evaluator: the views
-        fields: by name
-        strengths: slider values, ascending
-        truth: what the pictures should be at one of them. -> [h,w,3] each
-        perceptual: LPIPS, or its stand-in
-    """
-    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in fields}
-    for s in strengths:
-        expected = truth(s)
-        for name, field in fields.items():
-            found = evaluator.pictures(field.offsets(s))
-            rows[name].append(
-                (
-                    evaluator.psnr(found, expected),
-                    evaluator.ssim(found, expected),
-                    evaluator.perceptual(found, expected, perceptual, "measured"),
-                )
-            )
-        perceptual.forget()
-    return {
-        name: ErrorCurve(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
-        for name, found in rows.items()
-    }
-
-
-def against_editor(
-    evaluator: Evaluator,
-    fields: Mapping[str, BakedField],
-    asked: Sequence[tuple[float, float]],
-    perceptual: Perceptual,
-) -> dict[str, ErrorCurve]:
-    """Each field's errors against the editor's own pictures.
-
-    Args:
-        evaluator: held-out views with these pictures
-        fields: by name
-        asked: slider value and the strength that the editor was asked at, ascending
-        perceptual: LPIPS, or its stand-in
-    """
-    strength = dict(asked)
-    return courses(evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual)
 
 
 def _seen(clip: Clip, evaluator: Evaluator, views: Sequence[View], offsets: Tensor) -> Tensor:

@@ -19,8 +19,10 @@ from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options, write_bear
 from trainer.fit.memory_bank import JointTraining, MemoryBank
-from trainer.options import FitOptions, check_network_options, resolve_options
-from trainer.pipeline.run import RunResult, refit, train
+from trainer.option_checks import check_network_options, resolve_options
+from trainer.options import FitOptions
+from trainer.pipeline.refit import refit
+from trainer.pipeline.run import RunResult, train
 
 
 @pytest.fixture(scope="module", autouse=True)

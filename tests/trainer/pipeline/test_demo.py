@@ -180,7 +180,7 @@ def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
 
     here = {"scarf": "finished", "gold": "stopped", "frost": "nothing"}
     monkeypatch.setattr(trainer.pipeline.run, "train", train)
-    monkeypatch.setattr(trainer.pipeline.resume, "found", lambda options: here[options.out.name])
+    monkeypatch.setattr(trainer.pipeline.resume, "find_run", lambda options: here[options.out.name])
     arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
     with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
         demo.main(arguments)

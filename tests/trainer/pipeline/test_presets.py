@@ -12,7 +12,8 @@ from progdf.errors import ProgdfError
 from trainer.cli import train_options
 from trainer.optimize.objective import LossWeights
 from trainer.optimize.settings import idle_options, loss_weights, pgs_settings, stage_count
-from trainer.options import Preset, TrainOptions, resolve_options
+from trainer.option_checks import resolve_options
+from trainer.options import Preset, TrainOptions
 from trainer.presets import PRESETS, under_preset
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")

@@ -80,7 +80,7 @@ def test_ctrl_c_before_the_optimisation_is_kept_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.pipeline.run, "edited_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(trainer.pipeline.run, "edit_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt, match="--resume"):
             train(small_run(bear_folder), quiet=True)
     gone_on(bear_folder, uninterrupted)
@@ -171,7 +171,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = small_run(bear_folder, kind="geometry", group_steps=8, steps=16)
-    monkeypatch.setattr(trainer.pipeline.run, "finished", lambda *_: None)
+    monkeypatch.setattr(trainer.pipeline.run, "finish_run", lambda *_: None)
     train(options, quiet=True)
     expected = (OUT / "trajectory.safetensors").read_bytes()
     shutil.rmtree(OUT)

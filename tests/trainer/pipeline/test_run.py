@@ -24,8 +24,10 @@ from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, write_bear
 from trainer import cli
 from trainer.optimize.retime import undo_retiming
-from trainer.options import FitOptions, resolve_options
-from trainer.pipeline.run import RunResult, refit, train
+from trainer.option_checks import resolve_options
+from trainer.options import FitOptions
+from trainer.pipeline.refit import refit
+from trainer.pipeline.run import RunResult, train
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,7 @@ def test_a_disk_that_is_full_from_the_start_is_one_line(
 def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls, true_sum = 0, trainer.optimize.pgs.summed
+    calls, true_sum = 0, trainer.optimize.pgs.total_loss
 
     def poisoned(terms: dict[str, torch.Tensor]) -> torch.Tensor:
         nonlocal calls
@@ -73,7 +73,7 @@ def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
         return true_sum(terms) * (float("nan") if calls == 13 else 1.0)
 
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.optimize.pgs, "summed", poisoned)
+        patch.setattr(trainer.optimize.pgs, "total_loss", poisoned)
         with pytest.raises(ProgdfError, match="the loss is nan at step 12; the state before it is kept"):
             train(small_run(bear_folder, save_every=NEVER), quiet=True)
     assert saved_step() == 12

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,11 +21,12 @@ from progdf.io.images import to_picture
 from tests.helpers.tiny_clip import tiny_clip
 from tests.helpers.trained import WHITE, quick_options, small, write_bear
 from trainer.fit.evaluate import make_evaluator
-from trainer.options import FitOptions
-from trainer.pipeline.fit_and_report import texts
-from trainer.pipeline.run import refit, train
+from trainer.options import FitOptions, TrainOptions
+from trainer.pipeline.refit import refit
+from trainer.pipeline.run import train
+from trainer.plan import Texts, make_plan
 from trainer.report.clip import Clip, _square, direction, load_clip
-from trainer.report.measures import Texts, clip_course
+from trainer.report.measures import clip_course
 
 pytest.importorskip("transformers")
 
@@ -123,10 +125,10 @@ def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
 
 
 def test_an_instruction_is_what_one_sees_after_unless_something_else_is_said() -> None:
-    told = {"editor": 'instruct:"a golden bear"', "text_before": "a bear"}
-    assert texts(told).after == "a golden bear"
-    assert texts({**told, "text_after": "gold"}).after == "gold"
-    assert texts({"editor": "recolor:#fff"}).after == ""
+    told = TrainOptions(Path("s.ply"), Path("run"), "all", 'instruct:"a golden bear"', text_before="a bear")
+    assert make_plan(told).texts.after == "a golden bear"
+    assert make_plan(replace(told, text_after="gold")).texts.after == "gold"
+    assert make_plan(replace(told, editor="recolor:#fff")).texts.after == ""
 
 
 def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_words(

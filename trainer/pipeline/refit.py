@@ -1,0 +1,58 @@
+"""`progdf fit`: the field of a finished run, fitted anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from trainer.optimize.losses import perceptual_loss
+from trainer.option_checks import check_network_options, plain_options
+from trainer.options import FitOptions
+from trainer.pipeline.fit_and_report import RunResult, finish_run
+from trainer.pipeline.reopen import options_of, render_run_views, reopen_run
+from trainer.pipeline.threads import use_threads
+from trainer.plan import make_plan
+from trainer.setup.training_setup import widen_views
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import read_views
+
+
+def refit(options: FitOptions, quiet: bool = False) -> RunResult:
+    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimised.
+
+    Raises:
+        ProgdfError: the folder is no finished run, or its scene is gone or another.
+    """
+    check_network_options(options)
+    use_threads(options.threads)
+    run = reopen_run(options.run, options.scene)
+    log = RunLog(run.folder.log, quiet, refits=True)
+    try:
+        with log.stage("views"):
+            setup = render_run_views(run)
+            names = [view.camera.name for view in setup.train]
+            edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
+            # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
+            setup = widen_views(setup, edited)
+        perceptual, warning = perceptual_loss()
+        if warning:
+            log.say(warning)
+        own = options_of(run.about)
+        now = replace(
+            own,
+            field=options.field,
+            fit="after",
+            size=options.size,
+            inputs=options.inputs,
+            bins=options.bins,
+            code=options.code,
+            picture_loss=options.picture_loss,
+            target_psnr=options.target_psnr,
+            bytes_budget=options.bytes_budget,
+            text_before=options.text_before or own.text_before,
+            text_after=options.text_after or own.text_after,
+            clip_model=options.clip_model or own.clip_model,
+        )
+        about = {**run.about, "options": plain_options(now)}
+        return finish_run(run.folder, setup, run.trajectory, about, perceptual, log, make_plan(now))
+    finally:
+        log.close()
