@@ -23,8 +23,8 @@ uniform vec3 eye_low;        // … and what the rounding left over
 uniform vec4 intrinsics;     // fx, fy, cx, cy
 uniform vec2 size;           // width, height
 uniform bool antialiased;    // opacity × sqrt(det before dilation / det after)
-uniform bool tinted;         // whether `tint` is there
-uniform sampler2D tint;      // rgb, and how much of it takes the place of the Gaussian's own colour
+uniform bool highlighted;         // whether `highlight` is there
+uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own colour
 
 out vec2 centre;
 out vec3 shape;              // slope, l11, l22
@@ -93,8 +93,8 @@ void main() {
     if (any(greaterThan(at - extent, size)) || any(lessThan(at + extent, vec2(0.0)))) return;
 
     vec3 rgb = shade(texel, offset / length(offset));
-    if (tinted) {
-        vec4 over = texelFetch(tint, texel, 0);
+    if (highlighted) {
+        vec4 over = texelFetch(highlight, texel, 0);
         rgb = mix(rgb, over.rgb, over.a);
     }
     if (not_finite(rgb)) return;        // before the clamp, which hides NaN and -inf

@@ -141,14 +141,14 @@ def turned(
             held.callback(mice[way].engine.release)
         full = _turn(mice, steps)
         for mouse in mice.values():
-            mouse.stage.change(replace(mouse.stage.work.view, draft="on"))
+            mouse.main_view.change(replace(mouse.main_view.work.view, draft="on"))
         coarse = _turn(mice, steps)
         for way, mouse in mice.items():
             wrong = sum(not np.array_equal(image, _afresh(mouse, view)) for view, image in full[way].kept)
             errors = [_psnr(image, _afresh(mouse, view)) for view, image in coarse[way].kept]
             results.append(
                 Turning(
-                    mouse.stage.facts.count,
+                    mouse.main_view.facts.count,
                     way,
                     tuple(full[way].frames_ms[WARM_UP:]),
                     tuple(full[way].draws_ms[WARM_UP:]),
@@ -266,9 +266,9 @@ def _open(mouse: Mouse, path: Path, way: str) -> float:
     """Open a file in the window as it is done when one is dropped there; seconds to its first picture."""
     began = time.perf_counter()
     document = documents.load(path)
-    mouse.engine = Engine(mouse.stage.context, document.scene, (), way)
-    mouse.stage.serve(mouse.engine, document.facts())
-    mouse.stage.restart(replace(mouse.stage.work.view, camera=first_camera(document.scene)))
+    mouse.engine = Engine(mouse.main_view.context, document.scene, (), way)
+    mouse.main_view.set_engine(mouse.engine, document.facts())
+    mouse.main_view.restart(replace(mouse.main_view.work.view, camera=first_camera(document.scene)))
     mouse.frame()
     return time.perf_counter() - began
 
@@ -287,9 +287,9 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
             break
         for way, mouse in mice.items():
             turns[way].frames_ms.append(mouse.turn(TURN_PX))
-            turns[way].draws_ms.append(mouse.stage.canvas.timings.total_ms)
+            turns[way].draws_ms.append(mouse.main_view.canvas.timings.total_ms)
             if step >= 0 and (steps - 1 - step) % -(-steps // KEPT) == 0:
-                turns[way].kept.append((mouse.stage.work.view, mouse.picture()))
+                turns[way].kept.append((mouse.main_view.work.view, mouse.picture()))
     for mouse in mice.values():
         mouse.release()
         mouse.settle()
@@ -303,26 +303,26 @@ def affordable(steps: int, one_s: float) -> int:
 
 def _afresh(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
     """The picture of `view` in full, by an engine that has drawn nothing before."""
-    stage, engine = mouse.stage, mouse.engine
-    new = Engine(stage.context, engine.scene, (), engine.draws_with)
-    stage.serve(new, stage.facts)
-    stage.change(replace(view, draft="off"))
+    main_view, engine = mouse.main_view, mouse.engine
+    new = Engine(main_view.context, engine.scene, (), engine.draws_with)
+    main_view.set_engine(new, main_view.facts)
+    main_view.change(replace(view, draft="off"))
     mouse.frame()
     picture = mouse.picture()
-    stage.serve(engine, stage.facts)
+    main_view.set_engine(engine, main_view.facts)
     new.release()
     return picture
 
 
 def _at_rest(mouse: Mouse) -> int:
     """Largest difference from the full picture once the hand, still holding it, has come to rest."""
-    mouse.stage.change(replace(mouse.stage.work.view, draft="on"))
+    mouse.main_view.change(replace(mouse.main_view.work.view, draft="on"))
     mouse.grip_picture()
     mouse.turn(TURN_PX)
-    if mouse.stage.canvas.pixels == 1:
+    if mouse.main_view.canvas.pixels == 1:
         raise AssertionError("the picture in motion was not coarse")
     mouse.frame(seconds=2 * draft.REST_S)
-    rested, view = mouse.picture(), mouse.stage.work.view
+    rested, view = mouse.picture(), mouse.main_view.work.view
     mouse.release()
     mouse.settle()
     return int(np.abs(rested.astype(int) - _afresh(mouse, view)).max())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from viewer.app.main_view import Stage
+from viewer.app.main_view import MainView
 from viewer.files.document import Document
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
@@ -34,7 +34,7 @@ def slider_at(width: float, layer: int, strength: float) -> tuple[float, float]:
 
 
 class Mouse:
-    """Moves the mouse on a stage of its own and says how long each finished frame took.
+    """Moves the mouse on a main_view of its own and says how long each finished frame took.
 
     Args:
         ctx: the GL context that the window is drawn in
@@ -55,7 +55,7 @@ class Mouse:
         self.engine, self.size = engine, size
         self.pixels = (size[0] + round(panel.WIDTH_PX), size[1])
         self._ctx = ctx
-        self.stage = Stage(ctx, engine, Document("scene.ply", scene, tuple(gdfs)).facts(), view)
+        self.main_view = MainView(ctx, engine, Document("scene.ply", scene, tuple(gdfs)).facts(), view)
         self._screen = ctx.simple_framebuffer(self.pixels)
         self._io = imgui.get_io()
         self._io.display_size = imgui.ImVec2(*self.pixels)
@@ -67,25 +67,25 @@ class Mouse:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.stage.close()
+        self.main_view.close()
         self._screen.release()
 
     def frame(self, seconds: float = _STEP_S) -> float:
         """Milliseconds from now to a frame's finished pixels.
 
         Args:
-            seconds: that have passed on the stage's clock since the last one
+            seconds: that have passed on the main view's clock since the last one
         """
         began = time.perf_counter()
-        self.stage.wake()
-        self.stage.frame(self._screen, self.pixels, seconds, arrived=began)
+        self.main_view.wake()
+        self.main_view.frame(self._screen, self.pixels, seconds, arrived=began)
         self._ctx.finish()
         return 1e3 * (time.perf_counter() - began)
 
     def settle(self) -> None:
         """Frames until nothing is left to draw at once."""
-        while self.stage.patience() == 0.0:
-            self.stage.frame(self._screen, self.pixels, _STEP_S)
+        while self.main_view.next_frame_delay() == 0.0:
+            self.main_view.frame(self._screen, self.pixels, _STEP_S)
 
     def move(self, x: float, y: float) -> float:
         """Move the mouse there, window pixels; milliseconds to finished pixels."""
@@ -102,7 +102,7 @@ class Mouse:
 
     def grip_slider(self, layer: int = 0) -> None:
         """Take the handle of a layer's slider where it stands."""
-        self.move(*slider_at(self.pixels[0], layer, self.stage.work.view.layers[layer].strength))
+        self.move(*slider_at(self.pixels[0], layer, self.main_view.work.view.layers[layer].strength))
         self.press()
 
     def grip_picture(self) -> None:

@@ -154,7 +154,7 @@ def rows(
                 if WAYS[name].whole:
                     mouse.engine.forget()
                 events[name].append(mouse.move(*place))
-                parts[name].append(mouse.stage.canvas.timings)
+                parts[name].append(mouse.main_view.canvas.timings)
         return [
             Result(
                 case,
@@ -221,7 +221,7 @@ def _fitting(scenes: Sequence[Gaussians], members: int) -> Gaussians:
 
 def _apart(mouse: Mouse, size: tuple[int, int]) -> float:
     """How far the picture is from the same one drawn afresh."""
-    view = mouse.stage.work.view
+    view = mouse.main_view.work.view
     stepped = mouse.engine.image(view, size)
     mouse.engine.forget()
     return float(np.abs(stepped - mouse.engine.image(view, size)).max())

@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> int:
 
         def draw(self) -> None:
             super().draw()
-            if not watched and self.stage.canvas.drawn:
+            if not watched and self.main_view.canvas.pictures_drawn:
                 self.context.finish()
                 watched.append(self)
                 _say(
@@ -57,8 +57,12 @@ def main(arguments: list[str]) -> int:
     finally:
         application.App, application.run = real, run  # type: ignore[misc]
         if watched and stays:
-            stage = watched[0].stage
-            _say(frames=stage.frames, pictures=stage.canvas.drawn, slider_ms=list(stage.latencies_ms))
+            shown = watched[0].main_view
+            _say(
+                frames=shown.frames,
+                pictures=shown.canvas.pictures_drawn,
+                slider_ms=list(shown.latencies_ms),
+            )
 
 
 def _most_mb() -> float:

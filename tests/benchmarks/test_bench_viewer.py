@@ -123,15 +123,15 @@ def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
     view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.3),), draft="off")
     with Mouse(ctx, engine, scene, [gdf], view, SIZE) as mouse:
         mouse.grip_slider()
-        assert mouse.stage.work.view.layers[0].strength == pytest.approx(0.3)
+        assert mouse.main_view.work.view.layers[0].strength == pytest.approx(0.3)
         mouse.turn(24.2)
         mouse.release()
-        assert mouse.stage.work.view.layers[0].strength == pytest.approx(0.4, abs=0.01)
-        assert mouse.stage.work.view.camera == view.camera
+        assert mouse.main_view.work.view.layers[0].strength == pytest.approx(0.4, abs=0.01)
+        assert mouse.main_view.work.view.camera == view.camera
         mouse.grip_picture()
         mouse.turn(10.0)
         mouse.release()
-        assert mouse.stage.work.view.camera.azimuth == pytest.approx(view.camera.azimuth - 3.0)
+        assert mouse.main_view.work.view.camera.azimuth == pytest.approx(view.camera.azimuth - 3.0)
         assert mouse.picture().shape == (*SIZE[::-1], 3)
     engine.release()
     ctx.release()

@@ -38,7 +38,7 @@ def press(app: App, *chords: str) -> None:
     """Keys as the window hears them."""
     for chord in chords:
         app.window.take_keys = lambda c=chord: Keys((Press(c),))  # type: ignore[method-assign]
-        app.stage.wake()
+        app.main_view.wake()
         app.draw()
         app.window.take_keys = lambda: Keys()  # type: ignore[method-assign]
         for _ in range(3):

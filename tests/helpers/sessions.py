@@ -12,7 +12,7 @@ import numpy as np
 from progdf.compose.layers import Gains
 from tests.helpers.ui_rig import bear, first_view
 from viewer.files import document, session
-from viewer.files.session import Session
+from viewer.files.session import WindowSession
 from viewer.state import paint, snapshots
 from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
 
@@ -21,7 +21,7 @@ def full_view() -> ViewState:
     """A view in which nothing is as it is by default."""
     view = first_view(bear(), 0.25, 0.75)
     ears = bear().gdfs[1].region
-    painted = paint.encoded(np.linspace(0, 1, len(ears)))
+    painted = paint.encode(np.linspace(0, 1, len(ears)))
     layers = (
         replace(view.layers[1], name="ears → gold", gains=Gains(0.5, 0.25, 0.125), solo=True, paint=painted),
         replace(view.layers[0], enabled=False),
@@ -49,8 +49,8 @@ def opened_document(folder: Path) -> document.Document:
 def saved_session(folder: Path) -> Path:
     """The session of `full_view` on the files of `bear_files`, with a snapshot."""
     view = full_view()
-    kept = snapshots.taken((), replace(view, blend="sum"))
-    session.save(folder / "work.session.json", Session(opened_document(folder), view, kept))
+    kept = snapshots.take((), replace(view, blend="sum"))
+    session.save(folder / "work.session.json", WindowSession(opened_document(folder), view, kept))
     return folder / "work.session.json"
 
 

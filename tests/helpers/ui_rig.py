@@ -1,4 +1,4 @@
-"""The whole window without a window: stage and engine in a headless context, and a hand that moves in it."""
+"""The whole window without a window: main view, engine and a hand, in a headless context."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from imgui_bundle import imgui
 from numpy.typing import NDArray
 
 from tests.helpers.stacks import Stack, bear_stack
-from viewer.app.main_view import Stage
+from viewer.app.main_view import MainView
 from viewer.camera.inputs import NO_KEYS, Keys, Press
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import Document
@@ -38,12 +38,12 @@ def first_view(stack: Stack, *strengths: float) -> ViewState:
 
 
 class Rig:
-    """A hand on the stage: each move, press and key is followed by one frame, as in the window."""
+    """A hand on the main view: each move, press and key is followed by one frame, as in the window."""
 
-    def __init__(self, stage: Stage, points: tuple[int, int], density: float) -> None:
-        self.stage, self.points = stage, points
+    def __init__(self, main_view: MainView, points: tuple[int, int], density: float) -> None:
+        self.main_view, self.points = main_view, points
         self.pixels = (round(points[0] * density), round(points[1] * density))
-        self.screen = stage.context.simple_framebuffer(self.pixels)
+        self.screen = main_view.context.simple_framebuffer(self.pixels)
         self.io = imgui.get_io()
         self.io.display_size = imgui.ImVec2(*points)
         self.io.display_framebuffer_scale = imgui.ImVec2(density, density)
@@ -51,23 +51,23 @@ class Rig:
 
     def frame(self, count: int = 1, keys: Keys = NO_KEYS) -> None:
         for _ in range(count):
-            self.stage.frame(self.screen, self.pixels, STEP_S, keys)
+            self.main_view.frame(self.screen, self.pixels, STEP_S, keys)
 
     def settle(self) -> None:
-        """What the window's loop does while the stage has no patience."""
-        while self.stage.patience() == 0.0:
+        """What the window's loop does while the main view has no patience."""
+        while self.main_view.next_frame_delay() == 0.0:
             self.frame()
 
     def rest(self, seconds: float = 3.0) -> None:
         """What the window's loop does for so long while nothing comes in."""
-        while seconds > 0.0 and (wait := self.stage.patience()) is not None:
+        while seconds > 0.0 and (wait := self.main_view.next_frame_delay()) is not None:
             passed = max(min(wait, seconds), STEP_S)
-            self.stage.frame(self.screen, self.pixels, passed)
+            self.main_view.frame(self.screen, self.pixels, passed)
             seconds -= passed
 
     def event(self) -> None:
-        """Something came in: the window wakes the stage and draws."""
-        self.stage.wake()
+        """Something came in: the window wakes the main view and draws."""
+        self.main_view.wake()
         self.frame()
 
     def move(self, x: float, y: float) -> None:
@@ -110,7 +110,7 @@ class Rig:
     def key(self, chord: str) -> None:
         """Press a chord of `controls.KEYS` and let go."""
         name = chord.rpartition("+")[2]
-        self.stage.wake()
+        self.main_view.wake()
         self.frame(keys=Keys((Press(chord),), frozenset({name})))
         self.frame()
         self.settle()
@@ -130,13 +130,13 @@ class Rig:
 
     @property
     def strengths(self) -> list[float]:
-        return [layer.strength for layer in self.stage.work.view.layers]
+        return [layer.strength for layer in self.main_view.work.view.layers]
 
     def slider(self, layer: int, strength: float) -> tuple[float, float]:
         """Where on the window (at 1×) the handle of a layer stands at a strength; the top one is the last."""
         inset = 12 + 10 + 7  # the panel's and the card's padding, the handle's radius
         span = panel.WIDTH_PX - 2 * inset
-        row = len(self.stage.work.view.layers) - 1 - layer
+        row = len(self.main_view.work.view.layers) - 1 - layer
         return self.points[0] - panel.WIDTH_PX + inset + strength * span, 136.0 + 97.0 * row
 
 
@@ -152,7 +152,7 @@ def rig(
     edit_pass: str = "auto",
     gdf_paths: Sequence[Path] = (),
 ) -> Iterator[Rig]:
-    """A stage on the bear.
+    """A main view on the bear.
 
     Args:
         view: the first state; the bear with both edits half way if None
@@ -166,10 +166,10 @@ def rig(
     context = headless_context()
     engine = Engine(context, stack.scene, stack.gdfs, draw, edit_pass)
     facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
-    stage = Stage(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
+    main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
     try:
-        yield Rig(stage, points, density)
+        yield Rig(main_view, points, density)
     finally:
-        stage.close()
+        main_view.close()
         engine.release()
         context.release()

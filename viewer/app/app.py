@@ -1,4 +1,4 @@
-"""The application: a window, the stage in it, its loop, and the files dropped on it."""
+"""The application: a window, the main view in it, its loop, and the files dropped on it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from imgui_bundle import imgui
 from viewer.files.document import Document
 from viewer.render.engine import Engine
 from viewer.state import workspace
-from viewer.state.snapshots import Snapshot
+from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 from viewer.ui.window import Window, interruptible
 
-from .actions import Desk
-from .main_view import Stage
+from .actions import FileActions
+from .main_view import MainView
 
 SIZE = (1280, 800)
 
@@ -27,7 +27,7 @@ def run(
     pictures: Path = Path(),
     size: tuple[int, int] = SIZE,
     session: Path | None = None,
-    snapshots: tuple[Snapshot, ...] = (),
+    snapshots: tuple[SliderSnapshot, ...] = (),
     draw: str = "auto",
     edit_pass: str = "auto",
 ) -> int:
@@ -51,8 +51,8 @@ def run(
     window = Window(_window_title(document.title), size)
     try:
         app = App(window, document, state, pictures, session, draw=draw, edit_pass=edit_pass)
-        app.stage.restart(state, snapshots)
-        app.desk.offer_autosave()
+        app.main_view.restart(state, snapshots)
+        app.file_actions.offer_autosave()
         try:
             with interruptible():
                 app.loop()
@@ -64,7 +64,7 @@ def run(
 
 
 class App:
-    """One window with its stage and engine; `desk` sees to its files."""
+    """One window with its main view and engine; `file_actions` sees to its files."""
 
     def __init__(
         self,
@@ -81,30 +81,32 @@ class App:
         self.context = window.context()
         self._draw, self._edit_pass = draw, edit_pass
         self.engine = self._engine(document)
-        self.stage = Stage(self.context, self.engine, document.facts(), state, window.ui_scale, pictures)
-        self.desk = Desk(self, session, memory)
+        self.main_view = MainView(
+            self.context, self.engine, document.facts(), state, window.ui_scale, pictures
+        )
+        self.file_actions = FileActions(self, session, memory)
         self._left = False
         self._title = ""
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
         self.last = time.perf_counter()
-        window.listen(self.stage.wake, self._remember_dropped, self._redraw)
+        window.listen(self.main_view.wake, self._queue_dropped, self._redraw)
 
     def close(self) -> None:
-        self.desk.release()
-        self.stage.ui.make_current()
+        self.file_actions.release()
+        self.main_view.ui.make_current()
         imgui.backends.glfw_shutdown()
-        self.stage.close()
+        self.main_view.close()
         self.engine.release()
 
     def loop(self) -> None:
         """Draw while something changes, sleep while nothing does."""
         self.window.new_frame()
-        self.stage.greet(self.context.screen)
+        self.main_view.draw_splash(self.context.screen)
         self.window.present()
         while not self._left:
             waits = [wait for wait in self._waits() if wait is not None]
-            if not self.stage.opening:  # else events wait in the window system, so that no letter is lost
+            if not self.main_view.opening:  # else events wait in the window system, so that no letter is lost
                 self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
@@ -112,34 +114,34 @@ class App:
                 self.open(path)
             if self.window.closing and not self._left:
                 self.window.stay_open()
-                self.stage.request("quit")
+                self.main_view.request("quit")
             self.draw()
-        self.desk.closed()
+        self.file_actions.on_close()
 
     def draw(self) -> None:
         """One frame of the latest state; nothing while the window is minimised."""
         if 0 in self.window.pixels:
-            self.stage.rest()
+            self.main_view.rest()
             return
         arrived = time.perf_counter()
         seconds, self.last = arrived - self.last, arrived
-        self.stage.ui.make_current()
-        self.stage.ui.set_scale(self.window.ui_scale)
+        self.main_view.ui.make_current()
+        self.main_view.ui.set_scale(self.window.ui_scale)
         self.window.new_frame()
         screen = self.context.screen
-        self.stage.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
+        self.main_view.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
         self.window.present()
         self._rename()
-        for request in self.stage.take_requests():
+        for request in self.main_view.take_requests():
             if request == "full_screen":
                 self.window.toggle_full_screen()
             else:
-                self.desk.serve(request)
+                self.file_actions.handle(request)
 
     def _waits(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
-        choosing = self.desk.choosing()  # first: what was chosen wakes the stage
-        return choosing, self.stage.patience(), self.desk.autosave(time.perf_counter())
+        choosing = self.file_actions.poll_dialog()  # first: what was chosen wakes the main view
+        return choosing, self.main_view.next_frame_delay(), self.file_actions.autosave(time.perf_counter())
 
     def _redraw(self) -> None:
         try:
@@ -147,9 +149,9 @@ class App:
         except BaseException as failure:  # glfw would only print it
             self.failure = failure
 
-    def _remember_dropped(self, paths: Sequence[Path]) -> None:
+    def _queue_dropped(self, paths: Sequence[Path]) -> None:
         self.dropped += paths
-        self.stage.wake()
+        self.main_view.wake()
 
     def _take_dropped(self) -> list[Path]:
         paths, self.dropped = self.dropped, []
@@ -157,18 +159,18 @@ class App:
 
     def open(self, path: Path) -> None:
         """A dropped or chosen file, by what it is."""
-        self.desk.open(path)
+        self.file_actions.open(path)
 
     def show(self, document: Document) -> None:
         """Draw another document from now on; the state is the caller's to change."""
         engine = self._engine(document)
         self.engine.release()
         self.document, self.engine = document, engine
-        self.stage.serve(engine, document.facts())
+        self.main_view.set_engine(engine, document.facts())
 
     def _rename(self) -> None:
         """The title bar says what is open, and with a dot that there are unsaved changes."""
-        title = _window_title(self.document.title, self.desk.unsaved)
+        title = _window_title(self.document.title, self.file_actions.has_unsaved)
         if title != self._title:
             self.window.rename(title)
             self._title = title

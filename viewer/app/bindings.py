@@ -58,7 +58,7 @@ def topics() -> tuple[Topic, ...]:
     """Everything that can be done, each once."""
     starts = [next(i for i, key in enumerate(controls.KEYS) if key.action == first) for _, first in TOPICS]
     ends = [min((s for s in starts if s > start), default=len(controls.KEYS)) for start in starts]
-    keys = (_named(controls.KEYS[start:end]) for start, end in zip(starts, ends, strict=True))
+    keys = (_describe_keys(controls.KEYS[start:end]) for start, end in zip(starts, ends, strict=True))
     named = zip((name for name, _ in TOPICS), keys, strict=True)
     return Topic("Mouse", MOUSE_HELP), *(Topic(name, rows) for name, rows in named)
 
@@ -67,7 +67,7 @@ def columns(shown: Sequence[Topic], count: int) -> list[list[Topic]]:
     """The topics in their order in at most `count` columns, the longest as short as it can be."""
     spans = ((i, j) for i in range(len(shown)) for j in range(i + 1, len(shown) + 1))
     heights = {sum(topic.height for topic in shown[i:j]) for i, j in spans}
-    return next(found for height in sorted(heights) if len(found := _packed(shown, height)) <= count)
+    return next(found for height in sorted(heights) if len(found := _pack(shown, height)) <= count)
 
 
 def draw(room: imgui.ImVec2, ui: UiContext) -> None:
@@ -118,7 +118,7 @@ def _heading(name: str, ui: UiContext) -> None:
     imgui.pop_font()
 
 
-def _packed(shown: Sequence[Topic], height: float) -> list[list[Topic]]:
+def _pack(shown: Sequence[Topic], height: float) -> list[list[Topic]]:
     """Columns of at most this height, filled one after the other; too long a topic stands alone."""
     found: list[list[Topic]] = []
     for topic in shown:
@@ -129,7 +129,7 @@ def _packed(shown: Sequence[Topic], height: float) -> list[list[Topic]]:
     return found
 
 
-def _named(keys: Sequence[controls.Key]) -> tuple[tuple[str, str], ...]:
+def _describe_keys(keys: Sequence[controls.KeyBinding]) -> tuple[tuple[str, str], ...]:
     """Chord and help of every key that has a help text, in the words of a person."""
     return tuple((_NAMES.get(key.chord, key.chord), key.help) for key in keys if key.help)
 

@@ -9,12 +9,11 @@ import moderngl
 from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_view import Comparer
 from viewer.pictures.thumbnails import Thumbnails
-from viewer.render import dynamic_resolution as draft
-from viewer.render import highlight as tint
+from viewer.render import dynamic_resolution, highlight
 from viewer.render.engine import Engine, FrameTimings
 from viewer.render.renderers import Image
-from viewer.state.recordings import Recording
-from viewer.state.snapshots import Snapshot, shown
+from viewer.state.recordings import RecordingFile
+from viewer.state.snapshots import SliderSnapshot, with_original
 from viewer.state.view_state import ViewState
 from viewer.ui.context import PALETTE
 
@@ -28,14 +27,16 @@ class Canvas:
         found: where the engine's edits were recorded, one for each
     """
 
-    def __init__(self, context: moderngl.Context, engine: Engine, found: Sequence[Recording] = ()) -> None:
+    def __init__(
+        self, context: moderngl.Context, engine: Engine, found: Sequence[RecordingFile] = ()
+    ) -> None:
         self.comparer = Comparer(engine, context, found)
         self._thumbnails = Thumbnails(context, engine)
         self.timings = FrameTimings()
         """Of the picture on screen."""
-        self.drawn = 0
+        self.pictures_drawn = 0
         """How many pictures were drawn."""
-        self._draft = draft.Draft()
+        self._resolution = dynamic_resolution.DynamicResolution()
         self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
 
     def draw(
@@ -54,7 +55,7 @@ class Canvas:
             focus: the layer whose painted weights are shown while the brush is out, or None
             overlap: the layer of which is shown what it shares with the others, or None
             held: a hand is on something, so that more will follow
-            now: seconds on the stage's clock
+            now: seconds on the main view's clock
 
         Raises:
             ProgdfError: a layer of `view` means nothing.
@@ -65,34 +66,36 @@ class Canvas:
         turned, slid = aim != self._last[0], edits != self._last[1]
         self._last = aim, edits
         mode = "off" if view.compare.mode == "difference" else view.draft
-        self._draft = draft.begun(self._draft, mode, held, turned, slid, now)
-        self.comparer.engine.tint = tint.wanted(view, focus, overlap)
+        self._resolution = dynamic_resolution.before_draw(self._resolution, mode, held, turned, slid, now)
+        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap)
         new = self.comparer.needs_draw(view, size, self.pixels)
         timings = self.comparer.draw(view, screen, size, self.pixels)
         if new:
             self.timings = timings
-            self.drawn += 1
-            self._draft = draft.drawn(self._draft, timings, turned)
+            self.pictures_drawn += 1
+            self._resolution = dynamic_resolution.after_draw(self._resolution, timings, turned)
 
     @property
     def pixels(self) -> int:
         """Of the window that one pixel of the picture fills, each way; more than 1 while it is coarse."""
-        return self._draft.pixels
+        return self._resolution.pixels
 
-    def patience(self, now: float) -> float | None:
+    def next_frame_delay(self, now: float) -> float | None:
         """Seconds until the picture has to be drawn in full; None where it is."""
-        return draft.patience(self._draft, now)
+        return dynamic_resolution.next_frame_delay(self._resolution, now)
 
     def image(self, view: ViewState, size: tuple[int, int]) -> Image:
         """The picture as an array, in full; see `Comparer.image`. [H,W,3]"""
         return self.comparer.image(view, size)
 
-    def cards(self, kept: tuple[Snapshot, ...], view: ViewState) -> tuple[tuple[SnapshotCard, ...], bool]:
+    def cards(
+        self, kept: tuple[SliderSnapshot, ...], view: ViewState
+    ) -> tuple[tuple[SnapshotCard, ...], bool]:
         """The snapshots as the panel shows them, and whether the picture of one is still to be drawn."""
         if not kept:
             return (), False
-        all_kept = shown(kept, view)
-        textures, missing = self._thumbnails.bring(all_kept, view)
+        all_kept = with_original(kept, view)
+        textures, missing = self._thumbnails.update(all_kept, view)
         cards = (SnapshotCard(s.name, texture) for s, texture in zip(all_kept, textures, strict=True))
         return tuple(cards), missing
 

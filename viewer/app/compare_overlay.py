@@ -26,12 +26,12 @@ def near(view: ViewState, area: Area, ui: UiContext) -> bool:
     return within and 0.0 <= mouse.y < area.height
 
 
-def moved(view: ViewState, area: Area) -> ViewState:
+def move_divider(view: ViewState, area: Area) -> ViewState:
     """The divider under the mouse, never out of the picture."""
-    return placed(view, max(0.0, min(1.0, imgui.get_io().mouse_pos.x / area.width)))
+    return place_divider(view, max(0.0, min(1.0, imgui.get_io().mouse_pos.x / area.width)))
 
 
-def placed(view: ViewState, divider: float) -> ViewState:
+def place_divider(view: ViewState, divider: float) -> ViewState:
     """The divider at this share of the picture's width, 0..1."""
     return replace(view, compare=replace(view.compare, divider=divider))
 

@@ -1,7 +1,7 @@
 """Questions over the picture: where to save, what to open, what becomes of unsaved changes.
 
 All of it goes by keys too: Enter takes the marked button, Escape leaves all as it was. Where to save is asked
-until it is saved: the desk takes that question away.
+until it is saved: the file actions takes that question away.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from progdf.terminal import printable
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, SMALL_PX, Rgba, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import elided, section, small, tip
+from viewer.ui.widgets import elide, section, small, tip
 
 WIDTH_PX = 520.0  # at 1×
 _POPUP = "##dialog"
@@ -41,7 +41,7 @@ _SUBMIT = {"save": "Save", "open": "Open", "replace": "Replace"}
 
 
 @dataclass(frozen=True)
-class _Choice:
+class _Button:
     """A button of a question without a path field; `keys` press it too."""
 
     name: str
@@ -49,9 +49,9 @@ class _Choice:
 
 
 _CHOICES = {
-    "leave": (_Choice("Save", ("Enter", "S")), _Choice("Discard", ("D",)), _Choice("Cancel")),
-    "overwrite": (_Choice("Rename…", ("Enter", "R")), _Choice("Replace"), _Choice("Cancel")),
-    "restore": (_Choice("Restore", ("Enter", "R")), _Choice("Discard", ("D",)), _Choice("Later")),
+    "leave": (_Button("Save", ("Enter", "S")), _Button("Discard", ("D",)), _Button("Cancel")),
+    "overwrite": (_Button("Rename…", ("Enter", "R")), _Button("Replace"), _Button("Cancel")),
+    "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }
 
 
@@ -101,15 +101,15 @@ def _content(
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.text(TITLES[dialog.kind])
     imgui.pop_font()
-    _wrapped(_HINTS[dialog.kind].format(printable(Path(dialog.text).name)), PALETTE.dim)
+    _wrapped_text(_HINTS[dialog.kind].format(printable(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
     if dialog.chosen:
-        return _given(dialog, dialog.chosen)
+        return _submit(dialog, dialog.chosen)
     if dialog.kind in _CHOICES:
         _is_new(dialog.kind)
-        return _chosen(dialog, _pressed(_CHOICES[dialog.kind], pressed, ui))
+        return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
         imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
@@ -129,12 +129,12 @@ def _content(
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
-        _wrapped(printable(dialog.error), PALETTE.error)
+        _wrapped_text(printable(dialog.error), PALETTE.error)
     if dialog.kind != "save":
         fitting = [path for path in recent if dialog.kind == "open" or path.suffix == ".gdf"]
         chosen = _recent(fitting, bottom, ui)
         if chosen is not None:
-            return _given(dialog, str(chosen))
+            return _submit(dialog, str(chosen))
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     name = _SUBMIT[dialog.kind]
     button = _buttons((name, "Cancel"), ui)
@@ -142,7 +142,7 @@ def _content(
         return Answer(None)
     path = text.strip().strip("\"'")
     if path and (button == name or "Enter" in pressed):
-        return _given(dialog, path)
+        return _submit(dialog, path)
     return Answer(dialog)
 
 
@@ -154,7 +154,7 @@ def _is_new(kind: str) -> bool:
     return bool(changed or imgui.is_window_appearing())
 
 
-def _given(dialog: Dialog, path: str) -> Answer:
+def _submit(dialog: Dialog, path: str) -> Answer:
     """The file that was asked for."""
     if dialog.kind == "save":
         return Answer(replace(dialog, text=path, chosen=""), (f"save_to:{path}",))
@@ -163,7 +163,7 @@ def _given(dialog: Dialog, path: str) -> Answer:
     return Answer(None, (f"open_file:{path}",))
 
 
-def _wrapped(text: str, colour: Rgba) -> None:
+def _wrapped_text(text: str, colour: Rgba) -> None:
     """Small text in as many lines as it takes."""
     imgui.push_font(None, SMALL_PX)
     imgui.push_text_wrap_pos(0.0)
@@ -172,14 +172,14 @@ def _wrapped(text: str, colour: Rgba) -> None:
     imgui.pop_font()
 
 
-def _pressed(choices: Sequence[_Choice], pressed: Sequence[str], ui: UiContext) -> str:
+def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiContext) -> str:
     """The name of the button that was pressed, by the mouse or a key; "" for none."""
     button = _buttons([choice.name for choice in choices], ui)
     by_key = (choice.name for choice in choices if any(key in pressed for key in choice.keys))
     return button or next(by_key, "")
 
 
-def _chosen(dialog: Dialog, button: str) -> Answer:
+def _answer(dialog: Dialog, button: str) -> Answer:
     """What follows from a button of a question without a path field."""
     path = dialog.text
     match dialog.kind, button:
@@ -213,11 +213,11 @@ def _recent(recent: Sequence[Path], bottom: float, ui: UiContext) -> Path | None
     imgui.begin_child("recent", imgui.ImVec2(0.0, min(len(recent) * row, space)))
     for i, path in enumerate(recent):
         room = imgui.get_content_region_avail().x
-        if imgui.selectable(f"{elided(printable(path.name), 0.4 * room)}##{i}", False)[0]:
+        if imgui.selectable(f"{elide(printable(path.name), 0.4 * room)}##{i}", False)[0]:
             chosen = path
         imgui.same_line(0.42 * room)
         imgui.push_font(None, SMALL_PX)
-        imgui.text_disabled(elided(printable(str(path.parent)), 0.56 * room))
+        imgui.text_disabled(elide(printable(str(path.parent)), 0.56 * room))
         imgui.pop_font()
     imgui.end_child()
     return chosen

@@ -16,47 +16,48 @@ from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 
-from . import bindings, compare_overlay, dialogs
-from . import mouse as hand
-from .mouse import Hand, Sight
+from . import bindings, compare_overlay, dialogs, mouse
+from .mouse import MouseTool, PointerContext
 
 
-def panels(work: Workspace, sight: Sight, cards: tuple[SnapshotCard, ...], reveal: bool) -> Workspace:
+def panels(
+    work: Workspace, pointer: PointerContext, cards: tuple[SnapshotCard, ...], reveal: bool
+) -> Workspace:
     """The panel and, where it is shown, the timeline.
 
     Args:
         cards: of the snapshots
         reveal: scroll to the focused layer
     """
-    facts, past = sight.facts, work.past
+    facts, past = pointer.facts, work.past
     shown = panel.PanelInput(
-        workspace.UNSAVED * workspace.unsaved(work) + facts.title,
+        workspace.UNSAVED * workspace.has_unsaved(work) + facts.title,
         facts.count,
         facts.rows,
         work.focus,
         len(past.past),
         len(past.future),
         reveal,
-        work.dial,
+        work.active_slider,
         work.renaming,
         cards,
         obstacle(facts.recordings),
     )
-    result = panel.draw(work.view, shown, sight.ui)
+    result = panel.draw(work.view, shown, pointer.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
     work = replace(work, overlap=result.overlap)
-    work = _performed(work, result.actions, sight)
+    work = _perform(work, result.actions, pointer)
     if work.player.shown:
-        work = _performed(
-            work, timeline_bar.draw(work.view.timeline, work.player, sight.area, sight.ui), sight
+        work = _perform(
+            work, timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui), pointer
         )
     return work
 
 
 def over_picture(
     work: Workspace,
-    sight: Sight,
-    held: Hand,
+    pointer: PointerContext,
+    held: MouseTool,
     said: Labels,
     figures: Sequence[tuple[str, str]],
     original: bool,
@@ -69,26 +70,28 @@ def over_picture(
         figures: of the table of timings
         original: the key that shows it is held
     """
-    area, ui, view = sight.area, sight.ui, work.view
+    area, ui, view = pointer.area, pointer.ui, work.view
     if view.brush.active and not imgui.get_io().want_capture_mouse:
         brush.ring(view, ui)
     if original:
         overlay.banner("Original", area, ui)
     else:
-        compare_overlay.draw(view, said, area, hand.grips_divider(held, view, sight), ui)
+        compare_overlay.draw(view, said, area, mouse.grips_divider(held, view, pointer), ui)
     if view.overlay:
         overlay.table(figures, ui)
     closed, free = False, imgui.get_io().display_size
     if work.message is not None:
         bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
         closed, top = overlay.message(work.message, replace(area, height=area.height - bar), ui)
-        closed, free = closed or sight.now >= work.message.until, imgui.ImVec2(free.x, top)
+        closed, free = closed or pointer.now >= work.message.until, imgui.ImVec2(free.x, top)
     if work.help:
         bindings.draw(free, ui)
     return replace(work, message=None) if closed else work
 
 
-def asked(work: Workspace, sight: Sight, recent: Sequence[Path], pressed: Sequence[str]) -> Workspace:
+def draw_dialog(
+    work: Workspace, pointer: PointerContext, recent: Sequence[Path], pressed: Sequence[str]
+) -> Workspace:
     """The question that is open, if one is.
 
     Args:
@@ -97,11 +100,11 @@ def asked(work: Workspace, sight: Sight, recent: Sequence[Path], pressed: Sequen
     """
     if work.dialog is None:
         return work
-    answer = dialogs.draw(work.dialog, recent, pressed, sight.ui, sight.area)
+    answer = dialogs.draw(work.dialog, recent, pressed, pointer.ui, pointer.area)
     return replace(work, dialog=answer.dialog, requests=(*work.requests, *answer.requests))
 
 
-def _performed(work: Workspace, actions: Sequence[str], sight: Sight) -> Workspace:
+def _perform(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
     for action in actions:
-        work = workspace.perform(work, action, sight.facts, sight.area.width / sight.area.height)
+        work = workspace.perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
     return work

@@ -20,27 +20,26 @@ from viewer.camera.inputs import NO_KEYS, Keys, Press
 from viewer.files import exports as saved_files
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
-from viewer.pictures.compare_labels import labelled
+from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import Engine, FrameTimings, drawn_size
 from viewer.state import playback, workspace
-from viewer.state.snapshots import Snapshot
+from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
-from viewer.ui.frame_pacer import Pace
+from viewer.ui.frame_pacer import FramePacer
 
-from . import interface
-from . import mouse as hand
+from . import interface, mouse
 from .canvas import Canvas
-from .mouse import Hand, Sight
+from .mouse import MouseTool, PointerContext
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
 OPENING_FRAMES = 4
 """From the wish for a text field until imgui gives it the keyboard."""
 
 
-class Stage:
+class MainView:
     """Draws frames of one engine into the framebuffer it is given.
 
     Args:
@@ -66,17 +65,17 @@ class Stage:
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
-        self.work = workspace.opened(view)
+        self.work = workspace.new_workspace(view)
         self.frames = 0  # all that were drawn
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
-        self._hand = Hand()
+        self._tool = MouseTool()
         self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
         self._waiting: tuple[Press, ...] = ()  # keys that imgui has not come to yet
         self._asked_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
         self._resting = False
-        self._pace = Pace()
+        self._pace = FramePacer()
         self.wake = self._pace.wake
 
     def rest(self) -> None:
@@ -85,13 +84,13 @@ class Stage:
         self._resting = True
 
     def close(self) -> None:
-        """Free what the stage made; the engine and the context are the caller's."""
+        """Free what the main view made; the engine and the context are the caller's."""
         self.ui.make_current()
         imgui.backends.opengl3_shutdown()
         self.ui.close()
         self.canvas.release()
 
-    def serve(self, engine: Engine, facts: SceneFacts) -> None:
+    def set_engine(self, engine: Engine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
         self.canvas.release()
         self.engine, self.facts = engine, facts
@@ -100,35 +99,35 @@ class Stage:
 
     def change(self, view: ViewState) -> None:
         """A new state from outside the window; what it edits can be undone."""
-        self.work = workspace.settled(replace(self.work, view=view))
+        self.work = workspace.record_undo(replace(self.work, view=view))
         self.wake()
 
-    def restart(self, view: ViewState, kept: tuple[Snapshot, ...] = ()) -> None:
+    def restart(self, view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> None:
         """A new state and snapshots, with nothing to undo."""
-        self.work = workspace.opened(view, kept)
+        self.work = workspace.new_workspace(view, kept)
         self.wake()
 
-    def patience(self) -> float | None:
+    def next_frame_delay(self) -> float | None:
         """Seconds the window may wait for an event before the next `frame`; None: for ever."""
         self.ui.make_current()
-        if not self._resting and (inputs.waiting() or self.opening):
+        if not self._resting and (inputs.has_pending_input() or self.opening):
             return 0.0
         waits = [FLIGHT_S] if inputs.flying(self._keys) else []
         if imgui.get_io().want_text_input:
             waits.append(BLINK_S)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
-        sharpens = self.canvas.patience(self._clock)
+        sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
-        film = playback.patience(self.work.player, self.work.view.timeline)
-        return self._pace.patience(waits if film is None else [*waits, film])
+        film = playback.next_frame_delay(self.work.player, self.work.view.timeline)
+        return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
-    def tell(self, text: str, error: bool = False) -> None:
+    def show_message(self, text: str, error: bool = False) -> None:
         """Show one line at the bottom of the picture for a while."""
-        self.work = workspace.told(self.work, text, self._clock, error)
+        self.work = workspace.with_message(self.work, text, self._clock, error)
         self.wake()
 
-    def greet(self, screen: moderngl.Framebuffer) -> None:
+    def draw_splash(self, screen: moderngl.Framebuffer) -> None:
         """A word while the first picture is made: that may take seconds, and the window is already there."""
         self.ui.make_current()
         imgui.backends.opengl3_new_frame()
@@ -162,19 +161,19 @@ class Stage:
         self._clock += max(seconds, 0.0)
         self._pace.step(seconds)
         self._resting = False
-        self.work = workspace.played(self.work, seconds)
+        self.work = workspace.advance(self.work, seconds)
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
-        self._keys = self._heard(keys)
+        self._keys = self._reached_keys(keys)
         self._handle_input(seconds)
-        if not imgui.is_any_item_active() and self._hand.drag is None and not inputs.repeating(keys):
-            self.work = workspace.settled(self.work)
+        if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.repeating(keys):
+            self.work = workspace.record_undo(self.work)
         if self.work != before:
             self.wake()
-        shown, area = self._shown(), self._sight().size
+        shown, area = self._shown_view(), self._pointer().size
         focus, overlap = self.work.focus, self.work.overlap if shown.panel else None
-        self.canvas.draw(shown, screen, area, self._held(), self._clock, focus, overlap)
+        self.canvas.draw(shown, screen, area, self._is_held(), self._clock, focus, overlap)
         self._draw_overlays()
         imgui.render()
         screen.use()
@@ -185,10 +184,10 @@ class Stage:
             self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
         self._save_files(screen, size)
 
-    def _heard(self, keys: Keys) -> Keys:
+    def _reached_keys(self, keys: Keys) -> Keys:
         """The keys that imgui has come to by now; while a text field opens they wait for it."""
         pressed = (*self._waiting, *keys.pressed)
-        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(inputs.heard, pressed))
+        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(inputs.has_reached_imgui, pressed))
         opener = next((i for i, press in enumerate(pressed[:count]) if inputs.opens_text(press)), None)
         if opener is not None:
             count, self._asked_at = opener + 1, self.frames + 1
@@ -208,11 +207,11 @@ class Stage:
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
-        off = inputs.calls_off(self._keys, self._hand.drag)
+        off = inputs.cancels_drag(self._keys, self._tool.drag)
         if off:
-            self._call_off()
+            self._cancel_drag()
         asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
-        for action in inputs.actions_pressed(self._keys):
+        for action in inputs.requested_actions(self._keys):
             if not asks or action in ("picture", "window_picture"):
                 self._perform(action)
         if inputs.flying(self._keys):
@@ -223,14 +222,14 @@ class Stage:
             cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
             if missing:
                 self.wake()
-            self.work = interface.panels(self.work, self._sight(), cards, reveal)
+            self.work = interface.panels(self.work, self._pointer(), cards, reveal)
             self._revealed = self.work.focus
         if not off:  # else the right button has said all it was pressed for
-            self._hand, self.work = hand.moved(self._hand, self.work, self._sight())
+            self._tool, self.work = mouse.handle_mouse(self._tool, self.work, self._pointer())
 
-    def _call_off(self) -> None:
+    def _cancel_drag(self) -> None:
         """What is dragged goes back to where it was, and nothing is held any more."""
-        self.work, self._hand = hand.called_off(self._hand, self.work), Hand()
+        self.work, self._tool = mouse.cancel_drag(self._tool, self.work), MouseTool()
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
@@ -238,28 +237,28 @@ class Stage:
         area = self._area()
         self.work = workspace.perform(self.work, action, self.facts, area.width / area.height)
 
-    def _sight(self) -> Sight:
+    def _pointer(self) -> PointerContext:
         """What lies under the hand."""
-        return Sight(self.engine, self.facts, self._shown(), self._area(), self.ui, self._clock)
+        return PointerContext(self.engine, self.facts, self._shown_view(), self._area(), self.ui, self._clock)
 
-    def _shown(self) -> ViewState:
+    def _shown_view(self) -> ViewState:
         return workspace.original(self.work.view) if inputs.holds_original(self._keys) else self.work.view
 
-    def _held(self) -> bool:
+    def _is_held(self) -> bool:
         """Whether a hand is on something that moves the picture, or a film plays."""
-        if self._hand.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
+        if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
         return inputs.flying(self._keys) or inputs.repeating(self._keys) or self.work.player.playing
 
     def _draw_overlays(self) -> None:
         """What stands over the picture; where some of it goes away, another frame follows."""
-        sight, before = self._sight(), self.work
+        pointer, before = self._pointer(), self.work
         pressed = [press.chord for press in self._keys.pressed]
-        self.work = interface.asked(self.work, sight, self.recent, pressed)
+        self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
         original = inputs.holds_original(self._keys)
         said = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
-        self.work = interface.over_picture(self.work, sight, self._hand, said, figures, original)
+        self.work = interface.over_picture(self.work, pointer, self._tool, said, figures, original)
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()
@@ -267,19 +266,19 @@ class Stage:
     def figures(self) -> list[tuple[str, str]]:
         """What the overlay shows of the picture on screen."""
         pixels, count, by = self.canvas.pixels, self.facts.count, self.engine.draws_with
-        drawn = drawn_size(self._sight().size, pixels)
+        drawn = drawn_size(self._pointer().size, pixels)
         edits = self.engine.edits()
         return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels, edits)
 
     @property
-    def drawn(self) -> int:
+    def pictures_drawn(self) -> int:
         """How many frames had a new picture of the splats."""
-        return self.canvas.drawn
+        return self.canvas.pictures_drawn
 
     @property
     def picture_size(self) -> tuple[int, int]:
         """Width and height in pixels of the picture on screen."""
-        return self._sight().size
+        return self._pointer().size
 
     @property
     def timings(self) -> FrameTimings:
@@ -302,24 +301,24 @@ class Stage:
         return requests
 
     def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
-        """Serve the requests for files that the stage can make by itself."""
+        """Serve the requests for files that the main view can make by itself."""
         served = [request for request in self.work.requests if request in saved_files.REQUESTS]
         left = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=left)
         for request in served:
             try:
-                self.tell(self._saved(request, screen, size))
+                self.show_message(self._save(request, screen, size))
             except ProgdfError as error:
-                self.tell(str(error), error=True)
+                self.show_message(str(error), error=True)
 
-    def _saved(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
-        title, view = self.facts.title, self._shown()
+    def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
+        title, view = self.facts.title, self._shown_view()
         if request == "timeline_file":
             return saved_files.timeline(self.pictures, title, view)
         if request == "window_picture":
             return saved_files.picture(self.pictures, title, read_rgb(screen, size))
-        image = self.canvas.image(view, self._sight().size)
-        pixels = labelled(image, view.compare, self.canvas.comparer.labels(view))
+        image = self.canvas.image(view, self._pointer().size)
+        pixels = draw_labels(image, view.compare, self.canvas.comparer.labels(view))
         return saved_files.picture(self.pictures, title, pixels)
 
 

@@ -26,7 +26,7 @@ CLICK_PX = 3.0  # a press that moves no further, at 1×, is a click
 
 
 @dataclass(frozen=True)
-class Hand:
+class MouseTool:
     """What the mouse holds.
 
     Args:
@@ -41,7 +41,7 @@ class Hand:
 
 
 @dataclass(frozen=True)
-class Sight:
+class PointerContext:
     """What lies under the hand in one frame.
 
     Args:
@@ -50,7 +50,7 @@ class Sight:
         shown: what the picture shows: the state, or the original while its key is held
         area: the part of the window that shows it
         ui: fonts and scale
-        now: seconds on the stage's clock
+        now: seconds on the main view's clock
     """
 
     engine: Engine
@@ -77,104 +77,106 @@ class Sight:
         return to_camera(camera, *self.size)
 
 
-def moved(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace]:
+def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """What the mouse did in this frame, as imgui's io has it."""
     io = imgui.get_io()
-    hand, work = _dragged(hand, work, sight)
-    if imgui.is_mouse_released(0) and hand.drag in ("orbit", "look") and not _travelled(sight.ui):
-        work = _focus_picked(work, sight)
+    tool, work = _drag(tool, work, pointer)
+    if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_travelled(pointer.ui):
+        work = _focus_picked_layer(work, pointer)
     if not inputs.any_button_down():
-        hand = replace(hand, drag=None)
+        tool = replace(tool, drag=None)
     if io.want_capture_mouse:
-        return hand, work
-    if grips_divider(hand, work.view, sight):
+        return tool, work
+    if grips_divider(tool, work.view, pointer):
         compare_overlay.show_grip()
         if imgui.is_mouse_clicked(0):
-            return Hand(compare_overlay.DIVIDER, divider=work.view.compare.divider), work
+            return MouseTool(compare_overlay.DIVIDER, divider=work.view.compare.divider), work
     if work.view.brush.active and imgui.is_mouse_clicked(0):
-        return _stroke_begun(hand, work, sight)
+        return _begin_stroke(tool, work, pointer)
     camera = work.view.camera
     if imgui.is_mouse_double_clicked(0):
-        return hand, workspace.with_camera(work, _pivot_picked(camera, sight))
-    hand = replace(hand, drag=inputs.drag_begun(camera.mode) or hand.drag)
+        return tool, workspace.with_camera(work, _pick_pivot(camera, pointer))
+    tool = replace(tool, drag=inputs.started_drag(camera.mode) or tool.drag)
     if io.mouse_wheel:
-        work = workspace.with_camera(work, controls.zoom(camera, io.mouse_wheel, sight.facts.bounds.radius))
-    return hand, work
+        work = workspace.with_camera(work, controls.zoom(camera, io.mouse_wheel, pointer.facts.bounds.radius))
+    return tool, work
 
 
-def called_off(hand: Hand, work: Workspace) -> Workspace:
+def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
     """What is dragged goes back to where it was; undo knows where, but for the divider, which is no edit."""
-    work = workspace.called_off(work)
-    if hand.drag != compare_overlay.DIVIDER:
+    work = workspace.cancel_drag(work)
+    if tool.drag != compare_overlay.DIVIDER:
         return work
-    return replace(work, view=compare_overlay.placed(work.view, hand.divider))
+    return replace(work, view=compare_overlay.place_divider(work.view, tool.divider))
 
 
-def grips_divider(hand: Hand, view: ViewState, sight: Sight) -> bool:
-    """Whether the divider of a split is in the hand, or under it."""
-    if hand.drag is not None:
-        return hand.drag == compare_overlay.DIVIDER
+def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> bool:
+    """Whether the divider of a split is in the tool, or under it."""
+    if tool.drag is not None:
+        return tool.drag == compare_overlay.DIVIDER
     over = imgui.get_io().want_capture_mouse
-    return not over and compare_overlay.near(view, sight.area, sight.ui)
+    return not over and compare_overlay.near(view, pointer.area, pointer.ui)
 
 
-def _dragged(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace]:
+def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """What is held follows the mouse."""
-    io, scale = imgui.get_io(), sight.ui.scale
+    io, scale = imgui.get_io(), pointer.ui.scale
     dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
-    if hand.drag == compare_overlay.DIVIDER:
-        return hand, replace(work, view=compare_overlay.moved(work.view, sight.area))
-    if hand.drag == brush.DRAG:
-        return _painted(hand, work, sight)
-    if hand.drag and (dx or dy):
+    if tool.drag == compare_overlay.DIVIDER:
+        return tool, replace(work, view=compare_overlay.move_divider(work.view, pointer.area))
+    if tool.drag == brush.DRAG:
+        return _paint(tool, work, pointer)
+    if tool.drag and (dx or dy):
         # also where the button went up within this frame: a slow frame must not lose the end of a drag
-        height, radius = sight.area.height / scale, sight.facts.bounds.radius
-        camera = controls.drag(work.view.camera, hand.drag, dx, dy, height, radius)
-        return hand, workspace.with_camera(work, camera)
-    return hand, work
+        height, radius = pointer.area.height / scale, pointer.facts.bounds.radius
+        camera = controls.drag(work.view.camera, tool.drag, dx, dy, height, radius)
+        return tool, workspace.with_camera(work, camera)
+    return tool, work
 
 
-def _stroke_begun(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace]:
+def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """The brush comes down on the focused layer, or says why it cannot."""
     reason = brush.obstacle(work.view, work.focus)
     if reason or work.focus is None:
-        return hand, workspace.told(work, f"Cannot paint: {reason}", sight.now, error=True)
-    layer, camera = work.view.layers[work.focus], sight.camera(work.view.camera)
-    scene, held = sight.engine.gaussians(work.view), work.view.brush
+        return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
+    layer, camera = work.view.layers[work.focus], pointer.camera(work.view.camera)
+    scene, held = pointer.engine.gaussians(work.view), work.view.brush
     mode = paint.mode_while(held.mode, inputs.modifier())
-    stroke = paint.begun(layer.paint, sight.engine.gdfs[layer.gdf], scene, camera, held.through, mode)
-    return _painted(Hand(brush.DRAG, stroke), work, sight)
+    stroke = paint.begin_stroke(
+        layer.paint, pointer.engine.gdfs[layer.gdf], scene, camera, held.through, mode
+    )
+    return _paint(MouseTool(brush.DRAG, stroke), work, pointer)
 
 
-def _painted(hand: Hand, work: Workspace, sight: Sight) -> tuple[Hand, Workspace]:
+def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """The brush moves to the cursor; what it has painted so far is shown at once."""
     view, focus = work.view, work.focus
-    if hand.stroke is None or focus is None:
-        return hand, work
-    density = imgui.get_io().display_framebuffer_scale.x * sight.ui.scale
-    stroke = paint.drawn_to(hand.stroke, *sight.cursor, view.brush, density)
-    painted = stack.with_paint(view, focus, paint.painted(stroke, view.brush, density))
-    return replace(hand, stroke=stroke), replace(work, view=painted)
+    if tool.stroke is None or focus is None:
+        return tool, work
+    density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
+    stroke = paint.extend_stroke(tool.stroke, *pointer.cursor, view.brush, density)
+    painted = stack.with_paint(view, focus, paint.apply_stroke(stroke, view.brush, density))
+    return replace(tool, stroke=stroke), replace(work, view=painted)
 
 
-def _travelled(ui: UiContext) -> bool:
+def _has_travelled(ui: UiContext) -> bool:
     """Whether the left button moved between its press and its release, by more than a hand trembles."""
     way = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
     return bool(way.x or way.y)
 
 
-def _focus_picked(work: Workspace, sight: Sight) -> Workspace:
+def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
     """A click on the picture: the layer there, if there is one, is focused."""
-    engine, view = sight.engine, sight.shown
-    camera = sight.camera(work.view.camera)
-    seen = seen_at(engine.gaussians(view), camera, *sight.cursor, engine.near)
+    engine, view = pointer.engine, pointer.shown
+    camera = pointer.camera(work.view.camera)
+    seen = seen_at(engine.gaussians(view), camera, *pointer.cursor, engine.near)
     layer = None if seen is None else layer_at(view, engine.gdfs, seen)
-    return work if layer is None else workspace.focused(work, layer)
+    return work if layer is None else workspace.focus_layer(work, layer)
 
 
-def _pivot_picked(camera: ViewCamera, sight: Sight) -> ViewCamera:
+def _pick_pivot(camera: ViewCamera, pointer: PointerContext) -> ViewCamera:
     """A double click: what lies under the cursor becomes the pivot."""
-    engine = sight.engine
-    scene = engine.gaussians(sight.shown)
-    point = surface_point(scene, sight.camera(camera), *sight.cursor, engine.near)
-    return camera if point is None else controls.pivot_on(camera, point, sight.facts.bounds.radius)
+    engine = pointer.engine
+    scene = engine.gaussians(pointer.shown)
+    point = surface_point(scene, pointer.camera(camera), *pointer.cursor, engine.near)
+    return camera if point is None else controls.pivot_on(camera, point, pointer.facts.bounds.radius)

@@ -51,7 +51,7 @@ class Browser:
         """Whether a dialog is shown, and worth another look after `POLL_S`."""
         return self._shown is not None
 
-    def begun(self, dialog: Dialog, near: Path) -> Dialog:
+    def open(self, dialog: Dialog, near: Path) -> Dialog:
         """The question while the desktop's dialog is shown, or with the reason why there is none.
 
         Args:
@@ -71,7 +71,7 @@ class Browser:
             dialog, choosing=True, notice="Choose a file in the system dialog, or type a path here"
         )
 
-    def looked(self, dialog: Dialog | None) -> Dialog | None:
+    def poll(self, dialog: Dialog | None) -> Dialog | None:
         """The question after a look at the dialog: with the file, if one was chosen. Does not wait."""
         if self._shown is None or dialog is None or not dialog.choosing:
             self.close()  # the question was answered without it

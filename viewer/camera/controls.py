@@ -22,15 +22,15 @@ CLOSEST, WIDEST = 1e-4, 1e4  # of the scene's radius: how near to and far from t
 def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
     """Turn around the pivot so that the scene follows the hand; stops at the poles."""
     elevation = max(-90.0, min(90.0, camera.elevation + DEGREES_PER_PIXEL * dy))
-    azimuth = _wrapped(camera.azimuth - DEGREES_PER_PIXEL * dx)
-    return _checked(replace(camera, azimuth=azimuth, elevation=elevation), camera)
+    azimuth = _wrap_degrees(camera.azimuth - DEGREES_PER_PIXEL * dx)
+    return _keep_finite(replace(camera, azimuth=azimuth, elevation=elevation), camera)
 
 
 def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
     """Turn the head where the eye stands (fly mode): right looks right, down looks down."""
     turned = orbit(camera, dx, dy)
     position = eye(camera)
-    return _checked(replace(turned, pivot=along(position, (-camera.distance, axes(turned).back))), camera)
+    return _keep_finite(replace(turned, pivot=along(position, (-camera.distance, axes(turned).back))), camera)
 
 
 def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
@@ -42,7 +42,7 @@ def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
     per_pixel = 2.0 * camera.distance * math.tan(math.radians(camera.fov_y) / 2) / max(height, 1.0)
     picture = axes(camera)
     pivot = along(camera.pivot, (-dx * per_pixel, picture.right), (dy * per_pixel, picture.up))
-    return _checked(replace(camera, pivot=pivot), camera)
+    return _keep_finite(replace(camera, pivot=pivot), camera)
 
 
 def zoom(camera: ViewCamera, steps: float, radius: float) -> ViewCamera:
@@ -52,7 +52,7 @@ def zoom(camera: ViewCamera, steps: float, radius: float) -> ViewCamera:
         radius: of the scene, world units; bounds the distance
     """
     factor = math.exp(max(-50.0, min(50.0, -ZOOM_PER_STEP * steps))) if math.isfinite(steps) else 1.0
-    return _checked(replace(camera, distance=_within(camera.distance * factor, radius)), camera)
+    return _keep_finite(replace(camera, distance=_within(camera.distance * factor, radius)), camera)
 
 
 def dolly(camera: ViewCamera, dy: float, radius: float) -> ViewCamera:
@@ -99,13 +99,13 @@ def fly(
         (length * wish[1], unit(camera.up, (0.0, 1.0, 0.0))),
         (-length * wish[2], picture.back),
     )
-    return _checked(replace(camera, pivot=along(camera.pivot, *steps)), camera)
+    return _keep_finite(replace(camera, pivot=along(camera.pivot, *steps)), camera)
 
 
 def pivot_on(camera: ViewCamera, point: Vec3, radius: float) -> ViewCamera:
     """Double click: the eye stays, the view turns to `point`, which becomes the pivot."""
     turned = look_from(camera, eye(camera), point)
-    return _checked(replace(turned, distance=_within(turned.distance, radius)), camera)
+    return _keep_finite(replace(turned, distance=_within(turned.distance, radius)), camera)
 
 
 def toggle_fly(camera: ViewCamera) -> ViewCamera:
@@ -117,18 +117,18 @@ def _within(distance: float, radius: float) -> float:
     return max(CLOSEST * radius, min(WIDEST * radius, distance))
 
 
-def _wrapped(degrees: float) -> float:
+def _wrap_degrees(degrees: float) -> float:
     return (degrees + 180.0) % 360.0 - 180.0 if math.isfinite(degrees) else degrees
 
 
-def _checked(new: ViewCamera, old: ViewCamera) -> ViewCamera:
+def _keep_finite(new: ViewCamera, old: ViewCamera) -> ViewCamera:
     numbers = (*new.pivot, new.distance, new.azimuth, new.elevation)
     fits = all(math.isfinite(v) and abs(v) <= FARTHEST for v in numbers) and new.distance > 0.0
     return new if fits else old
 
 
 @dataclass(frozen=True)
-class Drag:
+class DragBinding:
     """A mouse drag on the picture. `mode`: only in this camera mode; empty is both."""
 
     button: str
@@ -138,7 +138,7 @@ class Drag:
 
 
 @dataclass(frozen=True)
-class Key:
+class KeyBinding:
     """A key: modifiers in the order Ctrl, Shift, Alt, then the key's name. `repeats` while held."""
 
     chord: str
@@ -148,12 +148,12 @@ class Key:
 
 
 DRAGS = (
-    Drag("left", "", "orbit"),
-    Drag("middle", "", "orbit"),
-    Drag("middle", "Shift", "pan"),
-    Drag("middle", "Ctrl", "dolly"),
-    Drag("right", "", "look", mode="fly"),
-    Drag("right", "", "pan"),
+    DragBinding("left", "", "orbit"),
+    DragBinding("middle", "", "orbit"),
+    DragBinding("middle", "Shift", "pan"),
+    DragBinding("middle", "Ctrl", "dolly"),
+    DragBinding("right", "", "look", mode="fly"),
+    DragBinding("right", "", "pan"),
 )
 
 FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
@@ -163,10 +163,13 @@ HELD_ORIGINAL = "\\"
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
 KEYS = (
-    *(Key(str(i), f"focus:{i}", "select layer 1–9" if i == 1 else "") for i in range(1, 10)),
-    *(Key(f"Shift+{i}", f"toggle:{i}", "show or hide layer 1–9" if i == 1 else "") for i in range(1, 10)),
+    *(KeyBinding(str(i), f"focus:{i}", "select layer 1–9" if i == 1 else "") for i in range(1, 10)),
     *(
-        Key(f"{held}{arrow}", f"nudge:{sign * step:g}", help_, repeats=True)
+        KeyBinding(f"Shift+{i}", f"toggle:{i}", "show or hide layer 1–9" if i == 1 else "")
+        for i in range(1, 10)
+    ),
+    *(
+        KeyBinding(f"{held}{arrow}", f"nudge:{sign * step:g}", help_, repeats=True)
         for held, step in NUDGES
         for arrow, sign, help_ in (
             ("Left", -1, ""),
@@ -175,65 +178,65 @@ KEYS = (
             ("Up", 1, ""),
         )
     ),
-    Key("Tab", "dial:1", "next slider for the arrow keys"),
-    Key("Shift+Tab", "dial:-1", ""),
-    Key("H", "hide", "show or hide the selected layer"),
-    Key("Shift+H", "solo", "solo (Alt+click the eye)"),
-    Key("Alt+H", "show_all", "show all layers"),
-    Key("L", "lock", "lock"),
-    Key("G", "fold", "show gains and curve"),
-    Key("Enter", "rename", "rename (double-click the name)"),
-    Key("Ctrl+D", "duplicate", "duplicate"),
-    Key("Ctrl+Delete", "remove", "delete"),
-    Key("Alt+Up", "move:-1", ""),
-    Key("Alt+Down", "move:1", "move up or down (drag the name)"),
-    Key("B", "brush", "paint strength (left drag)"),
-    Key("X", "brush_mode", "brush: erase, smooth, add"),
-    Key("Shift+B", "brush_through", "brush: front surface or all depths"),
-    Key("C", "brush_weights", "brush: show weights"),
-    Key("[", f"brush_radius:{1 / 1.25:g}", "", repeats=True),
-    Key("]", "brush_radius:1.25", "brush radius; with Shift softness", repeats=True),
-    Key("Shift+[", "brush_softness:-0.1", "", repeats=True),
-    Key("Shift+]", "brush_softness:0.1", "", repeats=True),
-    Key("Backspace", "paint_clear", "clear the paint; with Shift fill it"),
-    Key("Shift+Backspace", "paint_fill", ""),
-    Key("Shift+X", "paint_feather", "feather the paint"),
-    Key("M", "blend", "next blend rule"),
-    Key("O", "overshoot", "overshoot to 1.2"),
-    Key("Escape", "unfocus", "close this list; deselect"),
-    Key("Ctrl+Z", "undo", "undo", repeats=True),
-    Key("Ctrl+Shift+Z", "redo", "redo", repeats=True),
-    Key("Ctrl+Y", "redo", "", repeats=True),
-    Key("V", "fly", "orbit or fly mode"),
-    Key("F", "frame", "frame the selected layer, or the scene"),
-    Key("Shift+F", "home", "reset the view"),
-    Key("Y", "split", "split view with the original"),
-    Key("Shift+Y", "difference", "difference from the original"),
-    Key("Alt+Y", "against", "compare with the recording"),
-    Key("Space", "play", "play or pause"),
-    Key("K", "key", "insert a keyframe"),
-    Key("Delete", "drop_key", "delete the keyframe"),
-    Key(",", "step:-1", "", repeats=True),
-    Key(".", "step:1", "previous or next frame", repeats=True),
-    Key("Shift+,", "jump:-1", ""),
-    Key("Shift+.", "jump:1", "previous or next keyframe"),
-    Key("Shift+K", "easing", "interpolation: smooth, linear, hold"),
-    Key("Alt+K", "ping_pong", "ping-pong"),
-    Key("Ctrl+K", "timeline_file", "save the timeline as a file"),
-    Key("T", "timeline", "show or hide the timeline"),
-    Key("F1", "help", "this list"),
-    Key("F2", "picture", "save the image as PNG"),
-    Key("Shift+F2", "window_picture", "save the whole window as PNG"),
-    Key("F3", "snapshot", "add a snapshot of the sliders"),
-    Key("F4", "camera", "save this view as a camera"),
-    Key("Ctrl+S", "save", "save the session"),
-    Key("Ctrl+Shift+S", "save_as", "save the session as"),
-    Key("Ctrl+O", "open", "open a session, scene or edit"),
-    Key("F10", "overlay", "show timings"),
-    Key("Shift+F10", "draft", "dynamic resolution: auto, on, off"),
-    Key("F11", "full_screen", "full screen"),
-    Key("F12", "panel", "show or hide the panel"),
-    Key("Ctrl+Q", "quit", "quit"),
+    KeyBinding("Tab", "next_slider:1", "next slider for the arrow keys"),
+    KeyBinding("Shift+Tab", "next_slider:-1", ""),
+    KeyBinding("H", "hide", "show or hide the selected layer"),
+    KeyBinding("Shift+H", "solo", "solo (Alt+click the eye)"),
+    KeyBinding("Alt+H", "show_all", "show all layers"),
+    KeyBinding("L", "lock", "lock"),
+    KeyBinding("G", "fold", "show gains and curve"),
+    KeyBinding("Enter", "rename", "rename (double-click the name)"),
+    KeyBinding("Ctrl+D", "duplicate", "duplicate"),
+    KeyBinding("Ctrl+Delete", "remove", "delete"),
+    KeyBinding("Alt+Up", "move:-1", ""),
+    KeyBinding("Alt+Down", "move:1", "move up or down (drag the name)"),
+    KeyBinding("B", "brush", "paint strength (left drag)"),
+    KeyBinding("X", "brush_mode", "brush: erase, smooth, add"),
+    KeyBinding("Shift+B", "brush_through", "brush: front surface or all depths"),
+    KeyBinding("C", "brush_weights", "brush: show weights"),
+    KeyBinding("[", f"brush_radius:{1 / 1.25:g}", "", repeats=True),
+    KeyBinding("]", "brush_radius:1.25", "brush radius; with Shift softness", repeats=True),
+    KeyBinding("Shift+[", "brush_softness:-0.1", "", repeats=True),
+    KeyBinding("Shift+]", "brush_softness:0.1", "", repeats=True),
+    KeyBinding("Backspace", "paint_clear", "clear the paint; with Shift fill it"),
+    KeyBinding("Shift+Backspace", "paint_fill", ""),
+    KeyBinding("Shift+X", "paint_feather", "feather the paint"),
+    KeyBinding("M", "blend", "next blend rule"),
+    KeyBinding("O", "overshoot", "overshoot to 1.2"),
+    KeyBinding("Escape", "unfocus", "close this list; deselect"),
+    KeyBinding("Ctrl+Z", "undo", "undo", repeats=True),
+    KeyBinding("Ctrl+Shift+Z", "redo", "redo", repeats=True),
+    KeyBinding("Ctrl+Y", "redo", "", repeats=True),
+    KeyBinding("V", "fly", "orbit or fly mode"),
+    KeyBinding("F", "frame", "frame the selected layer, or the scene"),
+    KeyBinding("Shift+F", "home", "reset the view"),
+    KeyBinding("Y", "split", "split view with the original"),
+    KeyBinding("Shift+Y", "difference", "difference from the original"),
+    KeyBinding("Alt+Y", "against", "compare with the recording"),
+    KeyBinding("Space", "play", "play or pause"),
+    KeyBinding("K", "key", "insert a keyframe"),
+    KeyBinding("Delete", "drop_key", "delete the keyframe"),
+    KeyBinding(",", "step:-1", "", repeats=True),
+    KeyBinding(".", "step:1", "previous or next frame", repeats=True),
+    KeyBinding("Shift+,", "jump:-1", ""),
+    KeyBinding("Shift+.", "jump:1", "previous or next keyframe"),
+    KeyBinding("Shift+K", "easing", "interpolation: smooth, linear, hold"),
+    KeyBinding("Alt+K", "ping_pong", "ping-pong"),
+    KeyBinding("Ctrl+K", "timeline_file", "save the timeline as a file"),
+    KeyBinding("T", "timeline", "show or hide the timeline"),
+    KeyBinding("F1", "help", "this list"),
+    KeyBinding("F2", "picture", "save the image as PNG"),
+    KeyBinding("Shift+F2", "window_picture", "save the whole window as PNG"),
+    KeyBinding("F3", "snapshot", "add a snapshot of the sliders"),
+    KeyBinding("F4", "camera", "save this view as a camera"),
+    KeyBinding("Ctrl+S", "save", "save the session"),
+    KeyBinding("Ctrl+Shift+S", "save_as", "save the session as"),
+    KeyBinding("Ctrl+O", "open", "open a session, scene or edit"),
+    KeyBinding("F10", "overlay", "show timings"),
+    KeyBinding("Shift+F10", "draft", "dynamic resolution: auto, on, off"),
+    KeyBinding("F11", "full_screen", "full screen"),
+    KeyBinding("F12", "panel", "show or hide the panel"),
+    KeyBinding("Ctrl+Q", "quit", "quit"),
 )
 
 

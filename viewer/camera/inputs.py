@@ -47,7 +47,7 @@ class Keys:
 NO_KEYS = Keys()
 
 
-def heard(press: Press) -> bool:
+def has_reached_imgui(press: Press) -> bool:
     """Whether imgui, which takes text and keys in over several frames, has come to this key.
 
     A key that comes before its time would overtake what was typed before it.
@@ -62,7 +62,7 @@ def opens_text(press: Press) -> bool:
     return opens and not imgui.get_io().want_text_input
 
 
-def waiting() -> bool:
+def has_pending_input() -> bool:
     """Whether imgui still holds input that its next frames take in."""
     return not imgui.get_current_context().input_events_queue.empty()
 
@@ -72,7 +72,7 @@ def next_event_id() -> int:
     return int(imgui.get_current_context().input_events_next_event_id)
 
 
-def actions_pressed(keys: Keys) -> list[str]:
+def requested_actions(keys: Keys) -> list[str]:
     """Actions of `controls.KEYS` that were asked for; none while a text field is open."""
     if imgui.get_io().want_text_input:
         return []
@@ -100,7 +100,7 @@ def modifier() -> str:
     return "Shift" if io.key_shift else "Ctrl" if io.key_ctrl else "Alt" if io.key_alt else ""
 
 
-def drag_begun(mode: str) -> str | None:
+def started_drag(mode: str) -> str | None:
     """What the button that went down over the picture in this frame does, or None."""
     for name, button in _BUTTONS:
         if imgui.is_mouse_clicked(button):
@@ -112,7 +112,7 @@ def any_button_down() -> bool:
     return any(imgui.is_mouse_down(button) for _, button in _BUTTONS)
 
 
-def calls_off(keys: Keys, drag: str | None) -> bool:
+def cancels_drag(keys: Keys, drag: str | None) -> bool:
     """Whether Escape or the right button takes back what the left button is dragging.
 
     Args:

@@ -78,7 +78,7 @@ class Fit(Protocol):
         """`aspect`: width / height of the picture"""
 
 
-def unmoved(camera: ViewCamera, aspect: float) -> ViewCamera:
+def keep_camera(camera: ViewCamera, aspect: float) -> ViewCamera:
     """The fit of something of which nothing is known."""
     return camera
 

@@ -120,7 +120,7 @@ def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
     return replace(framed, azimuth=numbers[0], elevation=numbers[1], distance=distance)
 
 
-def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
+def fit_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     """The same view in another size, undistorted: the same height of the scene, the sides cut or widened."""
     width, height = size
     scale = height / camera.height
@@ -156,7 +156,7 @@ def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
             raise ProgdfError(f"{out} is one of the files to read; choose another name for the result")
 
 
-def joined(argv: Sequence[str]) -> list[str]:
+def join_arguments(argv: Sequence[str]) -> list[str]:
     """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option.
 
     `--split` and `--difference` without a number get theirs.

@@ -45,20 +45,20 @@ def asked_camera(
         if options.frame is not None:
             raise ProgdfError("--camera and --frame were both given; give one of them")
         camera = read_camera(options.camera)
-        return camera if size is None else arguments.fitted(camera, size)
+        return camera if size is None else arguments.fit_camera(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height
     view = saved or first_camera(scene, aspect=aspect, up=up)
     if options.orbit is not None:
         view = arguments.parse_orbit(options.orbit, view)
     if options.frame is not None or (options.orbit is not None and saved is None):
-        view = _filled(view, options.frame, scene, gdfs, aspect)
+        view = _frame_on(view, options.frame, scene, gdfs, aspect)
         if options.orbit is not None:  # a distance that was said holds
             view = arguments.parse_orbit(options.orbit, view)
     return to_camera(view, width, height)
 
 
-def _filled(
+def _frame_on(
     view: ViewCamera, name: str | None, scene: Gaussians, gdfs: Sequence[Gdf], aspect: float
 ) -> ViewCamera:
     """The same direction, filled by what --frame names."""

@@ -21,7 +21,7 @@ from progdf.io.atomic import atomic_write
 from progdf.terminal import say
 from viewer.camera.view_camera import first_camera
 from viewer.render.threads import one_thread
-from viewer.state.layers import shown
+from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
 
 from . import arguments, opening
@@ -31,8 +31,8 @@ from .options import ExportOptions, ViewOptions
 @one_thread()
 def view(argv: Sequence[str]) -> int:
     """`progdf view`: open the window and stay until it is closed."""
-    options = parsed(ViewOptions, arguments.joined(opening.without_name(argv)), "progdf view")
-    found = opening.opened(options)
+    options = parsed(ViewOptions, arguments.join_arguments(opening.without_name(argv)), "progdf view")
+    found = opening.open_stack(options)
     from viewer.app.app import run  # imgui and glfw, which render and export do without
 
     state = found.view
@@ -50,12 +50,12 @@ def view(argv: Sequence[str]) -> int:
 
 def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
-    options = parsed(ExportOptions, arguments.joined(opening.without_name(argv)), "progdf export")
+    options = parsed(ExportOptions, arguments.join_arguments(opening.without_name(argv)), "progdf export")
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
-    found = opening.opened(options, unset=1.0)
+    found = opening.open_stack(options, unset=1.0)
     arguments.check_not_an_input(options.out, found.files)
-    gdfs, states = found.document.gdfs, shown(found.view)
+    gdfs, states = found.document.gdfs, visible_layers(found.view)
     layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
     edited = compose_layers(found.document.scene, layers, found.view.blend)
     with atomic_write(options.out) as temporary_file:

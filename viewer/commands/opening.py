@@ -14,7 +14,7 @@ from viewer.camera.view_camera import with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.state import layers as stack
-from viewer.state.snapshots import Snapshot
+from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 
 from . import arguments
@@ -26,7 +26,7 @@ _SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "background")
 
 
 @dataclass(frozen=True)
-class Opened:
+class OpenStack:
     """What was opened, and how it shall look.
 
     Args:
@@ -40,7 +40,7 @@ class Opened:
     document: Document
     view: ViewState
     session: Path | None = None
-    snapshots: tuple[Snapshot, ...] = ()
+    snapshots: tuple[SliderSnapshot, ...] = ()
     asked_up: str = "auto"
 
     @property
@@ -61,7 +61,7 @@ class Opened:
         return name if name in named.values() else named.get(name, name)
 
 
-def opened(options: StackOptions, unset: float = 0.0) -> Opened:
+def open_stack(options: StackOptions, unset: float = 0.0) -> OpenStack:
     """Open what the options name.
 
     Args:
@@ -82,7 +82,7 @@ def opened(options: StackOptions, unset: float = 0.0) -> Opened:
     layers = stack_of(
         found.gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint, unset
     )
-    return Opened(found, replace(view, layers=layers), asked_up=_asked_up(options))
+    return OpenStack(found, replace(view, layers=layers), asked_up=_asked_up(options))
 
 
 def is_session(path: Path) -> bool:
@@ -118,7 +118,7 @@ def _check_each_once(gdfs: Sequence[Path]) -> None:
             raise ProgdfError(f"{path} was given twice{again}; give each edit once")
 
 
-def _session(options: StackOptions) -> Opened:
+def _session(options: StackOptions) -> OpenStack:
     """The session with the strengths and the blend rule that were given beside it."""
     defaults = {f.name: f.default for f in fields(options)}
     for name in _SAID_BY_SESSION:
@@ -128,11 +128,11 @@ def _session(options: StackOptions) -> Opened:
                 f"{what} with the session {options.scene.name}, which says it too; leave it out"
             )
     kept = session.open_session(options.scene)
-    found = Opened(kept.document, kept.view, options.scene, kept.snapshots, _asked_up(options))
+    found = OpenStack(kept.document, kept.view, options.scene, kept.snapshots, _asked_up(options))
     settings = [
         f"{found.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in options.set)
     ]
-    strengths = arguments.strengths_of(kept.view.layers, settings, stack.most(kept.view))
+    strengths = arguments.strengths_of(kept.view.layers, settings, stack.largest_strength(kept.view))
     layers = (replace(l, strength=strengths.get(l.name, l.strength)) for l in kept.view.layers)
     view = replace(kept.view, layers=tuple(layers), blend=options.blend or kept.view.blend)
     if _asked_up(options) != "auto":  # else the session's own

@@ -17,7 +17,7 @@ from progdf.io.atomic import atomic_write
 from progdf.terminal import say
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
-from viewer.pictures.compare_labels import labelled
+from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
 from viewer.render.engine import Engine
 from viewer.render.headless import headless_context
@@ -27,7 +27,7 @@ from viewer.state.view_state import Comparison, Timeline, ViewState
 
 from . import arguments, opening
 from .camera_arguments import asked_camera
-from .opening import Opened
+from .opening import OpenStack
 from .options import RenderOptions
 
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
@@ -37,11 +37,11 @@ ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 @one_thread()
 def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
-    options = parsed(RenderOptions, arguments.joined(opening.without_name(argv)), "progdf render")
+    options = parsed(RenderOptions, arguments.join_arguments(opening.without_name(argv)), "progdf render")
     _check_output(options)
     size = None if options.size is None else arguments.parse_size(options.size)
     one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
-    found = opening.opened(options, unset=0.0 if one_moves else 1.0)
+    found = opening.open_stack(options, unset=0.0 if one_moves else 1.0)
     arguments.check_not_an_input(options.out, found.files)
     scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
     view = replace(view, compare=_comparison(options, view.compare))
@@ -88,7 +88,7 @@ def _moving(
             Image.fromarray(film.contact_sheet(swept[0], picture, view)).save(temporary_file)
 
 
-def _still(options: RenderOptions, found: Opened, view: ViewState, camera: Camera, engine: Engine) -> str:
+def _still(options: RenderOptions, found: OpenStack, view: ViewState, camera: Camera, engine: Engine) -> str:
     """One picture, compared as `view` asks; gives what to say about the comparison."""
     where = found.document.recordings()
     missing = recordings.obstacle(where)
@@ -98,12 +98,12 @@ def _still(options: RenderOptions, found: Opened, view: ViewState, camera: Camer
     try:
         image = comparer.image(view, camera=camera)
         with atomic_write(options.out) as temporary_file:
-            Image.fromarray(labelled(image, view.compare, comparer.labels(view))).save(temporary_file)
+            Image.fromarray(draw_labels(image, view.compare, comparer.labels(view))).save(temporary_file)
         if view.compare.mode == "off":
             return ""
         if comparer.against(view) == "original":
             return f"PSNR of edited against original {comparer.psnr:.2f} dB"
-        recorded = recordings.told(view, engine.gdfs, comparer.recordings)
+        recorded = recordings.describe(view, engine.gdfs, comparer.recordings)
         return f"PSNR of the field against what was recorded {comparer.psnr:.2f} dB ({recorded})"
     finally:
         comparer.release()
@@ -120,7 +120,7 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
     return replace(asked, against=options.against)
 
 
-def _keys(options: RenderOptions, found: Opened) -> Timeline:
+def _keys(options: RenderOptions, found: OpenStack) -> Timeline:
     """The timeline that was asked for: of a file of its own, or of the session."""
     assert options.timeline is not None
     own = found.session is not None and options.timeline.exists() and options.timeline.samefile(found.session)
@@ -142,7 +142,7 @@ def _count(sheet: str | None) -> int:
     return int(sheet)
 
 
-def _swept(options: RenderOptions, found: Opened) -> list[str]:
+def _swept(options: RenderOptions, found: OpenStack) -> list[str]:
     """Names of the layers whose sliders move in the picture: none, one or two."""
     if options.sweep is not None:
         return [_showing(found.layer(options.sweep), found.view, "--sweep")]
@@ -185,7 +185,7 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> It
 def _drawn_by(engine: Engine) -> str:
     """The engine in words, with its edit pass if that had a part in the picture, or why it had none."""
     edits = engine.edits()
-    return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.told}"
+    return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.description}"
 
 
 def _check_output(options: RenderOptions) -> None:

@@ -21,7 +21,7 @@ MOST_DISCARDED = 3
 _KINDS = "autosave", "discarded"
 
 
-class Autosave:
+class SessionAutosave:
     """The autosave of one window, which never writes over another's."""
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class Autosave:
             return self._due - now
         self._due, self._kept = None, kept
         if self.path is None:
-            self.path = next(path for path in _numbered(beside(), "autosave") if not path.exists())
+            self.path = next(path for path in _numbered_paths(beside(), "autosave") if not path.exists())
         save(self.path)
         return 0.0
 
@@ -88,7 +88,7 @@ def is_discarded(path: Path) -> bool:
     return ".discarded" in path.name and session_of(path) is not None
 
 
-def left(session: Path, numbered: bool = False) -> tuple[Path, ...]:
+def find_autosaves(session: Path, numbered: bool = False) -> tuple[Path, ...]:
     """Autosaves that lie beside a session, the latest first.
 
     Args:
@@ -111,7 +111,9 @@ def put_aside(path: Path) -> Path:
         OSError: it cannot be moved.
     """
     session = session_of(path) or path
-    names = [name for name, _ in zip(_numbered(session, "discarded"), range(MOST_DISCARDED), strict=False)]
+    names = [
+        name for name, _ in zip(_numbered_paths(session, "discarded"), range(MOST_DISCARDED), strict=False)
+    ]
     free = [name for name in names if not name.exists()]
     to = free[0] if free else min(names, key=lambda name: name.stat().st_mtime)
     os.replace(path, to)
@@ -123,9 +125,9 @@ def free_session(path: Path, own: Path | None) -> Path:
     """`path`, with a number where a session of that name exists, or unsaved work of it that is not `own`."""
 
     def taken(session: Path) -> bool:
-        return session.exists() or any(found != own for found in left(session))
+        return session.exists() or any(found != own for found in find_autosaves(session))
 
-    return next(session for session in _numbered(path) if not taken(session))
+    return next(session for session in _numbered_paths(path) if not taken(session))
 
 
 def stem(session: Path) -> str:
@@ -133,7 +135,7 @@ def stem(session: Path) -> str:
     return session.name.removesuffix(SUFFIX) if session.name.endswith(SUFFIX) else session.stem
 
 
-def _numbered(session: Path, kind: str = "") -> Iterator[Path]:
+def _numbered_paths(session: Path, kind: str = "") -> Iterator[Path]:
     """NAME, NAME-2, NAME-3 …; with a kind NAME.kind, NAME.kind-2 …"""
     name, number = stem(session) + f".{kind}" * bool(kind), 1
     while True:

@@ -13,7 +13,7 @@ from progdf.terminal import printable
 from viewer.camera.view_camera import bounds_of, first_camera, fit_all
 from viewer.render.threads import all_threads
 from viewer.state.layer_facts import layer_rows
-from viewer.state.recordings import Recording, found
+from viewer.state.recordings import RecordingFile, find_recording
 from viewer.state.workspace import SceneFacts
 
 
@@ -50,11 +50,11 @@ class Document:
             ),
         )
 
-    def recordings(self) -> tuple[Recording, ...]:
+    def recordings(self) -> tuple[RecordingFile, ...]:
         """Where each edit was recorded."""
         if len(self.gdf_paths) != len(self.gdfs):
-            return (Recording(),) * len(self.gdfs)
-        return tuple(found(gdf, path) for gdf, path in zip(self.gdfs, self.gdf_paths, strict=True))
+            return (RecordingFile(),) * len(self.gdfs)
+        return tuple(find_recording(gdf, path) for gdf, path in zip(self.gdfs, self.gdf_paths, strict=True))
 
     def free_name(self, name: str) -> str:
         """An edit's name, with a number where another edit has it."""

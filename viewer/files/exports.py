@@ -35,7 +35,7 @@ def picture(folder: Path, title: str, image: NDArray[np.uint8]) -> str:
     def save() -> str:
         return f"Saved {save_picture(folder, Path(title).stem, image).resolve()}"
 
-    return _saved("picture", folder, save)
+    return _try_save("picture", folder, save)
 
 
 def timeline(folder: Path, title: str, view: ViewState) -> str:
@@ -50,7 +50,7 @@ def timeline(folder: Path, title: str, view: ViewState) -> str:
         timeline_file.save(path, view.timeline, view.layers)
         return f"Saved {path.resolve()}; render it with progdf render … --timeline {path.name}"
 
-    return _saved("timeline", folder, save)
+    return _try_save("timeline", folder, save)
 
 
 def camera(place: Path, seen: Camera) -> tuple[Path, int]:
@@ -69,7 +69,7 @@ def camera(place: Path, seen: Camera) -> tuple[Path, int]:
     return path, len(kept) + 1
 
 
-def _saved(what: str, folder: Path, save: Callable[[], str]) -> str:
+def _try_save(what: str, folder: Path, save: Callable[[], str]) -> str:
     try:
         return save()
     except OSError as error:

@@ -20,25 +20,25 @@ import numpy as np
 _LARGEST = 1 << 28  # bytes of an array; a header that claims more is not believed
 
 
-class NotPlainError(ValueError):
+class JsonFormError(ValueError):
     """A value that the state cannot hold; the message says where and why."""
 
 
-def plain(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """A state as JSON values: dataclasses as tables, tuples as lists."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+        return {f.name: to_json(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, np.ndarray):
         packed = base64.b64encode(zlib.compress(np.ascontiguousarray(value).tobytes(), 6)).decode()
         return {"dtype": value.dtype.str, "shape": list(value.shape), "zlib": packed}
     if isinstance(value, (tuple, list, frozenset)):
-        return [plain(part) for part in (sorted(value) if isinstance(value, frozenset) else value)]
+        return [to_json(part) for part in (sorted(value) if isinstance(value, frozenset) else value)]
     if isinstance(value, dict):
-        return {str(key): plain(part) for key, part in value.items()}
+        return {str(key): to_json(part) for key, part in value.items()}
     return value
 
 
-def restored(kind: Any, value: Any, where: str = "") -> Any:
+def from_json(kind: Any, value: Any, where: str = "") -> Any:
     """The state of type `kind` that `plain` made `value` of.
 
     Args:
@@ -65,47 +65,47 @@ def restored(kind: Any, value: Any, where: str = "") -> Any:
     if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         if math.isfinite(value):
             return float(value)
-        raise NotPlainError(f"{where} is not finite")
+        raise JsonFormError(f"{where} is not finite")
     if kind in (int, str, bool) and type(value) is kind:
         return value
-    raise NotPlainError(f"{where} is {_shown(value)}, not {getattr(kind, '__name__', kind)}")
+    raise JsonFormError(f"{where} is {_short_repr(value)}, not {getattr(kind, '__name__', kind)}")
 
 
 def _table(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise NotPlainError(f"{where or 'it'} is {_shown(value)}, not a table")
+        raise JsonFormError(f"{where or 'it'} is {_short_repr(value)}, not a table")
     known = {f.name: f for f in fields(kind)}
     at = f"{where}." if where else ""
     for name in value:
         if name not in known:
-            raise NotPlainError(f"{at}{name} is unknown")
+            raise JsonFormError(f"{at}{name} is unknown")
     for name, f in known.items():
         if name not in value and f.default is MISSING and f.default_factory is MISSING:
-            raise NotPlainError(f"{at}{name} is missing")
+            raise JsonFormError(f"{at}{name} is missing")
     hints = _hints(kind)
-    found = {name: restored(hints[name], part, at + name) for name, part in value.items()}
+    found = {name: from_json(hints[name], part, at + name) for name, part in value.items()}
     try:
         return kind(**found)
     except ValueError as error:
-        raise NotPlainError(f"{where or 'it'}: {error}") from None
+        raise JsonFormError(f"{where or 'it'}: {error}") from None
 
 
 def _tuple(parts: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, list):
-        raise NotPlainError(f"{where} is {_shown(value)}, not a list")
+        raise JsonFormError(f"{where} is {_short_repr(value)}, not a list")
     if len(parts) == 2 and parts[1] is Ellipsis:
-        return tuple(restored(parts[0], part, f"{where}[{i}]") for i, part in enumerate(value))
+        return tuple(from_json(parts[0], part, f"{where}[{i}]") for i, part in enumerate(value))
     if len(parts) != len(value):
-        raise NotPlainError(f"{where} has {len(value)} entries, not {len(parts)}")
-    return tuple(restored(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(parts, value, strict=True)))
+        raise JsonFormError(f"{where} has {len(value)} entries, not {len(parts)}")
+    return tuple(from_json(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(parts, value, strict=True)))
 
 
 def _one_of(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
     failures = []
     for kind in kinds:
         try:
-            return restored(kind, value, where)
-        except NotPlainError as error:
+            return from_json(kind, value, where)
+        except JsonFormError as error:
             if kind is not type(None):
                 failures.append(error)
     raise failures[0]
@@ -116,10 +116,10 @@ def _other(origin: Any, parts: tuple[Any, ...], value: Any, where: str) -> Any:
         if value in parts:
             return value
     elif origin is frozenset and isinstance(value, list):
-        return frozenset(restored(parts[0], part, where) for part in value)
+        return frozenset(from_json(parts[0], part, where) for part in value)
     elif origin is dict and isinstance(value, dict):
-        return {key: restored(parts[1], part, f"{where}.{key}") for key, part in value.items()}
-    raise NotPlainError(f"{where} is {_shown(value)}")
+        return {key: from_json(parts[1], part, f"{where}.{key}") for key, part in value.items()}
+    raise JsonFormError(f"{where} is {_short_repr(value)}")
 
 
 def _array(value: Any, where: str) -> np.ndarray[Any, Any]:
@@ -132,9 +132,9 @@ def _array(value: Any, where: str) -> np.ndarray[Any, Any]:
         content = unpacker.decompress(base64.b64decode(value["zlib"], validate=True), size + 1)
         array = np.frombuffer(content, dtype).reshape(shape).copy()
     except (KeyError, TypeError, ValueError, zlib.error):
-        raise NotPlainError(f"{where} is a damaged array") from None
+        raise JsonFormError(f"{where} is a damaged array") from None
     if dtype.kind == "f" and not np.isfinite(array).all():
-        raise NotPlainError(f"{where} is not finite")
+        raise JsonFormError(f"{where} is not finite")
     return array
 
 
@@ -143,6 +143,6 @@ def _hints(kind: Any) -> dict[str, Any]:
     return typing.get_type_hints(kind)
 
 
-def _shown(value: object) -> str:
+def _short_repr(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:39]}…"

@@ -16,25 +16,25 @@ from viewer.state import paint
 from viewer.state.comparison import AGAINST, MODES, MOST_AMPLIFIED
 from viewer.state.history import Edit
 from viewer.state.layers import OVERSHOOT
-from viewer.state.snapshots import Snapshot
-from viewer.state.view_state import DRAFT_MODES, LayerState, ViewState
+from viewer.state.snapshots import SliderSnapshot
+from viewer.state.view_state import RESOLUTION_MODES, LayerState, ViewState
 
 from . import document, timeline_file
 from . import json_form as plain
 from .document import Document
-from .json_form import NotPlainError
+from .json_form import JsonFormError
 
 
 @dataclass(frozen=True)
-class Session:
+class WindowSession:
     """What a session brings back."""
 
     document: Document
     view: ViewState
-    snapshots: tuple[Snapshot, ...] = ()
+    snapshots: tuple[SliderSnapshot, ...] = ()
 
 
-def save(path: Path, session: Session) -> None:
+def save(path: Path, session: WindowSession) -> None:
     """Write the session, whole or not at all.
 
     Raises:
@@ -42,20 +42,20 @@ def save(path: Path, session: Session) -> None:
     """
     if session.document.path is None or len(session.document.gdf_paths) != len(session.document.gdfs):
         raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
-    scene, session = session.document.path, pruned(session)
+    scene, session = session.document.path, prune(session)
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; make it first")
     folder = path.parent
     state = SessionFile(
         reference(scene, folder),
         tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
-        plain.plain(session.view),
-        tuple(plain.plain(snapshot) for snapshot in session.snapshots),
+        plain.to_json(session.view),
+        tuple(plain.to_json(snapshot) for snapshot in session.snapshots),
     )
     write_session(path, state)
 
 
-def open_session(path: Path) -> Session:
+def open_session(path: Path) -> WindowSession:
     """Read a session with its scene and edits.
 
     Raises:
@@ -67,8 +67,8 @@ def open_session(path: Path) -> Session:
     scene, gdfs = verified(path, file)
     opened = document.load(scene, gdfs)
     for layer in (*view.layers, *(layer for kept in snapshots for layer in kept.edit.layers)):
-        paint.decoded(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
-    return Session(opened, view, snapshots)
+        paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
+    return WindowSession(opened, view, snapshots)
 
 
 def default_path(opened: Document) -> Path:
@@ -77,7 +77,7 @@ def default_path(opened: Document) -> Path:
     return scene.with_name(scene.stem + SUFFIX)
 
 
-def pruned(session: Session) -> Session:
+def prune(session: WindowSession) -> WindowSession:
     """Without the edits that no layer shows any more, in the view or in a snapshot."""
     view, snapshots = session.view, session.snapshots
     stacks = (view.layers, *(kept.edit.layers for kept in snapshots))
@@ -94,7 +94,7 @@ def pruned(session: Session) -> Session:
         replace(key, strengths=tuple((places[gdf], s) for gdf, s in key.strengths if gdf in places))
         for key in view.timeline.keys
     )
-    return Session(
+    return WindowSession(
         replace(
             opened,
             gdfs=tuple(opened.gdfs[gdf] for gdf in used),
@@ -110,12 +110,13 @@ def pruned(session: Session) -> Session:
     )
 
 
-def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ...]]:
+def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
     """The state of a session, every value of it one that the window could have made."""
     try:
-        view = plain.restored(ViewState, file.view, "view")
+        view = plain.from_json(ViewState, file.view, "view")
         snapshots = tuple(
-            plain.restored(Snapshot, entry, f"snapshots[{i}]") for i, entry in enumerate(file.snapshots)
+            plain.from_json(SliderSnapshot, entry, f"snapshots[{i}]")
+            for i, entry in enumerate(file.snapshots)
         )
         count = len(file.edits)
         _check_camera("view.camera", view.camera)
@@ -126,7 +127,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ..
         _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)
         _among("view.compare.mode", view.compare.mode, MODES)
         _among("view.compare.against", view.compare.against, AGAINST)
-        _among("view.draft", view.draft, DRAFT_MODES)
+        _among("view.draft", view.draft, RESOLUTION_MODES)
         _among("view.brush.mode", view.brush.mode, paint.MODES)
         _check("view.brush.radius", [view.brush.radius], paint.SMALLEST_PX, paint.LARGEST_PX)
         _check("view.brush.softness", [view.brush.softness], 0.0, 1.0)
@@ -134,7 +135,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[Snapshot, ..
         for i, snapshot in enumerate(snapshots):
             _check_camera(f"snapshots[{i}].camera", snapshot.camera)
             _check_edit(f"snapshots[{i}].edit", snapshot.edit, count)
-    except NotPlainError as error:
+    except JsonFormError as error:
         raise ProgdfError(f"{name} cannot be opened: {error}; save it anew, or update progdf") from None
     return view, snapshots
 
@@ -144,7 +145,7 @@ def _check_edit(where: str, edit: Edit, count: int) -> None:
     for i, layer in enumerate(edit.layers):
         at = f"{where}.layers[{i}]"
         if not 0 <= layer.gdf < count:
-            raise NotPlainError(f"{at}.gdf is {layer.gdf} of {count} edits")
+            raise JsonFormError(f"{at}.gdf is {layer.gdf} of {count} edits")
         _check(f"{at}.strength", [layer.strength], 0.0, OVERSHOOT)
         gains = layer.gains
         _check(f"{at}.gains", [gains.geometry, gains.opacity, gains.colour], 0.0, 1.0)
@@ -162,9 +163,9 @@ def _check_camera(where: str, camera: ViewCamera) -> None:
 def _check(where: str, values: Sequence[float], least: float, most: float) -> None:
     for value in values:
         if not least <= value <= most:
-            raise NotPlainError(f"{where} is {value:g}, outside {least:g} to {most:g}")
+            raise JsonFormError(f"{where} is {value:g}, outside {least:g} to {most:g}")
 
 
 def _among(where: str, value: Any, known: Sequence[str]) -> None:
     if value not in known:
-        raise NotPlainError(f"{where} is '{value}', none of {', '.join(known)}")
+        raise JsonFormError(f"{where} is '{value}', none of {', '.join(known)}")

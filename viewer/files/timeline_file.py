@@ -31,7 +31,7 @@ from viewer.state.layers import OVERSHOOT
 from viewer.state.view_state import Keyframe, LayerState, Timeline
 
 from . import json_form as plain
-from .json_form import NotPlainError
+from .json_form import JsonFormError
 
 VERSION = 1
 _LARGEST = 16 << 20  # bytes
@@ -79,7 +79,7 @@ def save(path: Path, shown: Timeline, layers: Sequence[LayerState]) -> None:
     )
     file = TimelineFile(VERSION, keys, shown.length, shown.fps, shown.ping_pong)
     with atomic_write(path) as temporary_file:
-        temporary_file.write_text(json.dumps(plain.plain(file), indent=2) + "\n", encoding="utf-8")
+        temporary_file.write_text(json.dumps(plain.to_json(file), indent=2) + "\n", encoding="utf-8")
 
 
 def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
@@ -104,10 +104,10 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
     if value[MARK] != VERSION:
         raise ProgdfError(f"{path} is a timeline of version {value[MARK]!r}; this progdf reads {VERSION}")
     try:
-        file = plain.restored(TimelineFile, value)
+        file = plain.from_json(TimelineFile, value)
         found = _of_layers(file, layers)
         check(found, "keys")
-    except NotPlainError as error:
+    except JsonFormError as error:
         raise ProgdfError(f"{path} cannot be read: {error}; correct it, or write it anew") from None
     return found
 
@@ -119,23 +119,23 @@ def check(found: Timeline, where: str = "timeline.keys") -> None:
         NotPlainError: one is not; the message names it.
     """
     if not 1 <= found.length <= timeline.LONGEST or not 1 <= found.fps <= timeline.FASTEST:
-        raise NotPlainError(
+        raise JsonFormError(
             f"length is {found.length} and fps {found.fps}; 1 to {timeline.LONGEST} and 1 to "
             f"{timeline.FASTEST} can be"
         )
     for i, key in enumerate(found.keys):
         at = f"{where}[{i}]"
         if not 0 <= key.frame <= found.length:
-            raise NotPlainError(f"{at}.frame is {key.frame}, outside 0 to the length, {found.length}")
+            raise JsonFormError(f"{at}.frame is {key.frame}, outside 0 to the length, {found.length}")
         if key.easing not in timeline.EASINGS:
-            raise NotPlainError(f"{at}.easing is '{key.easing}', none of {', '.join(timeline.EASINGS)}")
+            raise JsonFormError(f"{at}.easing is '{key.easing}', none of {', '.join(timeline.EASINGS)}")
         for _, strength in key.strengths:
             if not 0.0 <= strength <= OVERSHOOT:
-                raise NotPlainError(f"{at}.strengths has {strength:g}, outside 0 to {OVERSHOOT:g}")
+                raise JsonFormError(f"{at}.strengths has {strength:g}, outside 0 to {OVERSHOOT:g}")
         if key.camera is not None:
             _check_camera(key.camera, f"{at}.camera")
     if any(before.frame >= after.frame for before, after in pairwise(found.keys)):
-        raise NotPlainError(f"{where} has two keys at one frame, or not in their order")
+        raise JsonFormError(f"{where} has two keys at one frame, or not in their order")
 
 
 def _of_layers(file: TimelineFile, layers: Sequence[LayerState]) -> Timeline:
@@ -144,7 +144,7 @@ def _of_layers(file: TimelineFile, layers: Sequence[LayerState]) -> Timeline:
         for name in key.strengths:
             if name not in gdfs:
                 there = ", ".join(gdfs) or "none"
-                raise NotPlainError(f"it moves the edit '{name}', which is not open (there is {there})")
+                raise JsonFormError(f"it moves the edit '{name}', which is not open (there is {there})")
     keys = sorted(file.keys, key=lambda key: key.frame)
     return Timeline(
         tuple(
@@ -160,8 +160,8 @@ def _of_layers(file: TimelineFile, layers: Sequence[LayerState]) -> Timeline:
 def _check_camera(camera: ViewCamera, where: str) -> None:
     numbers = (*camera.pivot, camera.azimuth, camera.distance, *camera.up)
     if not all(abs(number) <= FARTHEST for number in numbers):
-        raise NotPlainError(f"{where} is farther away than {FARTHEST:g}")
+        raise JsonFormError(f"{where} is farther away than {FARTHEST:g}")
     if camera.distance <= 0.0 or not any(camera.up):
-        raise NotPlainError(f"{where} has a distance that is not above 0, or an up axis without a direction")
+        raise JsonFormError(f"{where} has a distance that is not above 0, or an up axis without a direction")
     if abs(camera.elevation) > 90.0 or not 1.0 <= camera.fov_y <= 179.0:
-        raise NotPlainError(f"{where} has an elevation outside -90 to 90, or a lens outside 1 to 179 degrees")
+        raise JsonFormError(f"{where} has an elevation outside -90 to 90, or a lens outside 1 to 179 degrees")

@@ -9,7 +9,7 @@ from progdf.errors import ProgdfError
 from progdf.io.session import SUFFIX
 
 
-def typed(text: str) -> Path:
+def parse_path(text: str) -> Path:
     """The path; the home of an unknown user is a name like any other, and missing.
 
     Raises:

@@ -95,12 +95,12 @@ class _List:
         self.parts: list[NDArray[Any]] = []
         self.length = 0
 
-    def put(self, texels: NDArray[Any]) -> int:
+    def append(self, texels: NDArray[Any]) -> int:
         begin, self.length = self.length, self.length + len(texels)
         self.parts.append(texels)
         return begin
 
-    def joined(self, dtype: Any) -> NDArray[Any]:
+    def join(self, dtype: Any) -> NDArray[Any]:
         return np.concatenate([np.zeros((0, 4), dtype), *self.parts])
 
 
@@ -114,16 +114,16 @@ def pack_edits(scene: Gaussians, gdfs: Sequence[Gdf]) -> PackedEdits:
         places[edit, np.searchsorted(slots, own)] = np.arange(len(own))
     floats, levels = _List(), _List()
     edits = [_edit(gdf, shown, floats, levels) for gdf in gdfs]
-    covers = [floats.put(_covers(scene, gdf)) for gdf in gdfs]
+    covers = [floats.append(_covers(scene, gdf)) for gdf in gdfs]
     moved = {target for edit in edits for target in edit}
     originals = [-1] * len(TARGETS)
     for target in sorted(moved):
-        originals[target] = floats.put(_originals(scene, TARGETS[target], slots, shown))
+        originals[target] = floats.append(_originals(scene, TARGETS[target], slots, shown))
     return PackedEdits(
         slots,
         tuple(originals),
-        floats.joined(np.float32),
-        levels.joined(np.int8),
+        floats.join(np.float32),
+        levels.join(np.int8),
         places.reshape(-1),
         tuple(edits),
         tuple(covers),
@@ -175,8 +175,8 @@ def _target(
         movers.append(Mover(name, bases.coefficients.numpy(), step))
     if as_floats:
         together = np.concatenate([full[:, None], rest], axis=1).reshape(-1, 4)
-        return TargetBases(floats.put(together), -1, rank, tuple(movers))
-    return TargetBases(floats.put(full), levels.put(rest.reshape(-1, 4)), rank, tuple(movers))
+        return TargetBases(floats.append(together), -1, rank, tuple(movers))
+    return TargetBases(floats.append(full), levels.append(rest.reshape(-1, 4)), rank, tuple(movers))
 
 
 def _originals(scene: Gaussians, texture: str, slots: NDArray[np.int64], shown: int) -> Floats:

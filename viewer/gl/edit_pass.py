@@ -22,7 +22,7 @@ from progdf.gdf.file import Gdf
 
 from .edit_bases import pack_edits
 from .edit_spans import spans_of
-from .edit_stack import described, joined_weights
+from .edit_stack import joined_weights, pack_stack
 from .layout import PLACES, SPLAT_TEXTURES, SPLATS_PER_ROW, TARGETS
 from .programs import load_program
 from .scene_textures import SplatTextures
@@ -34,7 +34,7 @@ _KEPT = 32
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _EditPlan:
     """What is drawn over when some edits change, and which edits have a part in it."""
 
     rows: NDArray[np.int64]
@@ -92,7 +92,7 @@ class EditPass:
         self._lists["edit_places"].write(self._packed.places)
         self._base = load_program(ctx, "edit.vert", "edit.frag")
         self._sh = load_program(ctx, "edit.vert", "edit_sh.frag")
-        self._plans: dict[frozenset[int], _Plan] = {}
+        self._plans: dict[frozenset[int], _EditPlan] = {}
         self._weights: list[tuple[Tensor, int]] = []  # those in `edit_weights`, and their versions
 
     def run(
@@ -176,11 +176,11 @@ class EditPass:
         ):
             self._lists["edit_weights"].write(weights)
             self._weights = given
-        layers, numbers = described(self._packed, stack, begins)
+        layers, numbers = pack_stack(self._packed, stack, begins)
         self._lists["edit_layers"].write(layers.view("<i4"))
         self._lists["edit_numbers"].write(numbers)
 
-    def _draw_base(self, plan: _Plan, attributes: Collection[str]) -> None:
+    def _draw_base(self, plan: _EditPlan, attributes: Collection[str]) -> None:
         """All attributes but shN; textures in which nothing moves are masked."""
         moved = {PLACES[name].texture for name in attributes}
         wanted = [name in moved for name in SPLAT_TEXTURES]
@@ -192,14 +192,14 @@ class EditPass:
         self._base["wanted"] = tuple(map(int, wanted))
         plan.base.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=plan.spans)
 
-    def _draw_sh(self, plan: _Plan, target: moderngl.Framebuffer) -> None:
+    def _draw_sh(self, plan: _EditPlan, target: moderngl.Framebuffer) -> None:
         target.use()
         target.viewport = (0, 0, *target.size)
         self._sh["original"] = self._packed.originals[_SH]
         self._sh["sh_coefficients"] = self._packed.sh_coefficients
         plan.sh.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=plan.spans)
 
-    def _plan(self, changed: frozenset[int]) -> _Plan:
+    def _plan(self, changed: frozenset[int]) -> _EditPlan:
         if changed not in self._plans:
             if len(self._plans) >= _KEPT:
                 for plan in self._plans.values():
@@ -212,7 +212,7 @@ class EditPass:
                 self.ctx.vertex_array(program, [(buffer, "4i/i", "span")])
                 for program in (self._base, self._sh)
             )
-            self._plans[changed] = _Plan(found.rows, found.edits, len(spans), buffer, base, sh)
+            self._plans[changed] = _EditPlan(found.rows, found.edits, len(spans), buffer, base, sh)
         return self._plans[changed]
 
 

@@ -15,7 +15,7 @@ from .edit_bases import Floats, PackedEdits, TargetBases
 from .layout import EDIT_LAYER, PLACES
 
 
-def described(
+def pack_stack(
     packed: PackedEdits, stack: Sequence[tuple[int, Layer]], weights_at: Sequence[int]
 ) -> tuple[NDArray[Any], Floats]:
     """The lists `edit_layers` and `edit_numbers`.

@@ -20,8 +20,8 @@ SPLAT_TEXTURES = {"mean_logit": MEAN_LOGIT, "log_scale": LOG_SCALE, "quat": QUAT
 Bands 1 to 3 lie in `shN`: rgb32f (rgba32f where the edit pass writes it), K texels a Gaussian.
 """
 
-TINT = np.dtype([("rgb", "u1", 3), ("share", "u1")])
-"""What is drawn over a Gaussian's colour; one texel of `tint` in shaders/project.vert, 0..255 as 0..1."""
+HIGHLIGHT = np.dtype([("rgb", "u1", 3), ("share", "u1")])
+"""What is drawn over a Gaussian's colour; a texel of `highlight` in shaders/project.vert, 0..255 as 0..1."""
 
 SHOWN_SH = 15
 """Largest K: coefficients above degree 3 ride along in the scene and are not shown."""

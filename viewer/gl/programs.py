@@ -83,10 +83,10 @@ def load_program(
             varyings=varyings,
         )
     except moderngl.Error as error:
-        raise ShaderError(_told(str(error), vertex, fragment, sources)) from None
+        raise ShaderError(_first_line(str(error), vertex, fragment, sources)) from None
 
 
-def _told(log: str, vertex: str, fragment: str | None, sources: list[Source]) -> str:
+def _first_line(log: str, vertex: str, fragment: str | None, sources: list[Source]) -> str:
     """The driver's log with its file numbers replaced by names."""
     stage = sources[-1] if "fragment_shader" in log else sources[0]
     complaints = []

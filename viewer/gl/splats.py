@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
-from .highlight_texture import TintTexture
+from .highlight_texture import HighlightTexture
 from .layout import ORDER, PROJECTED, SHOWN_SH
 from .programs import load_program
 from .scene_textures import SplatTextures
@@ -60,7 +60,7 @@ class SplatRenderer:
         self._project = load_program(ctx, "project.vert", varyings=PROJECTED.names or ())
         self._splat = load_program(ctx, "splat.vert", "splat.frag")
         self._scene: SplatTextures | None = None
-        self._tints: TintTexture | None = None
+        self._highlights: HighlightTexture | None = None
         self._buffers: _Buffers | None = None
         self._target: _Target | None = None
         self._drawn = 0
@@ -94,13 +94,13 @@ class SplatRenderer:
         """Take the changed attributes of the changed rows (sorted); gives the bytes sent."""
         return self.textures.write(scene, attributes, rows)
 
-    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+    def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """Draw Gaussians (sorted) in other colours: rgb and its share, 0..255. [R,4]"""
-        self._tints = self._tints or TintTexture(self.ctx, self.textures.count)
-        self._tints.write(rows, tints)
-        if self._tints.empty:
-            self._tints.release()
-            self._tints = None
+        self._highlights = self._highlights or HighlightTexture(self.ctx, self.textures.count)
+        self._highlights.write(rows, highlights)
+        if self._highlights.empty:
+            self._highlights.release()
+            self._highlights = None
 
     def set_order(self, order: NDArray[np.uint32]) -> None:
         """Which Gaussians are drawn, farthest first; see `viewer.render.depth_sort`."""
@@ -130,9 +130,9 @@ class SplatRenderer:
             self._scene.bind(self._project)
             _set_camera(self._project, camera)
             self._project["antialiased"] = self._antialiased
-            self._project["tinted"] = self._tints is not None
-            if self._tints is not None:
-                self._tints.bind(self._project, len(self._scene.textures))
+            self._project["highlighted"] = self._highlights is not None
+            if self._highlights is not None:
+                self._highlights.bind(self._project, len(self._scene.textures))
             self._buffers.project.transform(self._buffers.projected, moderngl.POINTS, vertices=self._drawn)
             self.ctx.enable_only(moderngl.BLEND)
             target.framebuffer.viewport = (0, 0, *size)
@@ -178,9 +178,9 @@ class SplatRenderer:
             self._buffers.release()
         if self._scene is not None:
             self._scene.release()
-        if self._tints is not None:
-            self._tints.release()
-            self._tints = None
+        if self._highlights is not None:
+            self._highlights.release()
+            self._highlights = None
 
 
 def vertex_format(dtype: np.dtype[Any]) -> str:

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from imgui_bundle import imgui
 
-from viewer.render import highlight as tint
+from viewer.render import highlight
 from viewer.state import layers as stack
 from viewer.state import paint
 from viewer.state.view_state import Brush, ViewState
@@ -34,7 +34,7 @@ def obstacle(view: ViewState, focus: int | None) -> str:
     layer = view.layers[focus]
     if layer.locked:
         return f"{layer.name} is locked; press L to unlock it"
-    if layer not in stack.shown(view):
+    if layer not in stack.visible_layers(view):
         return f"{layer.name} is hidden; press H to show it"
     return ""
 
@@ -89,8 +89,8 @@ def _legend(column: float, ui: UiContext) -> None:
     left, top = imgui.get_cursor_screen_pos()
     width, height, size = imgui.get_content_region_avail().x, 10.0 * ui.scale, SMALL_PX * ui.scale
     canvas = imgui.get_window_draw_list()
-    for (start, a), (end, b) in pairwise(tint.RAMP):
-        low, high = (u32(tint.rgba(colour)) for colour in (a, b))
+    for (start, a), (end, b) in pairwise(highlight.RAMP):
+        low, high = (u32(highlight.rgba(colour)) for colour in (a, b))
         corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
         canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
     imgui.push_font(None, SMALL_PX)

@@ -16,10 +16,10 @@ from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import ViewState
 from viewer.ui.context import PALETTE, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import (
-    elided,
-    grouped,
+    elide,
+    group_digits,
     icon_button,
-    let_go,
+    is_released,
     menu,
     right_edge,
     section,
@@ -55,19 +55,19 @@ class Cards:
         rows: one per .gdf, indexed by `LayerState.gdf`
         focus: the focused layer, an index into `ViewState.layers`, or None
         reveal: scroll to it
-        dial: which of `stack.DIALS` of it the arrow keys move
+        active_slider: which of `stack.SLIDERS` of it the arrow keys move
         renaming: the layer whose name is being typed, or None
     """
 
     rows: Sequence[LayerRow]
     focus: int | None = None
     reveal: bool = False
-    dial: str = "strength"
+    active_slider: str = "strength"
     renaming: int | None = None
 
 
 @dataclass(frozen=True)
-class Drawn:
+class CardsResult:
     """What became of the state: the focused layer, the one being renamed, the one asked about.
 
     `actions`: those of the cards' menus, as in `workspace.perform`.
@@ -133,7 +133,7 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
     return state
 
 
-def draw(state: ViewState, cards: Cards, ui: UiContext) -> Drawn:
+def draw(state: ViewState, cards: Cards, ui: UiContext) -> CardsResult:
     """All cards."""
     if not state.layers:
         imgui.push_text_wrap_pos(0.0)
@@ -162,10 +162,10 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> Drawn:
         to = _place(dragged, spans, imgui.get_mouse_pos().y)
         if dropped:
             was, focus = stack.index_of(state, dragged), stack.index_of(state, to)
-            state = stack.moved(state, was, focus)
+            state = stack.move_layer(state, was, focus)
         else:
             _show_place(dragged, to, spans, ui)
-    return Drawn(state, focus, renaming, overlap, tuple(actions))
+    return CardsResult(state, focus, renaming, overlap, tuple(actions))
 
 
 def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:
@@ -198,7 +198,7 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
     """One card: eye, swatch, name and value; the slider; count and toggles; unfolded, curve and gains."""
     scale, p = ui.scale, PALETTE
     layer, focused = state.layers[index], cards.focus == index
-    row, active = cards.rows[layer.gdf], layer in stack.shown(state)
+    row, active = cards.rows[layer.gdf], layer in stack.visible_layers(state)
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
@@ -222,17 +222,21 @@ def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
         scale,
         p.accent if focused else p.accent_dark,
         active,
-        stack.most(state),
+        stack.largest_strength(state),
     )
     touched = imgui.is_item_active()
     imgui.end_disabled()
     _number(number_at, strength, active)
-    card = replace(card, state=stack.changed(card.state, index, lambda old: replace(old, strength=strength)))
+    card = replace(
+        card, state=stack.change_layer(card.state, index, lambda old: replace(old, strength=strength))
+    )
     card = _foot(card, index, row, ui)
     if layer.gdf in card.state.unfolded:
-        dial = cards.dial if focused else None
-        unfolded = layer_fold.draw(card.state.layers[index], row, dial, stack.most(state), ui)
-        card = replace(card, state=stack.changed(card.state, index, lambda _: unfolded))
+        active_slider = cards.active_slider if focused else None
+        unfolded = layer_fold.draw(
+            card.state.layers[index], row, active_slider, stack.largest_strength(state), ui
+        )
+        card = replace(card, state=stack.change_layer(card.state, index, lambda _: unfolded))
     over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
     pressed = over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value)
     held = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button calls its drag off
@@ -276,9 +280,9 @@ def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, 
     right = right_edge()
     if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
         if imgui.get_io().key_alt:
-            state = stack.soloed(state, index)
+            state = stack.toggle_solo(state, index)
         else:
-            state = stack.changed(state, index, lambda old: replace(old, enabled=not old.enabled))
+            state = stack.change_layer(state, index, lambda old: replace(old, enabled=not old.enabled))
     tip("Show or hide (H). Alt+click: solo")
     imgui.same_line()
     _swatch(row.swatch, active, ui)
@@ -306,12 +310,12 @@ def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui
     layer = card.state.layers[index]
     if renaming:
         text = typed_name(layer.name, room)
-        return replace(card, renaming=text is None, state=stack.renamed(card.state, index, text or ""))
+        return replace(card, renaming=text is None, state=stack.rename_layer(card.state, index, text or ""))
     x, y = imgui.get_cursor_screen_pos()
     imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     colour = PALETTE.text if active else PALETTE.dim
-    imgui.get_window_draw_list().add_text(at, u32(colour), elided(layer.name, room))
+    imgui.get_window_draw_list().add_text(at, u32(colour), elide(layer.name, room))
     tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename (Enter)")
     if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
         return replace(card, renaming=True, touched=True)
@@ -319,7 +323,7 @@ def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui
     if imgui.is_item_active() and imgui.is_mouse_dragging(imgui.MouseButton_.left.value, threshold):
         return replace(card, drag="dragged")
     moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, threshold)
-    if let_go() and (moved.x or moved.y):
+    if is_released() and (moved.x or moved.y):
         return replace(card, drag="dropped")
     return card
 
@@ -334,30 +338,30 @@ def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
         for i, other in enumerate(state.layers)
         if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
     ]
-    note = f"{grouped(row.count)} splats"
+    note = f"{group_digits(row.count)} splats"
     if len(overlaps) == 1:
         name, count = overlaps[0]
-        note += f"  ·  {'all' if count == row.count else grouped(count)} in {name}"
+        note += f"  ·  {'all' if count == row.count else group_digits(count)} in {name}"
     elif overlaps:
         note += f"  ·  overlaps {len(overlaps)} layers"
     elif row.instruction:
         note += f"  ·  {row.instruction}"
     small(note, PALETTE.dim, right - left - 4 * wide - 6.0 * ui.scale)
     asked = bool(overlaps) and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
-    shared = [f"{grouped(count)} of its splats are also in {name}" for name, count in overlaps]
+    shared = [f"{group_digits(count)} of its splats are also in {name}" for name, count in overlaps]
     shared += ["Highlighted in pink"] if overlaps else []
-    tip("\n".join((f"{grouped(row.count)} splats", *filter(None, [row.instruction]), *shared)))
+    tip("\n".join((f"{group_digits(row.count)} splats", *filter(None, [row.instruction]), *shared)))
     imgui.same_line(right - 4 * wide)
     if small_toggle("solo", "S", layer.solo, wide, ui):
-        state = stack.soloed(state, index)
+        state = stack.toggle_solo(state, index)
     tip("Solo: show only soloed layers (Shift+H)")
     imgui.same_line(right - 3 * wide)
     if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
-        state = stack.changed(state, index, lambda old: replace(old, locked=not old.locked))
+        state = stack.change_layer(state, index, lambda old: replace(old, locked=not old.locked))
     tip("Lock strength, gains and paint (L)")
     imgui.same_line(right - 2 * wide)
     if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
-        state = stack.folded(state, index)
+        state = stack.toggle_details(state, index)
     tip("Show gains and the curve of visible change (G)")
     imgui.same_line(right - wide)
     if small_toggle("menu", Icon.MENU, False, wide, ui):

@@ -14,43 +14,45 @@ from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.widgets import label, tip, value_slider
 
 CURVE_PX = 52.0  # at 1×
-GAINS = stack.DIALS[1:]
+GAINS = stack.SLIDERS[1:]
 
 
-def draw(layer: LayerState, row: LayerRow, dial: str | None, most: float, ui: UiContext) -> LayerState:
+def draw(
+    layer: LayerState, row: LayerRow, active_slider: str | None, most: float, ui: UiContext
+) -> LayerState:
     """Draw the curve and the gains.
 
     Args:
         layer: what they show
         row: of its .gdf
-        dial: what the arrow keys move; None where they move another layer
+        active_slider: what the arrow keys move; None where they move another layer
         most: the upper end of the strength
         ui: fonts and scale
     """
     _curve(row, layer.strength, most, ui)
     imgui.begin_disabled(layer.locked)
     for kind in GAINS:
-        layer = _gain(layer, kind, kind in row.kinds, kind == dial, ui)
+        layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
     imgui.end_disabled()
     return layer
 
 
-def _gain(layer: LayerState, kind: str, moves: bool, remap_slider: bool, ui: UiContext) -> LayerState:
+def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext) -> LayerState:
     """One gain: a slider as the others of the panel."""
-    if remap_slider:
+    if active:
         imgui.push_style_color(imgui.Col_.text_disabled, imgui.ImVec4(*PALETTE.accent))
     label(kind.capitalize(), 84.0 * ui.scale)
-    if remap_slider:
+    if active:
         imgui.pop_style_color()
     imgui.begin_disabled(not moves)
-    value = stack.dial_value(layer, kind)
+    value = stack.slider_value(layer, kind)
     new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
     imgui.end_disabled()
     if moves:
         tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
     else:
         tip(f"This edit does not change the {kind}")
-    return layer if new == value else stack.remap_slider(layer, kind, new)
+    return layer if new == value else stack.with_slider_value(layer, kind, new)
 
 
 def value_at(curve: Sequence[float], strength: float) -> float:

@@ -16,10 +16,10 @@ from viewer.state.view_state import Comparison, ViewState
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.widgets import (
     choice,
-    double_clicked,
-    elided,
-    grouped,
+    elide,
+    group_digits,
     icon_button,
+    is_double_clicked,
     label,
     right_edge,
     section,
@@ -52,7 +52,7 @@ class PanelInput:
         undos, redos: how many entries there are either way
         reveal: scroll to the focused layer
         snapshots: the original and what was kept
-        dial: which of `stack.DIALS` of the focused layer the arrow keys move
+        active_slider: which of `stack.SLIDERS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
         unrecorded: why there is nothing recorded to compare with, "" where there is
     """
@@ -64,7 +64,7 @@ class PanelInput:
     undos: int = 0
     redos: int = 0
     reveal: bool = False
-    dial: str = "strength"
+    active_slider: str = "strength"
     renaming: int | None = None
     snapshots: tuple[SnapshotCard, ...] = ()
     unrecorded: str = ""
@@ -111,7 +111,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     _begin_body(footer)
     state = layer_cards.heading(state, ui)
-    cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.dial, shown.renaming)
+    cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.active_slider, shown.renaming)
     drawn = layer_cards.draw(state, cards, ui)
     state, focus = drawn.state, drawn.focus
     actions += drawn.actions
@@ -155,9 +155,9 @@ def _end_body() -> None:
 def _title(shown: PanelInput, ui: UiContext) -> None:
     imgui.push_font(ui.fonts.bold, 0.0)
     room = imgui.get_content_region_avail().x
-    imgui.text(elided(shown.title, room))
+    imgui.text(elide(shown.title, room))
     imgui.pop_font()
-    small(f"{grouped(shown.count)} splats", PALETTE.dim)
+    small(f"{group_digits(shown.count)} splats", PALETTE.dim)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
 
 
@@ -181,7 +181,7 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     label("FOV", column)
     imgui.set_next_item_width(-1.0)
     changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
-    if double_clicked():
+    if is_double_clicked():
         changed, fov_y = True, ViewCamera.fov_y
     camera = replace(camera, fov_y=fov_y) if changed else camera  # unchanged, imgui still rounds to float32
     tip(f"Vertical field of view. Double-click: reset to {ViewCamera.fov_y:g}°")
@@ -224,7 +224,7 @@ def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext
         changed, times = imgui.slider_float(
             "##amplify", shown.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
         )
-        if double_clicked():
+        if is_double_clicked():
             changed, times = True, Comparison.amplify
         shown = replace(shown, amplify=float(round(times))) if changed else shown
         tip(f"Gain of the difference. Double-click: reset to × {Comparison.amplify:g}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from imgui_bundle import imgui
 
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.widgets import elided, menu, right_edge, section, tip, typed_name
+from viewer.ui.widgets import elide, menu, right_edge, section, tip, typed_name
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -73,7 +73,7 @@ def _card(index: int, card: SnapshotCard, wide: float, ui: UiContext, actions: l
         imgui.get_state_storage().set_bool(renaming, name is None)
         actions += [f"name_snapshot:{index}:{name}"] if name else []
     else:
-        imgui.text_disabled(elided(card.name, wide))
+        imgui.text_disabled(elide(card.name, wide))
     imgui.pop_font()
     imgui.end_group()
     imgui.pop_id()

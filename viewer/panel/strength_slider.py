@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from viewer.ui.context import PALETTE, Rgba, u32
-from viewer.ui.widgets import let_go, tip
+from viewer.ui.widgets import is_released, tip
 
 HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one types
 FINE = 0.1
@@ -57,7 +57,7 @@ def draw(
     """
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "typing")):
-        return _typed(label, value, width, most)
+        return _text_field(label, value, width, most)
     left, top = imgui.get_cursor_screen_pos()
     imgui.invisible_button(label, imgui.ImVec2(width, HEIGHT_PX * scale))
     hovered, held = imgui.is_item_hovered(), imgui.is_item_active()
@@ -68,12 +68,12 @@ def draw(
         if imgui.get_io().key_ctrl:
             start_typing(label)
             imgui.set_cursor_screen_pos(imgui.ImVec2(left, top))
-            return _typed(label, value, width, most)  # at once: what is typed next is not lost
+            return _text_field(label, value, width, most)  # at once: what is typed next is not lost
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
         value = DEFAULT if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
         _anchor(label, mouse, value)
-    elif held or let_go():  # a slow frame may hold the last move and the release
+    elif held or is_released():  # a slow frame may hold the last move and the release
         was_fine = storage.get_bool(_slot(label, "fine"))
         moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if was_fine else 1.0)
         value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
@@ -104,7 +104,7 @@ def _anchor(label: str, mouse: float, value: float) -> None:
     storage.set_bool(_slot(label, "fine"), imgui.get_io().key_shift)
 
 
-def _typed(label: str, value: float, width: float, most: float) -> float:
+def _text_field(label: str, value: float, width: float, most: float) -> float:
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "wants focus")):
         imgui.set_keyboard_focus_here()

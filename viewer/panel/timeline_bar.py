@@ -15,7 +15,7 @@ from viewer.state.playback import Player
 from viewer.state.view_state import Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import icon_button, let_go, tip
+from viewer.ui.widgets import icon_button, is_released, tip
 
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
 ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
@@ -100,7 +100,7 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
 def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext) -> None:
     gap = 4.0 * ui.scale
     imgui.begin_disabled(not timeline.keys)
-    easing = tl.before(timeline, frame).easing if timeline.keys else tl.EASINGS[0]
+    easing = tl.key_before(timeline, frame).easing if timeline.keys else tl.EASINGS[0]
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
@@ -145,7 +145,7 @@ def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: 
     if imgui.is_item_activated():
         storage.set_int(slot, -1 if under is None else under)
         actions.append(f"seek:{to if under is None else under}")
-    elif imgui.is_item_active() or let_go():  # a slow frame may hold move and release
+    elif imgui.is_item_active() or is_released():  # a slow frame may hold move and release
         held = storage.get_int(slot, -1)
         moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
         if held < 0 and to != frame:

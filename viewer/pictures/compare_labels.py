@@ -54,7 +54,7 @@ def labels(compare: Comparison, decibels: float, recorded: str = "", obstacle: s
     return Labels(line=line, notice=f"Against the original: {obstacle}" if obstacle else "")
 
 
-def labelled(image: Image, compare: Comparison, said: Labels) -> Pixels:
+def draw_labels(image: Image, compare: Comparison, said: Labels) -> Pixels:
     """A picture of `Comparer.image` for a file: with the divider and what is on which side."""
     pixels = to_pixels(image)
     if compare.mode == "off":

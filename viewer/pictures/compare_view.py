@@ -21,7 +21,7 @@ from viewer.gl.present import Presenter
 from viewer.render.engine import Engine, FrameTimings, drawn_size
 from viewer.render.renderers import Image
 from viewer.state import recordings
-from viewer.state.recordings import Recording
+from viewer.state.recordings import RecordingFile
 from viewer.state.view_state import ViewState
 
 from .compare_labels import Labels, column, labels
@@ -36,11 +36,13 @@ class Comparer:
         found: where the engine's edits were recorded, one for each
     """
 
-    def __init__(self, engine: Engine, ctx: moderngl.Context | None, found: Sequence[Recording] = ()) -> None:
+    def __init__(
+        self, engine: Engine, ctx: moderngl.Context | None, found: Sequence[RecordingFile] = ()
+    ) -> None:
         self.engine = engine
         self.psnr = math.nan
         """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
-        self.recordings = tuple(found) or (Recording(),) * len(engine.gdfs)
+        self.recordings = tuple(found) or (RecordingFile(),) * len(engine.gdfs)
         """Where the edits were recorded; one that turned out to be broken is none."""
         self._ctx = ctx
         self._other: Engine | None = None
@@ -101,7 +103,7 @@ class Comparer:
         """What to say over the last comparison, of `view`."""
         wished, found = view.compare.against, self.against(view)
         obstacle = recordings.obstacle(self.recordings) if wished != found else ""
-        recorded = recordings.told(view, self.engine.gdfs, self.recordings) if found == "recorded" else ""
+        recorded = recordings.describe(view, self.engine.gdfs, self.recordings) if found == "recorded" else ""
         return labels(view.compare, self.psnr, recorded, obstacle)
 
     def release(self) -> None:
@@ -113,7 +115,7 @@ class Comparer:
     def _second(self, view: ViewState) -> Engine:
         """What draws the other side of `view`."""
         if self._other is None or self._against != self.against(view):
-            gdfs = self._recorded() if self.against(view) == "recorded" else ()
+            gdfs = self._load_recorded() if self.against(view) == "recorded" else ()
             if self._other is not None:
                 self._other.release()
             self._against = self.against(view)  # reading a recording may have shown that it is none
@@ -121,23 +123,23 @@ class Comparer:
             self._other = Engine(self._ctx, self.engine.scene, gdfs, *ways)
         return self._other
 
-    def _recorded(self) -> tuple[Gdf, ...]:
+    def _load_recorded(self) -> tuple[Gdf, ...]:
         """The edits as they were recorded."""
         gdfs, read = [], []
         for gdf, recording in zip(self.engine.gdfs, self.recordings, strict=True):
             try:
-                gdfs.append(recordings.recorded(gdf, recording))
+                gdfs.append(recordings.load_recorded(gdf, recording))
                 read.append(recording)
             except ProgdfError as error:
                 gdfs.append(gdf)
-                read.append(Recording(reason=str(error)))
+                read.append(RecordingFile(reason=str(error)))
         self.recordings = tuple(read)
         return tuple(gdfs)
 
     def _beside(self, view: ViewState) -> ViewState:
         """What the other side of `view` shows."""
         recorded = self.against(view) == "recorded"
-        return recordings.within(view, self.recordings) if recorded else replace(view, layers=())
+        return recordings.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
 
     def _draw_split(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int

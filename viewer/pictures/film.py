@@ -79,7 +79,7 @@ def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
         path: a .gif file
         frames: from one end of the slider to the other. [H,W,3] each
     """
-    indexed = _indexed(frames)
+    indexed = _quantize(frames)
     shown = indexed + indexed[-2:0:-1]
     rests = {0, len(indexed) - 1}
     _save_gif(path, shown, [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))])
@@ -94,7 +94,7 @@ def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> 
     if path.suffix.lower() == ".mp4":
         _encode_mp4(path, frames, frames_per_second)
         return
-    indexed = _indexed(frames)
+    indexed = _quantize(frames)
     ends = [round(100 * (i + 1) / frames_per_second) for i in range(len(indexed))]
     hundredths = [end - start for start, end in zip([0, *ends], ends, strict=False)]
     _save_gif(path, indexed, [10 * max(2, each) for each in hundredths])
@@ -140,7 +140,7 @@ def check_sequence(folder: Path) -> None:
         raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; make it first")
 
 
-def _indexed(frames: Iterable[Pixels]) -> list[Image.Image]:
+def _quantize(frames: Iterable[Pixels]) -> list[Image.Image]:
     """Frames in one palette."""
     there = [Image.fromarray(frame) for frame in frames]
     few = there[:: max(1, len(there) // 4)]

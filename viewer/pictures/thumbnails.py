@@ -11,7 +11,7 @@ import numpy as np
 from progdf.errors import ProgdfError
 from viewer.camera.view_camera import ViewCamera
 from viewer.render.engine import Engine
-from viewer.state.snapshots import Snapshot, back_to
+from viewer.state.snapshots import SliderSnapshot, restore
 from viewer.state.view_state import Comparison, ViewState
 
 from .film import to_pixels
@@ -32,7 +32,7 @@ class Thumbnails:
         self._ctx, self._engine = ctx, engine
         self._made: dict[tuple[object, ViewCamera], moderngl.Texture] = {}
 
-    def bring(self, shown: Sequence[Snapshot], view: ViewState) -> tuple[tuple[int, ...], bool]:
+    def update(self, shown: Sequence[SliderSnapshot], view: ViewState) -> tuple[tuple[int, ...], bool]:
         """Texture names of the snapshots, 0 where one is not drawn yet, and whether any is missing.
 
         One is drawn a call, so that a session of many does not stop the hand.
@@ -42,7 +42,7 @@ class Thumbnails:
             self._made.pop(key).release()
         for i, key in enumerate(keys):
             if key not in self._made:
-                self._made[key] = self._drawn(i, shown[i], view)
+                self._made[key] = self._draw(i, shown[i], view)
                 break
         missing = any(key not in self._made for key in keys)
         return tuple(self._made[key].glo if key in self._made else 0 for key in keys), missing
@@ -52,8 +52,8 @@ class Thumbnails:
             texture.release()
         self._made.clear()
 
-    def _drawn(self, index: int, snapshot: Snapshot, view: ViewState) -> moderngl.Texture:
-        edited = replace(view, layers=()) if index == 0 else back_to(view, snapshot)
+    def _draw(self, index: int, snapshot: SliderSnapshot, view: ViewState) -> moderngl.Texture:
+        edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
         wanted = replace(edited, camera=snapshot.camera, compare=Comparison())
         try:
             pixels = to_pixels(self._engine.image(wanted, SIZE))
@@ -64,6 +64,6 @@ class Thumbnails:
         return texture
 
 
-def _key(index: int, snapshot: Snapshot) -> tuple[object, ViewCamera]:
-    """What decides the picture; the original has no edit, however its layers are dialled."""
+def _key(index: int, snapshot: SliderSnapshot) -> tuple[object, ViewCamera]:
+    """What decides the picture; the original has no edit, however its layers are active."""
     return (snapshot.edit if index else None), snapshot.camera

@@ -48,7 +48,7 @@ def frames(
         numbers: of the frames
     """
     for frame in numbers:
-        state = timeline.shown_at(shown, frame, view)
+        state = timeline.state_at(shown, frame, view)
         moving = timeline.camera_at(shown, frame) is not None
         camera = to_camera(state.camera, still.width, still.height) if moving else still
         yield film.to_pixels(engine.image(state, camera=camera))

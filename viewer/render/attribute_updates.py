@@ -1,6 +1,6 @@
 """Two ways to bring the attributes under a stack of layers to where they are drawn from, one interface.
 
-`CpuEditing` composes on the CPU and sends the changed rows: for any painter, exact, the reference.
+`CpuEditing` composes on the CPU and sends the changed rows: for any renderer, exact, the reference.
 `GpuEditing` leaves the work to the edit pass (gl/edit_pass.py); the CPU composes the means alone, which the
 depth order needs.
 """
@@ -22,14 +22,14 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 
 from .edit_sample import EditSample
-from .renderers import GlPainter, Painter
+from .renderers import GlRenderer, Renderer
 
 Stack = Sequence[tuple[int, Layer]]
 """Layers with the indices of their edits, the lowest first."""
 
 
 @dataclass(frozen=True)
-class Step:
+class UpdateCost:
     """What it took to bring the attributes from one stack to the next.
 
     Args:
@@ -55,7 +55,7 @@ class Editing(Protocol):
     def means(self) -> NDArray[np.float32]:
         """Centres under the last stack. [N,3]"""
 
-    def bring(self, stack: Stack, blend: str) -> Step:
+    def update(self, stack: Stack, blend: str) -> UpdateCost:
         """Make what is drawn the scene under `stack`.
 
         Raises:
@@ -63,17 +63,17 @@ class Editing(Protocol):
         """
 
     def gaussians(self, stack: Stack, blend: str) -> Gaussians:
-        """The scene under `stack`, by the CPU; written in place by the next call or `bring`."""
+        """The scene under `stack`, by the CPU; written in place by the next call or `update`."""
 
     def error(self, stack: Stack, blend: str) -> float:
         """How far what is drawn is from `progdf.compose`: see `EditSample.error`.
 
         Args:
-            stack, blend: those of the last `bring`
+            stack, blend: those of the last `update`
         """
 
     def release(self) -> None:
-        """Give back what lives in a context, but for the painter's."""
+        """Give back what lives in a context, but for the renderer's."""
 
 
 class CpuEditing:
@@ -81,23 +81,23 @@ class CpuEditing:
 
     where = "cpu"
 
-    def __init__(self, painter: Painter, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
-        self._painter = painter
+    def __init__(self, renderer: Renderer, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
+        self._renderer = renderer
         self._composer = Composer(scene, gdfs)
-        painter.upload(self._composer.gaussians)
+        renderer.upload(self._composer.gaussians)
 
     @property
     def means(self) -> NDArray[np.float32]:
         means: NDArray[np.float32] = self._composer.gaussians.means.numpy()
         return means
 
-    def bring(self, stack: Stack, blend: str) -> Step:
+    def update(self, stack: Stack, blend: str) -> UpdateCost:
         started = time.perf_counter()
         change = self._composer.update([layer for _, layer in stack], blend)
         composed = time.perf_counter()
-        self._painter.update(self._composer.gaussians, change.attributes, change.rows)
+        self._renderer.update(self._composer.gaussians, change.attributes, change.rows)
         uploaded = time.perf_counter()
-        return Step(
+        return UpdateCost(
             1e3 * (composed - started), 1e3 * (uploaded - composed), len(change.rows), change.means_moved
         )
 
@@ -121,12 +121,12 @@ class GpuEditing:
 
     where = "gpu"
 
-    def __init__(self, painter: GlPainter, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
-        self._painter, self._scene, self._gdfs = painter, scene, tuple(gdfs)
+    def __init__(self, renderer: GlRenderer, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
+        self._renderer, self._scene, self._gdfs = renderer, scene, tuple(gdfs)
         self._movers = tuple(_means_alone(gdf) for gdf in gdfs)
         self._means = Composer(scene, self._movers)
-        painter.upload(scene)
-        self._pass = painter.edit_pass(scene, gdfs)
+        renderer.upload(scene)
+        self._pass = renderer.edit_pass(scene, gdfs)
         self._effects = Effects()
         self._composer: Composer | None = None  # made when somebody asks for the Gaussians
         self._sample: EditSample | None = None  # made when somebody asks for the error
@@ -136,7 +136,7 @@ class GpuEditing:
         means: NDArray[np.float32] = self._means.gaussians.means.numpy()
         return means
 
-    def bring(self, stack: Stack, blend: str) -> Step:
+    def update(self, stack: Stack, blend: str) -> UpdateCost:
         started = time.perf_counter()
         active = [(edit, layer) for edit, layer in stack if layer.active]
         moved = self._means.update([replace(layer, gdf=self._movers[edit]) for edit, layer in stack], blend)
@@ -144,10 +144,10 @@ class GpuEditing:
         changed = changed_edits(self._effects, effects)
         composed = time.perf_counter()
         rows = self._pass.run(active, blend, changed) if changed else ()
-        self._painter.finish()
+        self._renderer.finish()
         self._effects = effects
         done = time.perf_counter()
-        return Step(1e3 * (composed - started), 1e3 * (done - composed), len(rows), moved.means_moved)
+        return UpdateCost(1e3 * (composed - started), 1e3 * (done - composed), len(rows), moved.means_moved)
 
     def gaussians(self, stack: Stack, blend: str) -> Gaussians:
         self._composer = self._composer or Composer(self._scene, self._gdfs)

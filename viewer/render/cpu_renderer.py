@@ -20,7 +20,7 @@ from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.present import Presenter
 from viewer.gl.scene_textures import row_runs
 
-from .dirty_rectangles import area, boxes
+from .dirty_rectangles import area, dirty_rectangles
 
 Image = NDArray[np.float32]
 
@@ -55,7 +55,7 @@ class _Kept:
         )
 
 
-class CpuPainter:
+class CpuRenderer:
     """Draws with `progdf.rasterize`, about four times faster than OpenGL in software.
 
     Between two pictures of one camera it draws only boxes around what the changed Gaussians touched before
@@ -77,13 +77,13 @@ class CpuPainter:
         self._lent = False  # whether the picture's array is in other hands
         self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
-        self._tints: Image | None = None  # rgb and its share, 0..1; None is no tint. [N,4]
+        self._highlights: Image | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
 
     def upload(self, scene: Gaussians) -> None:
-        """Take a whole scene. The painter's copies are what was drawn, when `scene` is written in place."""
+        """Take a whole scene. The renderer's copies are what was drawn, when `scene` is written in place."""
         self._means, self._quats = _copy(scene.means), _copy(scene.quats)
         self._scales, self._opacities = _exp(scene.log_scales), _sigmoid(scene.logit_opacities)
-        self._scene, self._tints = scene, None
+        self._scene, self._highlights = scene, None
         self._sh = scene.sh
         self._degree = min(scene.sh_degree, 3)
         self._kept = self._cells = self._last = None
@@ -93,8 +93,8 @@ class CpuPainter:
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         self._scene, names = scene, tuple(attributes)
-        dyed = self._tints is not None and any(name in SH for name in names)
-        names = tuple(dict.fromkeys((*names, *SH))) if dyed else names
+        highlighted = self._highlights is not None and any(name in SH for name in names)
+        names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
         if len(rows) > MANY:
             self._cells = None
         cells = self._cells
@@ -104,21 +104,21 @@ class CpuPainter:
             part = slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW)
             for name in names:
                 self._write(scene, name, part)
-            if dyed:
-                self._dye(part)
+            if highlighted:
+                self._apply_highlight(part)
         if any(name not in SH for name in names):
             self._last = None
             if cells is not None and len(rows):
                 cells |= self._where(rows)
 
-    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
-        """See `Painter.tint`."""
-        if self._tints is None:
-            self._tints = np.zeros((len(self._means), 4), np.float32)
-        self._tints[rows] = tints.astype(np.float32) / 255.0
+    def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
+        """See `Renderer.highlight`."""
+        if self._highlights is None:
+            self._highlights = np.zeros((len(self._means), 4), np.float32)
+        self._highlights[rows] = highlights.astype(np.float32) / 255.0
         self.update(self._scene, SH, rows)
-        if not self._tints[:, 3].any():
-            self._tints = None
+        if not self._highlights[:, 3].any():
+            self._highlights = None
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
         """Make the picture; `order` is not used, the rasteriser sorts by itself. Gives the share drawn."""
@@ -127,13 +127,13 @@ class CpuPainter:
         kept = self._kept if self._kept is not None and self._kept.shows(camera, background) else None
         if kept is not None and self._cells is not None:
             worth = _FLOOR + int(_PIXELS_PER_GAUSSIAN * len(self._means))
-            crops = boxes(self._cells, (camera.width, camera.height), worth)
+            crops = dirty_rectangles(self._cells, (camera.width, camera.height), worth)
         share = area(crops) / whole
         if kept is None or share > WORTH_DRAWING_APART:
-            image, share = self._drawn(camera, background, None), 1.0
+            image, share = self._draw(camera, background, None), 1.0
             self._kept, self._stale, self._lent = _Kept(image, camera, background), None, False
         elif crops:
-            parts = [self._drawn(camera, background, crop) for crop in crops]
+            parts = [self._draw(camera, background, crop) for crop in crops]
             if self._lent:
                 kept, self._lent = replace(kept, image=kept.image.copy()), False
             for (x0, y0, x1, y1), part in zip(crops, parts, strict=True):
@@ -180,7 +180,7 @@ class CpuPainter:
         if self._presenter is not None:
             self._presenter.release()
 
-    def _drawn(self, camera: Camera, background: Vec3, crop: Crop | None) -> Image:
+    def _draw(self, camera: Camera, background: Vec3, crop: Crop | None) -> Image:
         with torch.no_grad():
             image, _, _ = rasterize(
                 torch.from_numpy(self._means),
@@ -229,12 +229,12 @@ class CpuPainter:
             case "shN":
                 self._sh.numpy()[part, 1:] = scene.shN[part].numpy()
 
-    def _dye(self, part: slice) -> None:
-        """Mix the tints into colours that were just written: into all bands, as colour is linear in them."""
-        assert self._tints is not None, "nothing to dye with"
-        sh, share = self._sh.numpy()[part], self._tints[part, 3:]
+    def _apply_highlight(self, part: slice) -> None:
+        """Mix the highlights into colours that were just written: all bands, as colour is linear in them."""
+        assert self._highlights is not None, "nothing to highlight with"
+        sh, share = self._sh.numpy()[part], self._highlights[part, 3:]
         sh *= 1.0 - share[:, :, None]
-        sh[:, 0] += share * (self._tints[part, :3] - 0.5) / C0
+        sh[:, 0] += share * (self._highlights[part, :3] - 0.5) / C0
 
     def _picture(self) -> _Kept:
         if self._kept is None:

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from progdf.rasterize import Crop
 from progdf.rasterize.pixel_cells import CELL
 
-MOST_BOXES = 6
+MOST_RECTANGLES = 6
 
 
-def boxes(cells: NDArray[np.bool_], size: tuple[int, int], worth: int) -> list[Crop]:
+def dirty_rectangles(cells: NDArray[np.bool_], size: tuple[int, int], worth: int) -> list[Crop]:
     """Boxes that do not overlap and hold all marked cells.
 
     Args:
@@ -23,9 +23,9 @@ def boxes(cells: NDArray[np.bool_], size: tuple[int, int], worth: int) -> list[C
         x0, y0, x1, y1 in pixels, one past the last; at most `MOST_BOXES`
     """
     least = worth / CELL**2
-    found = _trimmed(cells, (0, 0, cells.shape[1], cells.shape[0]))
+    found = _trim(cells, (0, 0, cells.shape[1], cells.shape[0]))
     whole = [found] if found else []
-    while len(whole) < MOST_BOXES:
+    while len(whole) < MOST_RECTANGLES:
         cuts = [(_cut(cells, box), i) for i, box in enumerate(whole)]
         (saved, parts), at = max(cuts, key=lambda cut: cut[0][0], default=((0, ()), 0))
         if not parts or saved < least:
@@ -52,14 +52,14 @@ def _cut(cells: NDArray[np.bool_], box: Crop) -> tuple[int, tuple[Crop, ...]]:
             halves = (
                 ((x0, y0, at, y1), (at, y0, x1, y1)) if axis == 0 else ((x0, y0, x1, at), (x0, at, x1, y1))
             )
-            parts = tuple(half for half in (_trimmed(cells, half) for half in halves) if half)
+            parts = tuple(half for half in (_trim(cells, half) for half in halves) if half)
             saved = area([box]) - area(list(parts))
             if saved > best[0]:
                 best = saved, parts
     return best
 
 
-def _trimmed(cells: NDArray[np.bool_], box: Crop) -> Crop | None:
+def _trim(cells: NDArray[np.bool_], box: Crop) -> Crop | None:
     """The least box around the marked cells in `box`."""
     x0, y0, x1, y1 = (int(value) for value in box)
     part = cells[y0:y1, x0:x1]

@@ -19,12 +19,12 @@ COARSE = 2
 
 
 @dataclass(frozen=True)
-class Draft:
+class DynamicResolution:
     """How pictures are drawn while the hand is on something, and what is known of their cost.
 
     Args:
         pixels: of the window that one pixel drawn covers, each way: 1 or `COARSE`
-        rest_at: when to draw in full, seconds on the stage's clock; None while the picture is in full
+        rest_at: when to draw in full, seconds on the main view's clock; None while the picture is in full
         camera_ms: what the last two whole pictures in full took; one alone may have waited for something
         slider_ms: the same of the last two steps of a slider, within this grip
     """
@@ -35,15 +35,17 @@ class Draft:
     slider_ms: tuple[float, ...] = ()
 
 
-def begun(draft: Draft, mode: str, held: bool, turned: bool, slid: bool, now: float) -> Draft:
+def before_draw(
+    draft: DynamicResolution, mode: str, held: bool, turned: bool, slid: bool, now: float
+) -> DynamicResolution:
     """Before a picture is drawn: how it shall be drawn.
 
     Args:
-        mode: of `DRAFT_MODES`
+        mode: of `RESOLUTION_MODES`
         held: whether a hand is on something, so that more will follow
         turned: whether the camera or the picture's size is another than in the last frame
         slid: whether what is drawn is another
-        now: seconds on the stage's clock
+        now: seconds on the main view's clock
     """
     draft = draft if held else replace(draft, slider_ms=())
     full = replace(draft, pixels=1, rest_at=None)
@@ -55,7 +57,7 @@ def begun(draft: Draft, mode: str, held: bool, turned: bool, slid: bool, now: fl
     return full if draft.rest_at is None or now >= draft.rest_at else draft
 
 
-def drawn(draft: Draft, timings: FrameTimings, turned: bool) -> Draft:
+def after_draw(draft: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
     """After a picture was drawn: what it took. A coarse one tells nothing of a full one."""
     if draft.pixels > 1:
         return draft
@@ -68,6 +70,6 @@ def _slow(pictures_ms: tuple[float, ...]) -> bool:
     return len(pictures_ms) == 2 and min(pictures_ms) > SLOW_MS
 
 
-def patience(draft: Draft, now: float) -> float | None:
+def next_frame_delay(draft: DynamicResolution, now: float) -> float | None:
     """Seconds until the picture has to be drawn in full; None where it is."""
     return None if draft.rest_at is None else max(draft.rest_at - now, 0.0)

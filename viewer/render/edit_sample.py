@@ -40,7 +40,7 @@ class EditSample:
         self._scene = scene[torch.from_numpy(self._rows)]
         self._chosen = [torch.from_numpy(np.flatnonzero(np.isin(own, self._rows))) for own in members]
         pairs = zip(gdfs, self._chosen, strict=True)
-        self._gdfs = [_cut(gdf, chosen, self._rows, self._scene) for gdf, chosen in pairs]
+        self._gdfs = [_select_members(gdf, chosen, self._rows, self._scene) for gdf, chosen in pairs]
 
     def error(self, edit_pass: EditPass, stack: Sequence[tuple[int, Layer]], blend: str) -> float:
         """The largest difference of a raw number from `compose_layers`, relative where that is larger than 1.
@@ -79,7 +79,7 @@ def difference(found: NDArray[np.float32], wanted: NDArray[np.float32]) -> float
     return float(apart.max(initial=0.0))
 
 
-def _cut(gdf: Gdf, chosen: Tensor, rows: NDArray[np.int64], scene: Gaussians) -> Gdf:
+def _select_members(gdf: Gdf, chosen: Tensor, rows: NDArray[np.int64], scene: Gaussians) -> Gdf:
     """The edit of the sample: only its `chosen` members, counted within `rows`."""
     attributes = {
         name: replace(bases, full=bases.full[chosen], rest=bases.rest[:, chosen])

@@ -23,16 +23,16 @@ from progdf.gdf.file import Gdf
 from progdf.scene.bounds import near_plane
 from viewer.camera.view_camera import bounds_of, to_camera
 from viewer.gl.edit_pass import EditPassError
-from viewer.state.layers import shown
+from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
 
 from .attribute_updates import CpuEditing, Editing, GpuEditing, Stack
-from .cpu_renderer import CpuPainter
+from .cpu_renderer import CpuRenderer
 from .depth_sort import back_to_front
 from .headless import is_software
-from .highlight import Tint, tints
-from .renderers import GlPainter, Image, Painter
+from .highlight import Highlight, highlight_colors
+from .renderers import GlRenderer, Image, Renderer
 
 DRAWS = ("auto", "gl", "cpu")
 EDIT_PASSES = ("auto", "gpu", "cpu")
@@ -83,7 +83,7 @@ class EditsBy:
     obstacle: str = ""
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """In words that fit after "edited by"."""
         return f"CPU: {self.obstacle}" if self.where == "cpu" else f"GPU ±{self.error:.1g}"
 
@@ -105,7 +105,7 @@ class _Picture:
     viewmat: bytes
     K: bytes
     size: tuple[int, int]
-    tint: Tint | None = None
+    highlight: Highlight | None = None
 
 
 class Engine:
@@ -149,20 +149,22 @@ class Engine:
         self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
         self._ordered_for: bytes | None = None
         self._picture: _Picture | None = None
-        self.tint: Tint | None = None
+        self.highlight: Highlight | None = None
         """What `draw` shows over the members of an edit; `image` never does."""
-        self._tinted: tuple[Tint, NDArray[np.uint8]] | None = None  # and the tints of its members
+        self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = (
+            None  # and the highlights of its members
+        )
         if edit_pass == "gpu" and self.draws_with == "cpu":
             raise ProgdfError("the CPU draws here, so the GPU cannot edit; add --draw gl to --edit-pass gpu")
         self._edit_obstacle = ""
         self._edit_error: float | None = None
         wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))
-        self._painter, self._editing = self._made(wants_pass and self.draws_with == "gl")
+        self._renderer, self._editing = self._create(wants_pass and self.draws_with == "gl")
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
-        wanted = self._wanted(view, camera or to_camera(view.camera, *size))
-        return replace(wanted, tint=self.tint) != self._picture
+        wanted = self._describe_picture(view, camera or to_camera(view.camera, *size))
+        return replace(wanted, highlight=self.highlight) != self._picture
 
     def draw(
         self,
@@ -174,13 +176,15 @@ class Engine:
         """Bring the picture up to date and show it in the lower left `size` pixels of `framebuffer`.
 
         Args:
-            pixels: of the framebuffer that one pixel of the picture fills, each way (see draft.py)
+            pixels: of the framebuffer that one pixel of the picture fills, each way
 
         Raises:
             ProgdfError: a layer of `view` means nothing; the last picture stays.
         """
-        self.timings = self._bring(view, to_camera(view.camera, *drawn_size(size, pixels)), self.tint)
-        self._painter.show(framebuffer, size)
+        self.timings = self._update_picture(
+            view, to_camera(view.camera, *drawn_size(size, pixels)), self.highlight
+        )
+        self._renderer.show(framebuffer, size)
         return self.timings
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
@@ -197,8 +201,8 @@ class Engine:
         Raises:
             ProgdfError: a layer of `view` means nothing.
         """
-        self.timings = self._bring(view, camera or to_camera(view.camera, *size))
-        return self._painter.pixels()
+        self.timings = self._update_picture(view, camera or to_camera(view.camera, *size))
+        return self._renderer.pixels()
 
     def gaussians(self, view: ViewState) -> Gaussians:
         """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
@@ -226,29 +230,29 @@ class Engine:
     def forget(self) -> None:
         """Draw the next picture as a whole, though only a part of the last one has changed."""
         self._picture = None
-        self._painter.forget()
+        self._renderer.forget()
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
         self._editing.release()
-        self._painter.release()
+        self._renderer.release()
 
-    def _made(self, wants_pass: bool) -> tuple[Painter, Editing]:
-        """The painter with the scene in it, and what edits it there."""
+    def _create(self, wants_pass: bool) -> tuple[Renderer, Editing]:
+        """The renderer with the scene in it, and what edits it there."""
         if self.draws_with == "cpu" or self.ctx is None:
-            painter: Painter = CpuPainter(self.ctx, self.near)
-            return painter, CpuEditing(painter, self.scene, self.gdfs)
+            renderer: Renderer = CpuRenderer(self.ctx, self.near)
+            return renderer, CpuEditing(renderer, self.scene, self.gdfs)
         if wants_pass:
-            by_gl = GlPainter(self.ctx, editable=True)
+            by_gl = GlRenderer(self.ctx, editable=True)
             try:
                 return by_gl, GpuEditing(by_gl, self.scene, self.gdfs)
             except EditPassError as error:
                 by_gl.release()
                 self._edit_obstacle = str(error)
-        painter = GlPainter(self.ctx)
-        return painter, CpuEditing(painter, self.scene, self.gdfs)
+        renderer = GlRenderer(self.ctx)
+        return renderer, CpuEditing(renderer, self.scene, self.gdfs)
 
-    def _wanted(self, view: ViewState, camera: Camera) -> _Picture:
+    def _describe_picture(self, view: ViewState, camera: Camera) -> _Picture:
         return _Picture(
             _edits(view),
             view.background,
@@ -257,28 +261,30 @@ class Engine:
             (camera.width, camera.height),
         )
 
-    def _bring(self, view: ViewState, camera: Camera, tint: Tint | None = None) -> FrameTimings:
+    def _update_picture(
+        self, view: ViewState, camera: Camera, highlight: Highlight | None = None
+    ) -> FrameTimings:
         """Do what lies between the last picture and this one."""
-        wanted = replace(self._wanted(view, camera), tint=tint)
+        wanted = replace(self._describe_picture(view, camera), highlight=highlight)
         if wanted == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
-        dye_ms = self._dye(tint)
+        highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
-        if self._painter.wants_order and self._ordered_for != wanted.viewmat:
+        if self._renderer.wants_order and self._ordered_for != wanted.viewmat:
             self._order = back_to_front(self._editing.means, camera, self.near)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
-        share = self._painter.draw(camera, view.background, self._order)
+        share = self._renderer.draw(camera, view.background, self._order)
         drawn_at = time.perf_counter()
         self._picture = wanted
         return FrameTimings(
             compose_ms,
-            upload_ms + dye_ms,
+            upload_ms + highlight_ms,
             1e3 * (sorted_at - started),
             1e3 * (drawn_at - sorted_at),
             changed,
-            len(self._order) if self._painter.wants_order else len(self.scene),
+            len(self._order) if self._renderer.wants_order else len(self.scene),
             share,
         )
 
@@ -289,27 +295,27 @@ class Engine:
         started = time.perf_counter()
         stack = self._stack(edits)
         unpacked_ms = 1e3 * (time.perf_counter() - started)
-        step = self._editing.bring(*stack)
+        step = self._editing.update(*stack)
         self._edits, self._picture, self._edit_error = edits, None, None
         if step.moved:
             self._ordered_for = None
         return unpacked_ms + step.compose_ms, step.upload_ms, step.changed
 
-    def _dye(self, tint: Tint | None) -> float:
-        """Bring the tints up to date, those alone that are others than before; gives the ms it took."""
-        if tint == (self._tinted and self._tinted[0]):
+    def _apply_highlight(self, highlight: Highlight | None) -> float:
+        """Bring the highlights up to date, those alone that are others than before; gives the ms it took."""
+        if highlight == (self._highlighted and self._highlighted[0]):
             return 0.0
         started = time.perf_counter()
-        if self._tinted is not None and (tint is None or tint.gdf != self._tinted[0].gdf):
-            last, shown = self._tinted
-            self._tinted = None
-            self._painter.tint(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
-        if tint is not None:
-            members = self._gdf(tint.gdf).region.members.numpy()
-            new = tints(tint, self.gdfs)
-            others = slice(None) if self._tinted is None else (new != self._tinted[1]).any(1)
-            self._tinted = tint, new
-            self._painter.tint(members[others], new[others])
+        if self._highlighted is not None and (highlight is None or highlight.gdf != self._highlighted[0].gdf):
+            last, shown = self._highlighted
+            self._highlighted = None
+            self._renderer.highlight(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
+        if highlight is not None:
+            members = self._gdf(highlight.gdf).region.members.numpy()
+            new = highlight_colors(highlight, self.gdfs)
+            others = slice(None) if self._highlighted is None else (new != self._highlighted[1]).any(1)
+            self._highlighted = highlight, new
+            self._renderer.highlight(members[others], new[others])
         return 1e3 * (time.perf_counter() - started)
 
     def _stack(self, edits: _Edits) -> tuple[Stack, str]:
@@ -332,5 +338,5 @@ def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
 
 def _edits(view: ViewState) -> _Edits:
     """Layers that are not shown or at strength 0 do not count, so that touching them does no work."""
-    layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in shown(view) if l.strength != 0.0)
+    layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in visible_layers(view) if l.strength != 0.0)
     return _Edits(layers, view.blend) if layers else _Edits()

@@ -26,7 +26,7 @@ Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Tint:
+class Highlight:
     """What to show of the members of one edit.
 
     Args:
@@ -40,7 +40,7 @@ class Tint:
     others: tuple[int, ...] = ()
 
 
-def wanted(view: ViewState, focus: int | None, overlap: int | None = None) -> Tint | None:
+def requested_highlight(view: ViewState, focus: int | None, overlap: int | None = None) -> Highlight | None:
     """What `view` shows: an overlap where one is asked for, or weights while the brush is out.
 
     Not in a comparison, and no weights of a hidden layer.
@@ -51,15 +51,15 @@ def wanted(view: ViewState, focus: int | None, overlap: int | None = None) -> Ti
     """
     if overlap is not None and overlap < len(view.layers) and view.compare.mode == "off":
         gdf = view.layers[overlap].gdf
-        return Tint(gdf, others=tuple(layer.gdf for layer in view.layers if layer.gdf != gdf))
+        return Highlight(gdf, others=tuple(layer.gdf for layer in view.layers if layer.gdf != gdf))
     asked = view.brush.active and view.brush.weights and view.compare.mode == "off"
     if not asked or focus is None or focus >= len(view.layers):
         return None
     layer = view.layers[focus]
-    return Tint(layer.gdf, layer.paint) if layer in stack.shown(view) else None
+    return Highlight(layer.gdf, layer.paint) if layer in stack.visible_layers(view) else None
 
 
-def colours(weights: NDArray[np.float32]) -> Bytes:
+def ramp_colors(weights: NDArray[np.float32]) -> Bytes:
     """The ramp at weights 0..1: rgb, 0..255. [M] -> [M,3]"""
     at = [weight for weight, _ in RAMP]
     channels = zip(*(rgba(rgb) for _, rgb in RAMP), strict=True)
@@ -73,22 +73,22 @@ def rgba(colour: int) -> tuple[float, float, float, float]:
     return red / 255, green / 255, blue / 255, 1.0
 
 
-def tints(tint: Tint, gdfs: Sequence[Gdf]) -> Bytes:
+def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf]) -> Bytes:
     """What is drawn over each member: rgb and its share, 0..255. [M,4]
 
     Args:
-        gdfs: the edits that `tint` counts
+        gdfs: the edits that `highlight` counts
 
     Raises:
         ProgdfError: see `paint.decoded`.
     """
-    members = gdfs[tint.gdf].region.members
+    members = gdfs[highlight.gdf].region.members
     shares = np.full(len(members), round(255 * SHARE), np.uint8)
-    if tint.others:
-        others = np.concatenate([gdfs[i].region.members.numpy() for i in tint.others])
+    if highlight.others:
+        others = np.concatenate([gdfs[i].region.members.numpy() for i in highlight.others])
         shares[~np.isin(members.numpy(), others)] = 0
         over = np.tile(np.round(255.0 * np.array(rgba(SHARED)[:3])), (len(members), 1)).astype(np.uint8)
     else:
-        found = paint.decoded(tint.paint, len(members))
-        over = colours(np.ones(len(members), np.float32) if found is None else found.numpy())
+        found = paint.decode(highlight.paint, len(members))
+        over = ramp_colors(np.ones(len(members), np.float32) if found is None else found.numpy())
     return np.concatenate([over, shares[:, None]], axis=1)

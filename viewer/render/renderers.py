@@ -1,4 +1,4 @@
-"""Two ways to draw a scene, one interface: OpenGL, and the CPU rasteriser (cpu_painter.py)."""
+"""Two ways to draw a scene, one interface: OpenGL, and the CPU rasteriser (cpu_renderer.py)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Image = NDArray[np.float32]
 T = TypeVar("T")
 
 
-class Painter(Protocol):
+class Renderer(Protocol):
     """Keeps a scene ready for drawing and the last picture of it."""
 
     wants_order: bool
@@ -33,11 +33,11 @@ class Painter(Protocol):
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """Take the changed attributes of the changed rows (sorted)."""
 
-    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
+    def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """Draw Gaussians (sorted) in other colours from now on, whatever becomes of their own.
 
         Args:
-            tints: rgb and the share that it takes of a Gaussian's colour, 0..255; 0 takes none. [R,4]
+            highlights: rgb and the share that it takes of a Gaussian's colour, 0..255; 0 takes none. [R,4]
         """
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
@@ -63,7 +63,7 @@ class Painter(Protocol):
         """Give back what it holds."""
 
 
-class GlPainter:
+class GlRenderer:
     """Draws with OpenGL (see `SplatRenderer`).
 
     Args:
@@ -99,8 +99,8 @@ class GlPainter:
         self._renderer.update(scene, attributes, rows)
         self._ctx.finish()
 
-    def tint(self, rows: NDArray[np.int64], tints: NDArray[np.uint8]) -> None:
-        self._renderer.tint(rows, tints)
+    def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
+        self._renderer.highlight(rows, highlights)
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
         self._renderer.set_order(order)
@@ -112,19 +112,19 @@ class GlPainter:
         pass  # as it does every time
 
     def pixels(self) -> Image:
-        picture = _drawn(self._picture)
+        picture = _require_picture(self._picture)
         rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
     def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
-        self._presenter.show(_drawn(self._picture), framebuffer, size)
+        self._presenter.show(_require_picture(self._picture), framebuffer, size)
 
     def release(self) -> None:
         self._presenter.release()
         self._renderer.release()
 
 
-def _drawn(thing: T | None) -> T:
+def _require_picture(thing: T | None) -> T:
     if thing is None:
         raise ValueError("there is no picture yet; draw first")
     return thing

@@ -15,13 +15,13 @@ AGAINST = ("original", "recorded")
 MOST_AMPLIFIED = 64.0
 
 
-def switched(view: ViewState, mode: str) -> ViewState:
+def toggle_mode(view: ViewState, mode: str) -> ViewState:
     """`mode` on, or off where it was on."""
     mode = "off" if view.compare.mode == mode else mode
     return replace(view, compare=replace(view.compare, mode=mode))
 
 
-def turned(view: ViewState) -> ViewState:
+def toggle_against(view: ViewState) -> ViewState:
     """Against the recording instead of the original, or back; where nothing is compared, side by side."""
     compare = view.compare
     if compare.mode == "off":

@@ -21,7 +21,7 @@ class Edit:
 
 
 @dataclass(frozen=True)
-class Step:
+class HistoryEntry:
     """What one entry brings back.
 
     Args:
@@ -37,9 +37,9 @@ class Step:
 class History:
     """Entries before and after the present one."""
 
-    present: Step
-    past: tuple[Step, ...] = ()
-    future: tuple[Step, ...] = ()
+    present: HistoryEntry
+    past: tuple[HistoryEntry, ...] = ()
+    future: tuple[HistoryEntry, ...] = ()
 
 
 def edit_of(state: ViewState) -> Edit:
@@ -48,7 +48,7 @@ def edit_of(state: ViewState) -> Edit:
 
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
     """A history whose present is `state` with these snapshots, and that has nothing to undo."""
-    return History(Step(edit_of(state), snapshots))
+    return History(HistoryEntry(edit_of(state), snapshots))
 
 
 def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
@@ -56,13 +56,13 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
 
     A gesture that ends where it began leaves no entry.
     """
-    step = Step(edit_of(state), snapshots)
+    step = HistoryEntry(edit_of(state), snapshots)
     if step == history.present:
         return history
     return History(step, (*history.past, history.present)[-LONGEST:])
 
 
-def followed(history: History, before: ViewState, after: ViewState) -> History:
+def follow_playhead(history: History, before: ViewState, after: ViewState) -> History:
     """The playhead has moved strengths: no entry, as nobody edited them; gestures under way stay such."""
     if after.layers == before.layers:
         return history
@@ -89,7 +89,7 @@ def redo(history: History) -> History:
     return History(ahead, (*history.past, history.present), tuple(future))
 
 
-def restored(state: ViewState, edit: Edit) -> ViewState:
+def apply_edit(state: ViewState, edit: Edit) -> ViewState:
     """`state` edited as in `edit`, seen from where it is."""
     return replace(
         state, layers=edit.layers, blend=edit.blend, overshoot=edit.overshoot, timeline=edit.timeline

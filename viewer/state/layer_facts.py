@@ -12,7 +12,7 @@ from progdf.compose.layers import KINDS
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.sh import sh0_to_rgb
-from viewer.camera.view_camera import Bounds, Fit, bounds_of, fit, unmoved
+from viewer.camera.view_camera import Bounds, Fit, bounds_of, fit, keep_camera
 
 from .change_curve import Curve, curve_of, flat
 
@@ -45,7 +45,7 @@ class LayerRow:
     kinds: frozenset[str] = frozenset(KINDS.values())
     curve: Curve = flat
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
-    fit: Fit = unmoved
+    fit: Fit = keep_camera
 
 
 def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:

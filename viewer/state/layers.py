@@ -13,24 +13,24 @@ from .view_state import LayerState, ViewState
 OVERSHOOT = 1.2
 """How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
 
-DIALS = ("strength", "geometry", "opacity", "colour")
+SLIDERS = ("strength", "geometry", "opacity", "colour")
 """What the arrow keys move: the strength, or a gain."""
 
 LONGEST_NAME = 60
 
 
-def shown(view: ViewState) -> tuple[LayerState, ...]:
+def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
     """The layers that take part, in their order: the soloed ones where there are any, else the enabled."""
     alone = tuple(layer for layer in view.layers if layer.solo)
     return alone or tuple(layer for layer in view.layers if layer.enabled)
 
 
-def most(view: ViewState) -> float:
+def largest_strength(view: ViewState) -> float:
     """The upper end of the sliders."""
     return OVERSHOOT if view.overshoot else 1.0
 
 
-def changed(view: ViewState, index: int, change: Callable[[LayerState], LayerState]) -> ViewState:
+def change_layer(view: ViewState, index: int, change: Callable[[LayerState], LayerState]) -> ViewState:
     """`view` with one layer changed; as it was where there is no such layer."""
     if not 0 <= index < len(view.layers):
         return view
@@ -39,34 +39,36 @@ def changed(view: ViewState, index: int, change: Callable[[LayerState], LayerSta
     return replace(view, layers=tuple(layers))
 
 
-def remap_slider(layer: LayerState, dial: str, value: float, upper: float = 1.0) -> LayerState:
+def with_slider_value(layer: LayerState, slider: str, value: float, upper: float = 1.0) -> LayerState:
     """The layer with its strength or a gain at `value`, held to 0..1 (a strength to 0..`upper`).
 
     A locked layer stays as it is.
     """
     if layer.locked:
         return layer
-    if dial == "strength":
+    if slider == "strength":
         return replace(layer, strength=min(upper, max(0.0, value)))
-    return replace(layer, gains=replace(layer.gains, **{dial: min(1.0, max(0.0, value))}))
+    return replace(layer, gains=replace(layer.gains, **{slider: min(1.0, max(0.0, value))}))
 
 
-def dial_value(layer: LayerState, dial: str) -> float:
-    """Where one of `DIALS` stands."""
-    return layer.strength if dial == "strength" else float(getattr(layer.gains, dial))
+def slider_value(layer: LayerState, slider: str) -> float:
+    """Where one of `SLIDERS` stands."""
+    return layer.strength if slider == "strength" else float(getattr(layer.gains, slider))
 
 
-def nudged(view: ViewState, index: int, dial: str, by: float) -> ViewState:
-    """One layer's dial a step further."""
+def nudge(view: ViewState, index: int, slider: str, by: float) -> ViewState:
+    """One layer's slider a step further."""
 
     def further(layer: LayerState) -> LayerState:
         # rounded, so that steps forth and back end on the number they began with
-        return remap_slider(layer, dial, round(dial_value(layer, dial) + by, 6), most(view))
+        return with_slider_value(
+            layer, slider, round(slider_value(layer, slider) + by, 6), largest_strength(view)
+        )
 
-    return changed(view, index, further)
+    return change_layer(view, index, further)
 
 
-def moved(view: ViewState, index: int, to: int) -> ViewState:
+def move_layer(view: ViewState, index: int, to: int) -> ViewState:
     """The layer at `index` taken out and put in at `to`; the ends of the stack stop it."""
     if not 0 <= index < len(view.layers):
         return view
@@ -75,13 +77,13 @@ def moved(view: ViewState, index: int, to: int) -> ViewState:
     return replace(view, layers=tuple(layers))
 
 
-def renamed(view: ViewState, index: int, text: str) -> ViewState:
+def rename_layer(view: ViewState, index: int, text: str) -> ViewState:
     """The layer under another name, on one line; a name that is taken gets a number; none changes nothing."""
     name = " ".join(text.split())[:LONGEST_NAME]
     if not name:
         return view
     free = free_name(replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :])), name)
-    return changed(view, index, lambda layer: replace(layer, name=free))
+    return change_layer(view, index, lambda layer: replace(layer, name=free))
 
 
 def free_name(view: ViewState, name: str) -> str:
@@ -92,27 +94,27 @@ def free_name(view: ViewState, name: str) -> str:
     return free
 
 
-def added(view: ViewState, gdf: int, name: str) -> ViewState:
+def add_layer(view: ViewState, gdf: int, name: str) -> ViewState:
     """An edit of its own on top of the others, at full strength, so that one sees what came."""
     layer = LayerState(gdf, free_name(view, name), strength=1.0)
     return replace(view, layers=(*view.layers, layer))
 
 
-def removed(view: ViewState, index: int) -> ViewState:
+def remove_layer(view: ViewState, index: int) -> ViewState:
     """Without one layer; as it was where there is no such layer."""
     if not 0 <= index < len(view.layers):
         return view
     return replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :]))
 
 
-def duplicated(view: ViewState, index: int, gdf: int) -> ViewState:
+def duplicate_layer(view: ViewState, index: int, gdf: int) -> ViewState:
     """A copy of one layer just above it, which shows `gdf`: the same edit under an index of its own."""
     layer = view.layers[index]
     copy = replace(layer, gdf=gdf, name=free_name(view, layer.name))
     return replace(view, layers=(*view.layers[: index + 1], copy, *view.layers[index + 1 :]))
 
 
-def replaced(view: ViewState, index: int, gdf: int, name: str) -> ViewState:
+def replace_edit(view: ViewState, index: int, gdf: int, name: str) -> ViewState:
     """One layer with another edit, on the timeline too: place, strength and gains stay, its paint goes."""
     old = view.layers[index].gdf
     keys = tuple(
@@ -120,8 +122,8 @@ def replaced(view: ViewState, index: int, gdf: int, name: str) -> ViewState:
         for key in view.timeline.keys
     )
     view = replace(view, timeline=replace(view.timeline, keys=keys))
-    view = changed(view, index, lambda layer: replace(layer, gdf=gdf, paint=""))
-    return renamed(view, index, name)
+    view = change_layer(view, index, lambda layer: replace(layer, gdf=gdf, paint=""))
+    return rename_layer(view, index, name)
 
 
 def index_of(view: ViewState, row: int) -> int:
@@ -129,17 +131,17 @@ def index_of(view: ViewState, row: int) -> int:
     return len(view.layers) - 1 - row
 
 
-def soloed(view: ViewState, index: int) -> ViewState:
+def toggle_solo(view: ViewState, index: int) -> ViewState:
     """One layer alone, or beside others that are alone; again lets it go."""
-    return changed(view, index, lambda layer: replace(layer, solo=not layer.solo))
+    return change_layer(view, index, lambda layer: replace(layer, solo=not layer.solo))
 
 
 def with_paint(view: ViewState, index: int, paint: str) -> ViewState:
     """One layer under other painted weights, unless it is locked."""
-    return changed(view, index, lambda layer: layer if layer.locked else replace(layer, paint=paint))
+    return change_layer(view, index, lambda layer: layer if layer.locked else replace(layer, paint=paint))
 
 
-def all_shown(view: ViewState) -> ViewState:
+def show_all(view: ViewState) -> ViewState:
     """Every eye open, no layer alone."""
     layers = tuple(replace(layer, enabled=True, solo=False) for layer in view.layers)
     return replace(view, layers=layers)
@@ -148,13 +150,13 @@ def all_shown(view: ViewState) -> ViewState:
 def with_overshoot(view: ViewState, on: bool) -> ViewState:
     """Sliders that go beyond 1, or that end there again; what stood beyond comes back to 1."""
     view = replace(view, overshoot=on)
-    upper = most(view)
+    upper = largest_strength(view)
     return replace(
         view, layers=tuple(replace(layer, strength=min(layer.strength, upper)) for layer in view.layers)
     )
 
 
-def folded(view: ViewState, index: int) -> ViewState:
+def toggle_details(view: ViewState, index: int) -> ViewState:
     """Show or hide the gains and the curve of the layer at `index`."""
     if not 0 <= index < len(view.layers):
         return view

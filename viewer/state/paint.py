@@ -79,7 +79,7 @@ def softness(wanted: float) -> float:
     return min(1.0, max(0.0, round(wanted, 3)))
 
 
-def encoded(weights: Floats) -> str:
+def encode(weights: Floats) -> str:
     """Weights 0..1 as the text that a state and a session keep; `FULL` where all are 1."""
     levels = np.round(np.clip(weights, 0.0, 1.0) * 255.0).astype(np.uint8)
     if (levels == 255).all():
@@ -88,7 +88,7 @@ def encoded(weights: Floats) -> str:
 
 
 @lru_cache(maxsize=16)  # the composer knows weights by their identity
-def decoded(paint: str, members: int) -> Tensor | None:
+def decode(paint: str, members: int) -> Tensor | None:
     """Weight of every member, None for `FULL`. [M] float32
 
     Raises:
@@ -112,10 +112,10 @@ def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
     Raises:
         ProgdfError: see `decoded`.
     """
-    return Layer(gdf, strength, True, gains, decoded(paint, len(gdf.region)))
+    return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region)))
 
 
-def begun(
+def begin_stroke(
     paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool, mode: str = "erase"
 ) -> Stroke:
     """A stroke that has touched nothing yet.
@@ -128,7 +128,7 @@ def begun(
         through: also what lies behind the front surface
         mode: of `MODES`
     """
-    weights, count = decoded(paint, len(gdf.region)), len(gdf.region)
+    weights, count = decode(paint, len(gdf.region)), len(gdf.region)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()
     rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     depth_of_all = (scene.means @ rotation.T + translation)[:, 2].numpy()
@@ -147,7 +147,7 @@ def begun(
     return Stroke(before, places, np.zeros(count, np.float32), mode)
 
 
-def drawn_to(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 1.0) -> Stroke:
+def extend_stroke(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 1.0) -> Stroke:
     """The stroke with the brush moved in a straight line to a pixel position.
 
     Args:
@@ -167,7 +167,7 @@ def drawn_to(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 
     return replace(stroke, reached=np.maximum(stroke.reached, touch), last=(x, y))
 
 
-def painted(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
+def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
     """The paint that the stroke has made so far: to 1, to 0, or to the mean of neighbours under the brush.
 
     Args:
@@ -179,10 +179,10 @@ def painted(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
         under = np.flatnonzero(stroke.reached)
         width = 0.5 * brush.radius * density
         goal[under] = near_mean(stroke.places[under], stroke.before[under], width)
-    return encoded(stroke.before + (goal - stroke.before) * stroke.reached)
+    return encode(stroke.before + (goal - stroke.before) * stroke.reached)
 
 
-def feathered(paint: str, points: Floats, width: float) -> str:
+def feather(paint: str, points: Floats, width: float) -> str:
     """The paint with its edges softened, wherever one looks from.
 
     Args:
@@ -193,12 +193,12 @@ def feathered(paint: str, points: Floats, width: float) -> str:
     Raises:
         ProgdfError: see `decoded`.
     """
-    weights = decoded(paint, len(points))
+    weights = decode(paint, len(points))
     if weights is None:
         return FULL
     soft, somewhere = weights.numpy().copy(), np.isfinite(points).all(1)
     soft[somewhere] = near_mean(points[somewhere], soft[somewhere], width)
-    return encoded(soft)
+    return encode(soft)
 
 
 def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -> Floats:

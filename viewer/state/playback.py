@@ -34,15 +34,15 @@ class Player:
     shown: bool = False
 
 
-def advanced(player: Player, timeline: Timeline, seconds: float) -> Player:
+def advance(player: Player, timeline: Timeline, seconds: float) -> Player:
     """The playhead after so much time of playing; a slow frame skips frames and keeps the pace."""
     over = player.part + max(0.0, seconds) * timeline.fps
     steps = int(over)
-    frame, backwards = _stepped(timeline, player.frame, player.backwards, steps)
+    frame, backwards = _step_frames(timeline, player.frame, player.backwards, steps)
     return replace(player, frame=frame, backwards=backwards, part=over - steps)
 
 
-def patience(player: Player, timeline: Timeline) -> float | None:
+def next_frame_delay(player: Player, timeline: Timeline) -> float | None:
     """Seconds until the next frame of the film is due; None while nothing plays."""
     return (1.0 - player.part) / timeline.fps if player.playing else None
 
@@ -61,11 +61,11 @@ def perform(view: ViewState, player: Player, action: str) -> tuple[ViewState, Pl
     after = replace(after, frame=max(0, min(after.frame, timeline.length)))
     view = replace(view, timeline=timeline)
     if after.frame != player.frame:
-        view = tl.shown_at(timeline, after.frame, view, LEAST_KEYS)
+        view = tl.state_at(timeline, after.frame, view, LEAST_KEYS)
     return view, after
 
 
-def _stepped(timeline: Timeline, frame: int, backwards: bool, steps: int) -> tuple[int, bool]:
+def _step_frames(timeline: Timeline, frame: int, backwards: bool, steps: int) -> tuple[int, bool]:
     last = timeline.length
     if not timeline.ping_pong:
         return (frame + steps) % (last + 1), False
@@ -84,7 +84,7 @@ def _drop_key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player
 def _move_key(view: ViewState, player: Player, places: str) -> tuple[Timeline, Player]:
     """`FROM>TO`; the playhead goes with the key."""
     frame, _, to = places.partition(">")
-    moved = tl.moved_key(view.timeline, int(frame), int(to))
+    moved = tl.move_key(view.timeline, int(frame), int(to))
     went = moved is not view.timeline
     return moved, replace(player, frame=int(to), playing=False, part=0.0) if went else player
 
@@ -115,9 +115,9 @@ def _easing(view: ViewState, player: Player, wanted: str) -> tuple[Timeline, Pla
     """Of the key that decides at the playhead; the next one of the list where none is named."""
     if not view.timeline.keys:
         return view.timeline, player
-    now = tl.before(view.timeline, player.frame).easing
+    now = tl.key_before(view.timeline, player.frame).easing
     after = wanted or tl.EASINGS[(tl.EASINGS.index(now) + 1) % len(tl.EASINGS)]
-    return tl.eased(view.timeline, player.frame, after), player
+    return tl.set_easing(view.timeline, player.frame, after), player
 
 
 def _ping_pong(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
@@ -140,7 +140,7 @@ ACTIONS: dict[str, Callable[[ViewState, Player, str], tuple[Timeline, Player]]] 
     "jump": _jump,
     "easing": _easing,
     "ping_pong": _ping_pong,
-    "length": lambda view, player, frames: (tl.resized(view.timeline, int(frames)), player),
+    "length": lambda view, player, frames: (tl.set_length(view.timeline, int(frames)), player),
     "fps": lambda view, player, fps: (tl.with_fps(view.timeline, int(fps)), player),
     "timeline": _bar,
 }

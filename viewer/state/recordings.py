@@ -16,14 +16,14 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
 from progdf.gdf.file import Gdf
 
-from .layers import shown
+from .layers import visible_layers
 from .view_state import ViewState
 
 NO_FILE = "the edit was not opened from a file"
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingFile:
     """Where the recording of one edit lies.
 
     Args:
@@ -35,22 +35,22 @@ class Recording:
     reason: str = ""
 
 
-def found(gdf: Gdf, path: Path) -> Recording:
+def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
     """The recording in the run folder that the edit at `path` lies in, if it is this edit's."""
     beside = path.with_name(FILE_NAME)
     if not beside.is_file():
-        return Recording(reason=f"there is no {FILE_NAME} beside {path.name}")
+        return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
     try:
         s, members = peek_trajectory(beside)
     except ProgdfError as error:
-        return Recording(reason=str(error))
+        return RecordingFile(reason=str(error))
     same_way = torch.equal(s, torch.tensor(gdf.field.recorded, dtype=s.dtype))
     if not same_way or not torch.equal(members, gdf.region.members):
-        return Recording(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
-    return Recording(beside)
+        return RecordingFile(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
+    return RecordingFile(beside)
 
 
-def recorded(gdf: Gdf, recording: Recording) -> Gdf:
+def load_recorded(gdf: Gdf, recording: RecordingFile) -> Gdf:
     """The edit with its recording as the field; as it is where there is none.
 
     Raises:
@@ -64,14 +64,14 @@ def recorded(gdf: Gdf, recording: Recording) -> Gdf:
     return replace(gdf, field=field)
 
 
-def obstacle(recordings: Sequence[Recording]) -> str:
+def obstacle(recordings: Sequence[RecordingFile]) -> str:
     """Why there is nothing recorded to compare with; "" where there is."""
     if any(recording.path is not None for recording in recordings):
         return ""
     return (recordings[0].reason or NO_FILE) if recordings else "no edit is open"
 
 
-def within(view: ViewState, recordings: Sequence[Recording]) -> ViewState:
+def clamp_to_recorded(view: ViewState, recordings: Sequence[RecordingFile]) -> ViewState:
     """`view` with no recorded edit beyond its last snapshot: past 1 nothing was recorded."""
     layers = (
         replace(layer, strength=min(layer.strength, 1.0)) if recordings[layer.gdf].path else layer
@@ -80,9 +80,9 @@ def within(view: ViewState, recordings: Sequence[Recording]) -> ViewState:
     return replace(view, layers=tuple(layers))
 
 
-def told(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[Recording]) -> str:
+def describe(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[RecordingFile]) -> str:
     """Which snapshots are shown, and which edits have none: "recorded, between 0.42 and 0.47"."""
-    active = [layer for layer in shown(view) if layer.strength != 0.0]
+    active = [layer for layer in visible_layers(view) if layer.strength != 0.0]
     places, fields = {}, []
     for layer in active:
         if recordings[layer.gdf].path is None:

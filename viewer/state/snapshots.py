@@ -16,7 +16,7 @@ MOST = 200
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class SliderSnapshot:
     """One kept state.
 
     Args:
@@ -30,19 +30,19 @@ class Snapshot:
     camera: ViewCamera = ViewCamera()
 
 
-def taken(snapshots: Sequence[Snapshot], view: ViewState) -> tuple[Snapshot, ...]:
+def take(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
     """One more, of `view`; as they were where the last one is the same, or there are `MOST`."""
-    new = Snapshot(_name(snapshots), _sliders(view), view.camera)
+    new = SliderSnapshot(_name(snapshots), _sliders(view), view.camera)
     same = snapshots and replace(snapshots[-1], name=new.name) == new
     return tuple(snapshots) if same or len(snapshots) >= MOST else (*snapshots, new)
 
 
-def without(snapshots: Sequence[Snapshot], index: int) -> tuple[Snapshot, ...]:
+def remove(snapshots: Sequence[SliderSnapshot], index: int) -> tuple[SliderSnapshot, ...]:
     """All but one."""
     return (*snapshots[:index], *snapshots[index + 1 :])
 
 
-def renamed(snapshots: Sequence[Snapshot], index: int, name: str) -> tuple[Snapshot, ...]:
+def rename(snapshots: Sequence[SliderSnapshot], index: int, name: str) -> tuple[SliderSnapshot, ...]:
     """One under another name, on one line; no name changes nothing."""
     name = " ".join(name.split())[:LONGEST_NAME]
     kept = list(snapshots)
@@ -50,19 +50,19 @@ def renamed(snapshots: Sequence[Snapshot], index: int, name: str) -> tuple[Snaps
     return tuple(kept)
 
 
-def shown(snapshots: Sequence[Snapshot], view: ViewState) -> tuple[Snapshot, ...]:
+def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
     """What the panel shows: the original of `view`, then those kept."""
     layers = tuple(replace(layer, strength=0.0) for layer in view.layers)
     edit = _sliders(replace(view, layers=layers))
     first = snapshots[0].camera if snapshots else view.camera
-    return Snapshot("original", edit, first), *snapshots
+    return SliderSnapshot("original", edit, first), *snapshots
 
 
-def back_to(view: ViewState, snapshot: Snapshot) -> ViewState:
+def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     """`view` edited as it was then; edits that were opened since stay in the stack, at 0."""
     kept = {layer.gdf for layer in snapshot.edit.layers}
     later = tuple(replace(layer, strength=0.0) for layer in view.layers if layer.gdf not in kept)
-    back = history.restored(view, snapshot.edit)
+    back = history.apply_edit(view, snapshot.edit)
     return replace(back, layers=(*back.layers, *later), timeline=view.timeline)
 
 
@@ -71,6 +71,6 @@ def _sliders(view: ViewState) -> Edit:
     return replace(history.edit_of(view), timeline=Timeline())
 
 
-def _name(snapshots: Sequence[Snapshot]) -> str:
+def _name(snapshots: Sequence[SliderSnapshot]) -> str:
     taken_names = {snapshot.name for snapshot in snapshots}
     return next(str(n) for n in range(1, MOST + 2) if str(n) not in taken_names)

@@ -26,7 +26,7 @@ def key_at(timeline: Timeline, frame: int) -> Keyframe | None:
 def with_key(timeline: Timeline, frame: int, view: ViewState) -> Timeline:
     """What `view` shows becomes the key at a frame, in place of the one there, whose easing stays."""
     old = key_at(timeline, frame)
-    easing = old.easing if old else before(timeline, frame).easing if timeline.keys else EASINGS[0]
+    easing = old.easing if old else key_before(timeline, frame).easing if timeline.keys else EASINGS[0]
     strengths = {layer.gdf: layer.strength for layer in view.layers}
     key = Keyframe(frame, tuple(strengths.items()), view.camera, easing)
     return _with(without_key(timeline, frame), key)
@@ -37,7 +37,7 @@ def without_key(timeline: Timeline, frame: int) -> Timeline:
     return replace(timeline, keys=tuple(key for key in timeline.keys if key.frame != frame))
 
 
-def moved_key(timeline: Timeline, frame: int, to: int) -> Timeline:
+def move_key(timeline: Timeline, frame: int, to: int) -> Timeline:
     """The key at `frame` at another place; unchanged where another key stands there, or off the timeline."""
     key = key_at(timeline, frame)
     if key is None or key_at(timeline, to) or not 0 <= to <= timeline.length:
@@ -45,20 +45,20 @@ def moved_key(timeline: Timeline, frame: int, to: int) -> Timeline:
     return _with(without_key(timeline, frame), replace(key, frame=to))
 
 
-def eased(timeline: Timeline, frame: int, easing: str) -> Timeline:
+def set_easing(timeline: Timeline, frame: int, easing: str) -> Timeline:
     """Another way to go on from the key at a frame, or from the last one before it."""
     if not timeline.keys or easing not in EASINGS:
         return timeline
-    key = before(timeline, frame)
+    key = key_before(timeline, frame)
     return _with(without_key(timeline, key.frame), replace(key, easing=easing))
 
 
-def before(timeline: Timeline, frame: int) -> Keyframe:
+def key_before(timeline: Timeline, frame: int) -> Keyframe:
     """The key that decides how things move at a frame: the last one up to it, else the first."""
     return next((key for key in reversed(timeline.keys) if key.frame <= frame), timeline.keys[0])
 
 
-def resized(timeline: Timeline, length: int) -> Timeline:
+def set_length(timeline: Timeline, length: int) -> Timeline:
     """Another last frame; no key is lost, so it ends with the last key at the earliest."""
     last = timeline.keys[-1].frame if timeline.keys else 0
     return replace(timeline, length=max(1, last, min(length, LONGEST)))
@@ -84,7 +84,7 @@ def film_frames(timeline: Timeline) -> Iterator[int]:
         yield from range(timeline.length - 1, 0, -1)
 
 
-def shown_at(timeline: Timeline, frame: float, view: ViewState, least: int = 1) -> ViewState:
+def state_at(timeline: Timeline, frame: float, view: ViewState, least: int = 1) -> ViewState:
     """`view` with the camera and strengths of a frame; what fewer than `least` keys mention stays as it is.
 
     Before the first key and after the last everything rests.

@@ -75,8 +75,8 @@ def camera(keys: Sequence[tuple[int, str, ViewCamera]], frame: float) -> ViewCam
     )
     if here.up != there.up:
         eased = value([(0, keys[i][1], 0.0), (1, keys[i][1], 1.0)], share)
-        return _turned(placed, here, there, eased)
-    azimuth = track(unwound([c.azimuth for c in cameras]))
+        return _slerp(placed, here, there, eased)
+    azimuth = track(unwrap([c.azimuth for c in cameras]))
     return replace(
         placed,
         azimuth=(azimuth + 180.0) % 360.0 - 180.0,
@@ -84,7 +84,7 @@ def camera(keys: Sequence[tuple[int, str, ViewCamera]], frame: float) -> ViewCam
     )
 
 
-def unwound(degrees: Sequence[float]) -> list[float]:
+def unwrap(degrees: Sequence[float]) -> list[float]:
     """The same angles, each within half a turn of the one before it."""
     angles = list(degrees[:1])
     for angle in degrees[1:]:
@@ -92,7 +92,7 @@ def unwound(degrees: Sequence[float]) -> list[float]:
     return angles
 
 
-def _turned(placed: ViewCamera, here: ViewCamera, there: ViewCamera, share: float) -> ViewCamera:
+def _slerp(placed: ViewCamera, here: ViewCamera, there: ViewCamera, share: float) -> ViewCamera:
     """`placed` with an orientation between two others; its up axis is what is up in the picture then."""
     between = quaternion.normalize(quaternion.slerp(_orientation(here), _orientation(there), share))
     _, up, back = matrix33.create_from_quaternion(between)

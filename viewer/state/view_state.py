@@ -114,7 +114,7 @@ class ViewState:
         overshoot: sliders go on to `stack.OVERSHOOT`, which extrapolates
         unfolded: which edits (`LayerState.gdf`) show their gains and curve
         brush: what paints
-        draft: when the window draws coarsely while something moves, of `DRAFT_MODES`; files never are
+        draft: when the window draws coarsely while something moves, of `RESOLUTION_MODES`; files never are
     """
 
     camera: ViewCamera = ViewCamera()
@@ -131,10 +131,12 @@ class ViewState:
     draft: str = "auto"
 
 
-DRAFT_MODES = ("auto", "on", "off")
+RESOLUTION_MODES = ("auto", "on", "off")
 """`ViewState.draft`: where it pays, always, never."""
 
 
-def next_draft(view: ViewState) -> ViewState:
-    """The state with the next of `DRAFT_MODES`."""
-    return replace(view, draft=DRAFT_MODES[(DRAFT_MODES.index(view.draft) + 1) % len(DRAFT_MODES)])
+def next_resolution_mode(view: ViewState) -> ViewState:
+    """The state with the next of `RESOLUTION_MODES`."""
+    return replace(
+        view, draft=RESOLUTION_MODES[(RESOLUTION_MODES.index(view.draft) + 1) % len(RESOLUTION_MODES)]
+    )

@@ -15,7 +15,7 @@ import numpy as np
 from progdf.compose.layers import BLENDS
 from progdf.terminal import printable
 from viewer.camera import controls
-from viewer.camera.view_camera import FARTHEST, Bounds, Fit, ViewCamera, unmoved
+from viewer.camera.view_camera import FARTHEST, Bounds, Fit, ViewCamera, keep_camera
 
 from . import comparison as compare
 from . import history, paint, playback, snapshots, timeline
@@ -23,9 +23,9 @@ from . import layers as stack
 from .history import Edit, History
 from .layer_facts import LayerRow
 from .playback import Player
-from .recordings import Recording
-from .snapshots import Snapshot
-from .view_state import Comparison, ViewState, next_draft
+from .recordings import RecordingFile
+from .snapshots import SliderSnapshot
+from .view_state import Comparison, ViewState, next_resolution_mode
 
 MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
 UNSAVED = "• "
@@ -52,9 +52,9 @@ class SceneFacts:
     count: int
     bounds: Bounds
     rows: Sequence[LayerRow]
-    recordings: Sequence[Recording] = ()
-    fit: Fit = unmoved
-    home: Fit = unmoved
+    recordings: Sequence[RecordingFile] = ()
+    fit: Fit = keep_camera
+    home: Fit = keep_camera
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Workspace:
         past: undo and redo
         home: the first camera
         focus: the focused layer, an index into `view.layers`, or None
-        dial: which of `stack.DIALS` of the focused layer the arrow keys move
+        active_slider: which of `stack.SLIDERS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
         help: whether the list of bindings is shown
         message: the line at the bottom, or None
@@ -114,35 +114,35 @@ class Workspace:
     past: History
     home: ViewCamera
     focus: int | None = None
-    dial: str = "strength"
+    active_slider: str = "strength"
     renaming: int | None = None
     help: bool = False
     message: Message | None = None
-    snapshots: tuple[Snapshot, ...] = ()
-    saved: tuple[Edit, tuple[Snapshot, ...]] | None = None
+    snapshots: tuple[SliderSnapshot, ...] = ()
+    saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
     dialog: Dialog | None = None
     requests: tuple[str, ...] = ()
     player: Player = Player()
     overlap: int | None = None
 
 
-def opened(view: ViewState, kept: tuple[Snapshot, ...] = ()) -> Workspace:
+def new_workspace(view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> Workspace:
     """A workspace on a fresh state; the top layer is focused."""
     past, focus = history.begin(view, kept), len(view.layers) - 1 if view.layers else None
-    return as_saved(Workspace(view, past, view.camera, focus, snapshots=kept))
+    return mark_saved(Workspace(view, past, view.camera, focus, snapshots=kept))
 
 
-def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[Snapshot, ...]]:
+def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]]:
     """What it would be a pity to lose; where one looked from is not."""
     return history.edit_of(workspace.view), workspace.snapshots
 
 
-def as_saved(workspace: Workspace) -> Workspace:
+def mark_saved(workspace: Workspace) -> Workspace:
     """The same, with nothing unsaved."""
     return replace(workspace, saved=worth_saving(workspace))
 
 
-def unsaved(workspace: Workspace) -> bool:
+def has_unsaved(workspace: Workspace) -> bool:
     """Whether closing now would lose something."""
     return workspace.saved != worth_saving(workspace)
 
@@ -153,34 +153,34 @@ def original(view: ViewState) -> ViewState:
     return replace(view, layers=layers, compare=Comparison())
 
 
-def told(workspace: Workspace, text: str, now: float, error: bool = False) -> Workspace:
+def with_message(workspace: Workspace, text: str, now: float, error: bool = False) -> Workspace:
     """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
     until = now + (ERROR_S if error else MESSAGE_S)
     return replace(workspace, message=Message(printable(" ".join(text.split())), until, error))
 
 
-def settled(workspace: Workspace) -> Workspace:
+def record_undo(workspace: Workspace) -> Workspace:
     """Call when no gesture is under way: what it changed becomes one undo entry."""
     past = history.record(workspace.past, workspace.view, workspace.snapshots)
     return workspace if past is workspace.past else replace(workspace, past=past)
 
 
-def called_off(workspace: Workspace) -> Workspace:
+def cancel_drag(workspace: Workspace) -> Workspace:
     """As it was before the gesture under way."""
-    return replace(workspace, view=history.restored(workspace.view, workspace.past.present.edit))
+    return replace(workspace, view=history.apply_edit(workspace.view, workspace.past.present.edit))
 
 
-def played(workspace: Workspace, seconds: float) -> Workspace:
+def advance(workspace: Workspace, seconds: float) -> Workspace:
     """After so much time; the film goes on where it is playing."""
     if not workspace.player.playing:
         return workspace
     view = workspace.view
-    player = playback.advanced(workspace.player, view.timeline, seconds)
-    view = timeline.shown_at(view.timeline, player.frame, view, playback.LEAST_KEYS)
+    player = playback.advance(workspace.player, view.timeline, seconds)
+    view = timeline.state_at(view.timeline, player.frame, view, playback.LEAST_KEYS)
     if _loses_strengths(workspace, view):
         past = history.record(workspace.past, view, workspace.snapshots)
     else:
-        past = history.followed(workspace.past, workspace.view, view)
+        past = history.follow_playhead(workspace.past, workspace.view, view)
     return replace(workspace, view=view, player=player, past=past)
 
 
@@ -189,7 +189,7 @@ def _loses_strengths(workspace: Workspace, after: ViewState) -> bool:
     before, frame = workspace.view, workspace.player.frame
     if after.layers == before.layers or history.edit_of(before) != workspace.past.present.edit:
         return False
-    return timeline.shown_at(before.timeline, frame, before, playback.LEAST_KEYS).layers != before.layers
+    return timeline.state_at(before.timeline, frame, before, playback.LEAST_KEYS).layers != before.layers
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
@@ -207,13 +207,13 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     if name in REQUESTS:
         return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
-        return (_framed if name == "frame" else _home)(workspace, facts, aspect)
+        return (_frame if name == "frame" else _home)(workspace, facts, aspect)
     if name in ("paint_clear", "paint_fill"):
-        return _repainted(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
+        return _fill_paint(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
     if name == "paint_feather":
-        return _feathered(workspace, facts)
-    if name == "dial":
-        return _dialled(workspace, int(argument), facts)
+        return _feather(workspace, facts)
+    if name == "next_slider":
+        return _select_slider(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
 
 
@@ -222,7 +222,7 @@ def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
     return replace(workspace, view=replace(workspace.view, camera=camera))
 
 
-def _framed(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
+def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
     """The focused layer, or what the scene is about, fills the picture; the direction stays."""
     fit = facts.fit
     if workspace.focus is not None:
@@ -239,44 +239,50 @@ def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
     return with_camera(workspace, home)
 
 
-def focused(workspace: Workspace, index: int) -> Workspace:
+def focus_layer(workspace: Workspace, index: int) -> Workspace:
     """With another layer focused; as it was where there is no such layer."""
     return replace(workspace, focus=index) if 0 <= index < len(workspace.view.layers) else workspace
 
 
 def _focus(workspace: Workspace, number: str) -> Workspace:
     """By its number, counted from 1 at the top of the panel's list."""
-    return focused(workspace, stack.index_of(workspace.view, int(number) - 1))
+    return focus_layer(workspace, stack.index_of(workspace.view, int(number) - 1))
 
 
-def _shown_or_hidden(view: ViewState, index: int) -> ViewState:
-    return stack.changed(view, index, lambda layer: replace(layer, enabled=not layer.enabled))
+def _toggle_shown(view: ViewState, index: int) -> ViewState:
+    return stack.change_layer(view, index, lambda layer: replace(layer, enabled=not layer.enabled))
 
 
 def _toggle(workspace: Workspace, number: str) -> Workspace:
     index = stack.index_of(workspace.view, int(number) - 1)
-    return replace(workspace, view=_shown_or_hidden(workspace.view, index))
+    return replace(workspace, view=_toggle_shown(workspace.view, index))
 
 
 def _hide(workspace: Workspace, _: str) -> Workspace:
-    return _on_focused(workspace, _shown_or_hidden)
+    return _change_focused(workspace, _toggle_shown)
 
 
 def _nudge(workspace: Workspace, by: str) -> Workspace:
-    return _on_focused(workspace, lambda view, i: stack.nudged(view, i, workspace.dial, float(by)))
+    return _change_focused(
+        workspace, lambda view, i: stack.nudge(view, i, workspace.active_slider, float(by))
+    )
 
 
-def _dialled(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
-    """The next dial that the focused layer has; its gains unfold, so that one sees which."""
+def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
+    """The next active_slider that the focused layer has; its gains unfold, so that one sees which."""
     if workspace.focus is None:
         return workspace
     view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
-    dials = [dial for dial in stack.DIALS if dial == "strength" or dial in facts.rows[gdf].kinds]
-    place = dials.index(workspace.dial) if workspace.dial in dials else 0
-    dial = dials[(place + by) % len(dials)]
-    if dial != "strength" and gdf not in view.unfolded:
+    sliders = [
+        active_slider
+        for active_slider in stack.SLIDERS
+        if active_slider == "strength" or active_slider in facts.rows[gdf].kinds
+    ]
+    place = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
+    active_slider = sliders[(place + by) % len(sliders)]
+    if active_slider != "strength" and gdf not in view.unfolded:
         view = replace(view, unfolded=(*view.unfolded, gdf))
-    return replace(workspace, dial=dial, view=view)
+    return replace(workspace, active_slider=active_slider, view=view)
 
 
 def _move(workspace: Workspace, by: str) -> Workspace:
@@ -284,7 +290,7 @@ def _move(workspace: Workspace, by: str) -> Workspace:
     if workspace.focus is None:
         return workspace
     to = max(0, min(workspace.focus - int(by), len(workspace.view.layers) - 1))
-    return replace(workspace, view=stack.moved(workspace.view, workspace.focus, to), focus=to)
+    return replace(workspace, view=stack.move_layer(workspace.view, workspace.focus, to), focus=to)
 
 
 def _remove(workspace: Workspace, index: str) -> Workspace:
@@ -292,7 +298,7 @@ def _remove(workspace: Workspace, index: str) -> Workspace:
     at = int(index) if index else workspace.focus
     if at is None or not 0 <= at < len(workspace.view.layers):
         return workspace
-    view = stack.removed(workspace.view, at)
+    view = stack.remove_layer(workspace.view, at)
     focus = max(at - 1, 0) if view.layers else None
     return replace(workspace, view=view, focus=focus, renaming=None, overlap=None)
 
@@ -304,36 +310,36 @@ def _rename(workspace: Workspace, index: str) -> Workspace:
 
 def _lock(workspace: Workspace, _: str) -> Workspace:
     def turned(view: ViewState, index: int) -> ViewState:
-        return stack.changed(view, index, lambda layer: replace(layer, locked=not layer.locked))
+        return stack.change_layer(view, index, lambda layer: replace(layer, locked=not layer.locked))
 
-    return _on_focused(workspace, turned)
+    return _change_focused(workspace, turned)
 
 
-def _brushed(workspace: Workspace, **changes: Any) -> Workspace:
+def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
     view = workspace.view
     return replace(workspace, view=replace(view, brush=replace(view.brush, **changes)))
 
 
-def _repainted(workspace: Workspace, facts: SceneFacts, weight: float) -> Workspace:
+def _fill_paint(workspace: Workspace, facts: SceneFacts, weight: float) -> Workspace:
     """The focused layer painted evenly, unless it is locked."""
 
     def even(view: ViewState, index: int) -> ViewState:
         count = facts.rows[view.layers[index].gdf].count
-        return stack.with_paint(view, index, paint.encoded(np.full(count, weight, np.float32)))
+        return stack.with_paint(view, index, paint.encode(np.full(count, weight, np.float32)))
 
-    return _on_focused(workspace, even)
+    return _change_focused(workspace, even)
 
 
-def _feathered(workspace: Workspace, facts: SceneFacts) -> Workspace:
+def _feather(workspace: Workspace, facts: SceneFacts) -> Workspace:
     """The edges of the focused layer's paint softened a little; again softens them more."""
 
     def softened(view: ViewState, index: int) -> ViewState:
         layer = view.layers[index]
         row = facts.rows[layer.gdf]
         width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
-        return stack.with_paint(view, index, paint.feathered(layer.paint, row.points, width))
+        return stack.with_paint(view, index, paint.feather(layer.paint, row.points, width))
 
-    return _on_focused(workspace, softened)
+    return _change_focused(workspace, softened)
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:
@@ -341,7 +347,7 @@ def _blend(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, view=replace(workspace.view, blend=after))
 
 
-def _on_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
+def _change_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
     if workspace.focus is None:
         return workspace
     return replace(workspace, view=change(workspace.view, workspace.focus))
@@ -360,7 +366,7 @@ def _back(workspace: Workspace, past: History) -> Workspace:
         return workspace
     kept = past.present
     workspace = replace(workspace, past=past, snapshots=kept.snapshots, renaming=None)
-    return _with_layers_of(workspace, history.restored(workspace.view, kept.edit))
+    return _with_layers_of(workspace, history.apply_edit(workspace.view, kept.edit))
 
 
 def _with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
@@ -376,7 +382,7 @@ def _fly(workspace: Workspace, _: str) -> Workspace:
     return with_camera(workspace, controls.toggle_fly(workspace.view.camera))
 
 
-def _timed(name: str) -> Callable[[Workspace, str], Workspace]:
+def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
     """An action of the timeline."""
 
     def act(workspace: Workspace, argument: str) -> Workspace:
@@ -385,7 +391,7 @@ def _timed(name: str) -> Callable[[Workspace, str], Workspace]:
         if _loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
             past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
         elif past.present.edit.layers == workspace.view.layers:
-            past = history.followed(past, workspace.view, view)
+            past = history.follow_playhead(past, workspace.view, view)
         return replace(workspace, view=view, player=player, past=past)
 
     return act
@@ -393,24 +399,24 @@ def _timed(name: str) -> Callable[[Workspace, str], Workspace]:
 
 def _restore(workspace: Workspace, index: str) -> Workspace:
     """Back to a snapshot, counted as the panel shows them: 0 is the original."""
-    kept = snapshots.shown(workspace.snapshots, workspace.view)
+    kept = snapshots.with_original(workspace.snapshots, workspace.view)
     if not 0 <= int(index) < len(kept):
         return workspace
-    return _with_layers_of(workspace, snapshots.back_to(workspace.view, kept[int(index)]))
+    return _with_layers_of(workspace, snapshots.restore(workspace.view, kept[int(index)]))
 
 
 def _forget(workspace: Workspace, index: str) -> Workspace:
-    return replace(workspace, snapshots=snapshots.without(workspace.snapshots, int(index) - 1))
+    return replace(workspace, snapshots=snapshots.remove(workspace.snapshots, int(index) - 1))
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`"""
     index, _, name = argument.partition(":")
-    return replace(workspace, snapshots=snapshots.renamed(workspace.snapshots, int(index) - 1, name))
+    return replace(workspace, snapshots=snapshots.rename(workspace.snapshots, int(index) - 1, name))
 
 
 def _snapshot(workspace: Workspace, _: str) -> Workspace:
-    return replace(workspace, snapshots=snapshots.taken(workspace.snapshots, workspace.view))
+    return replace(workspace, snapshots=snapshots.take(workspace.snapshots, workspace.view))
 
 
 REQUESTS = (
@@ -428,19 +434,21 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "hide": _hide,
     "nudge": _nudge,
     "move": _move,
-    "solo": lambda workspace, _: _on_focused(workspace, stack.soloed),
-    "show_all": lambda w, _: replace(w, view=stack.all_shown(w.view)),
+    "solo": lambda workspace, _: _change_focused(workspace, stack.toggle_solo),
+    "show_all": lambda w, _: replace(w, view=stack.show_all(w.view)),
     "lock": _lock,
-    "fold": lambda workspace, _: _on_focused(workspace, stack.folded),
+    "fold": lambda workspace, _: _change_focused(workspace, stack.toggle_details),
     "rename": _rename,
     "remove": _remove,
     "blend": _blend,
-    "brush": lambda w, _: _brushed(w, active=not w.view.brush.active),
-    "brush_mode": lambda w, _: _brushed(w, mode=paint.next_mode(w.view.brush.mode)),
-    "brush_weights": lambda w, _: _brushed(w, weights=not w.view.brush.weights),
-    "brush_through": lambda w, _: _brushed(w, through=not w.view.brush.through),
-    "brush_radius": lambda w, by: _brushed(w, radius=paint.radius(w.view.brush.radius * float(by))),
-    "brush_softness": lambda w, by: _brushed(w, softness=paint.softness(w.view.brush.softness + float(by))),
+    "brush": lambda w, _: _change_brush(w, active=not w.view.brush.active),
+    "brush_mode": lambda w, _: _change_brush(w, mode=paint.next_mode(w.view.brush.mode)),
+    "brush_weights": lambda w, _: _change_brush(w, weights=not w.view.brush.weights),
+    "brush_through": lambda w, _: _change_brush(w, through=not w.view.brush.through),
+    "brush_radius": lambda w, by: _change_brush(w, radius=paint.radius(w.view.brush.radius * float(by))),
+    "brush_softness": lambda w, by: _change_brush(
+        w, softness=paint.softness(w.view.brush.softness + float(by))
+    ),
     "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": _snapshot,
     "restore": _restore,
@@ -450,11 +458,11 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "redo": _redo,
     "fly": _fly,
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
-    "split": lambda w, _: replace(w, view=compare.switched(w.view, "split")),
-    "difference": lambda w, _: replace(w, view=compare.switched(w.view, "difference")),
-    "against": lambda w, _: replace(w, view=compare.turned(w.view)),
-    "draft": lambda w, _: replace(w, view=next_draft(w.view)),
+    "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
+    "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
+    "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),
+    "draft": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
-    **{name: _timed(name) for name in playback.ACTIONS},
+    **{name: _timeline_action(name) for name in playback.ACTIONS},
 }

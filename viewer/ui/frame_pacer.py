@@ -9,7 +9,7 @@ LINGER_S = 0.65
 """Seconds after which a resting mouse gets its tooltip: a little more than imgui's own two delays."""
 
 
-class Pace:
+class FramePacer:
     """Counts frames, and seconds of rest, since the last event."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Pace:
                 # it, and shows it in the one after
                 self._unsettled, self._rest_left = SETTLE_FRAMES, None
 
-    def patience(self, others: Sequence[float]) -> float | None:
+    def next_frame_delay(self, others: Sequence[float]) -> float | None:
         """Seconds until the next frame is due without an event, or None: none is.
 
         Args:

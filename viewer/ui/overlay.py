@@ -12,7 +12,7 @@ from viewer.render.engine import EditsBy, FrameTimings
 from viewer.state.workspace import Message
 
 from .context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32
-from .widgets import grouped
+from .widgets import group_digits
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ def figures(
     if latencies_ms:
         median, late = np.percentile(latencies_ms, (50, 95))
         lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
-    lines.append(("splats", f"{grouped(timings.drawn)} of {grouped(count)}"))
+    lines.append(("splats", f"{group_digits(timings.drawn)} of {group_digits(count)}"))
     lines.append(("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with]))
     if edits is not None:
-        lines.append(("edited by", edits.told))
+        lines.append(("edited by", edits.description))
     return lines
 
 

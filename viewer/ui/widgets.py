@@ -36,7 +36,7 @@ def small(text: str, colour: Rgba, room: float | None = None) -> None:
     """Small text, shortened to `room` window pixels, or to the line."""
     imgui.push_font(None, SMALL_PX)
     room = imgui.get_content_region_avail().x if room is None else room
-    imgui.text_colored(imgui.ImVec4(*colour), elided(text, room))
+    imgui.text_colored(imgui.ImVec4(*colour), elide(text, room))
     imgui.pop_font()
 
 
@@ -89,7 +89,7 @@ def menu(name: str, ui: UiContext) -> Iterator[bool]:
             imgui.end_popup()
 
 
-def let_go() -> bool:
+def is_released() -> bool:
     """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
     return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
 
@@ -110,7 +110,7 @@ def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -
     return pressed
 
 
-def double_clicked() -> bool:
+def is_double_clicked() -> bool:
     """Whether the last item, a slider, was double-clicked, which takes it back to its default.
 
     It lets go of the slider, which would follow the mouse again in the next frame.
@@ -139,7 +139,7 @@ def value_slider(
     imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.text[:3], alpha))
     changed, new = imgui.slider_float(name, value, *ends, form, flags)
     imgui.pop_style_color()
-    if double_clicked():
+    if is_double_clicked():
         changed, new = True, default
     low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
     number = form % (new if changed else value)
@@ -176,12 +176,12 @@ def choice(
 _BUTTON_COLOURS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
 
 
-def grouped(count: int) -> str:
+def group_digits(count: int) -> str:
     """12345 as "12 345", with a thin space."""
     return f"{count:,}".replace(",", "\u2009")
 
 
-def elided(text: str, room: float) -> str:
+def elide(text: str, room: float) -> str:
     """The text, shortened with "…" to fit `room` window pixels in the present font."""
     if imgui.calc_text_size(text).x <= room:
         return text

@@ -67,7 +67,7 @@ class Window:
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
         errors: list[str] = []
-        glfw.set_error_callback(lambda _, text: errors.append(_decoded(text)))
+        glfw.set_error_callback(lambda _, text: errors.append(_decode(text)))
         if not glfw.init():
             raise _no_window("no window can be opened here", errors)
         for hint, value in _HINTS:
@@ -280,5 +280,5 @@ def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
     return ProgdfError(f"{what}{why}; `progdf render` makes pictures without one")
 
 
-def _decoded(text: str | bytes) -> str:
+def _decode(text: str | bytes) -> str:
     return text.decode(errors="replace") if isinstance(text, bytes) else text

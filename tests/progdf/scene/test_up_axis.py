@@ -127,7 +127,7 @@ def test_check_prints_boxes_to_paste_and_the_up_axis(
 
 def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:
     options = parsed(RenderOptions, [*arguments, "-o", str(tmp_path / "p.png")], "progdf render")
-    found = opening.opened(options)
+    found = opening.open_stack(options)
     return found.up if found.session is None else found.view.camera.up
 
 
@@ -145,9 +145,9 @@ def test_a_session_keeps_the_up_axis_and_up_changes_it(tmp_path: Path) -> None:
     stack = bear_stack(2000)
     scene, _, _ = stack.save(tmp_path)
     options = parsed(RenderOptions, [str(scene), "-o", "p.png"], "progdf render")
-    found = opening.opened(options)
+    found = opening.open_stack(options)
     view = replace(found.view, camera=first_camera(found.document.scene, up=(0.0, 0.0, 1.0)))
-    session.save(tmp_path / "a.session.json", session.Session(found.document, view))
+    session.save(tmp_path / "a.session.json", session.WindowSession(found.document, view))
     assert upright(tmp_path, str(tmp_path / "a.session.json")) == (0.0, 0.0, 1.0)
     assert upright(tmp_path, str(tmp_path / "a.session.json"), "--up", "-y") == (0.0, -1.0, 0.0)
 

@@ -56,11 +56,11 @@ def test_the_whole_list_is_readable_in_the_smallest_window(
 def fits_its_columns(hand: Rig) -> bool:
     """Whether no line is longer than its column."""
     imgui.new_frame()
-    imgui.push_font(hand.stage.ui.fonts.regular, SMALL_PX)
-    room = (bindings.COLUMN_PX - 8.0) * hand.stage.ui.scale
+    imgui.push_font(hand.main_view.ui.fonts.regular, SMALL_PX)
+    room = (bindings.COLUMN_PX - 8.0) * hand.main_view.ui.scale
     fits = all(
         max(imgui.calc_text_size(chord).x for topic in column for chord, _ in topic.rows)
-        + 14.0 * hand.stage.ui.scale
+        + 14.0 * hand.main_view.ui.scale
         + max(imgui.calc_text_size(does).x for topic in column for _, does in topic.rows)
         <= room
         for column in bindings.columns(bindings.topics(), 3)
@@ -75,7 +75,7 @@ def fits_its_columns(hand: Rig) -> bool:
 def test_a_message_stands_below_the_list_also_where_it_takes_several_lines(times: int) -> None:
     with rig(None, SMALLEST) as hand:
         hand.key("F1")
-        hand.stage.tell("a line that is long enough to be wrapped " * times)
+        hand.main_view.show_message("a line that is long enough to be wrapped " * times)
         hand.frame(3)
         window, message = shown(hand), imgui.internal.find_window_by_name("message")
         assert window.pos.y + window.size.y <= message.pos.y
@@ -87,9 +87,9 @@ def test_in_a_window_that_is_too_small_the_list_scrolls_to_its_end() -> None:
     with rig(None, (640, 400)) as hand:
         hand.key("F1")
         hand.frame(2)
-        before = hand.stage.work.view.camera
+        before = hand.main_view.work.view.camera
         assert shown(hand).scroll_max.y > 0.0
         for _ in range(40):
             hand.wheel(320.0, 200.0, -2.0)
         assert shown(hand).scroll.y == shown(hand).scroll_max.y
-        assert hand.stage.work.view.camera == before, "the wheel over it zooms nothing"
+        assert hand.main_view.work.view.camera == before, "the wheel over it zooms nothing"

@@ -34,7 +34,7 @@ def click_twice(hand: Rig, gap: float, frame: float, unheard: float = 0.0) -> No
             hand.io.add_mouse_button_event(0, down)
         for _ in range(3):
             clicks.apply()
-            hand.stage.frame(hand.screen, hand.pixels, frame)
+            hand.main_view.frame(hand.screen, hand.pixels, frame)
 
 
 @pytest.mark.parametrize("frame", [1 / 60, 0.12, 0.5])
@@ -77,4 +77,4 @@ def test_the_window_notes_when_it_heard_of_a_press(opened: application.App) -> N
     for _ in range(6):
         opened.last -= 0.4  # so long a frame takes
         opened.draw()
-    assert [layer.strength for layer in opened.stage.work.view.layers] == [0.5, 0.0]
+    assert [layer.strength for layer in opened.main_view.work.view.layers] == [0.5, 0.0]

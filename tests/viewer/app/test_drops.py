@@ -45,28 +45,28 @@ def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, 
     save_gdf(tmp_path / "ears.gdf", gdf)
     opened.open(tmp_path / "ears.gdf")
     opened.draw()
-    layers = opened.stage.work.view.layers
+    layers = opened.main_view.work.view.layers
     assert [(layer.name, layer.strength) for layer in layers] == [("scarf", 0.5), ("ears", 1.0)]
-    assert [row.count for row in opened.stage.facts.rows] == [len(g.region) for g in bear().gdfs]
-    assert len(opened.stage.work.past.past) == 1
+    assert [row.count for row in opened.main_view.facts.rows] == [len(g.region) for g in bear().gdfs]
+    assert len(opened.main_view.work.past.past) == 1
 
 
 @pytest.mark.gl
 def test_a_dropped_timeline_is_ready_to_play_and_can_be_undone(
     opened: application.App, tmp_path: Path
 ) -> None:
-    layers = opened.stage.work.view.layers
+    layers = opened.main_view.work.view.layers
     keys = (Keyframe(0, ((0, 0.0),)), Keyframe(9, ((0, 1.0),)))
     timeline_file.save(tmp_path / "film.json", Timeline(keys, 9), layers)
     opened.open(tmp_path / "film.json")
     opened.draw()
-    assert opened.stage.work.view.timeline.keys == keys
-    assert opened.stage.work.player.shown
-    assert len(opened.stage.work.past.past) == 1
+    assert opened.main_view.work.view.timeline.keys == keys
+    assert opened.main_view.work.player.shown
+    assert len(opened.main_view.work.past.past) == 1
     save_ply(tmp_path / "half.ply", bear().scene[:700])
-    opened.stage.restart(opened.stage.work.view)
+    opened.main_view.restart(opened.main_view.work.view)
     opened.open(tmp_path / "half.ply")
-    assert opened.stage.work.view.timeline == Timeline()
+    assert opened.main_view.work.view.timeline == Timeline()
 
 
 @pytest.mark.gl
@@ -74,16 +74,16 @@ def test_a_dropped_scene_takes_the_place_of_the_old_one(opened: application.App,
     save_ply(tmp_path / "half.ply", bear().scene[:700])
     opened.open(tmp_path / "half.ply")
     opened.draw()
-    assert opened.stage.facts.count == 700
-    assert opened.stage.work.view.layers == ()
-    assert opened.stage.facts.title == "half.ply"
+    assert opened.main_view.facts.count == 700
+    assert opened.main_view.work.view.layers == ()
+    assert opened.main_view.facts.title == "half.ply"
 
 
 @pytest.mark.gl
 def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
     opened: application.App, tmp_path: Path
 ) -> None:
-    before = opened.stage.work.view
+    before = opened.main_view.work.view
     other = replace(bear().gdfs[1], scene=replace(bear().gdfs[1].scene, means_sha256="0" * 64))
     save_gdf(tmp_path / "other.gdf", other)
     (tmp_path / "torn.ply").write_bytes(b"ply\nformat")
@@ -91,12 +91,12 @@ def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
     for name in ("other.gdf", "torn.ply", "notes.txt", "absent.gdf"):
         opened.open(tmp_path / name)
         opened.draw()
-        message = opened.stage.work.message
+        message = opened.main_view.work.message
         assert message is not None
         assert message.error
         assert name in message.text
         assert "\n" not in message.text
-        assert opened.stage.work.view == before
+        assert opened.main_view.work.view == before
 
 
 @pytest.mark.gl
@@ -109,10 +109,10 @@ def test_glfw_hands_dropped_files_to_the_next_turn_of_the_loop(
     drop = glfw.set_drop_callback(opened.window.handle, None)
     names = (ctypes.c_char_p * 1)(str(tmp_path / "torn.ply").encode())
     drop(opened.window.handle, len(names), names)
-    assert opened.stage.patience() == 0.0, "the loop wakes"
+    assert opened.main_view.next_frame_delay() == 0.0, "the loop wakes"
     for path in opened._take_dropped():
         opened.open(path)
     opened.draw()
-    assert opened.stage.work.message is not None
-    assert "torn.ply" in opened.stage.work.message.text
+    assert opened.main_view.work.message is not None
+    assert "torn.ply" in opened.main_view.work.message.text
     assert opened._take_dropped() == []

@@ -34,16 +34,16 @@ def test_the_title_and_the_recent_files_are_shown_and_the_file_is_found_again(
 ) -> None:
     assert opened.document.title == "b\\udce4r.ply"
     press(opened, "Ctrl+O")
-    assert opened.stage.recent == (opened.document.path,) == recent.read(tmp_path / "memory")
+    assert opened.main_view.recent == (opened.document.path,) == recent.read(tmp_path / "memory")
 
 
 def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: application.App) -> None:
     press(opened, "Ctrl+S")
-    dialog = opened.stage.work.dialog
+    dialog = opened.main_view.work.dialog
     assert dialog is not None
     assert dialog.text.endswith("b\udce4r.session.json"), "the path stays the file's own"
     press(opened, "Enter")
-    dialog = opened.stage.work.dialog
+    dialog = opened.main_view.work.dialog
     assert dialog is not None
     assert "it is not UTF-8; rename it" in dialog.error
 
@@ -51,6 +51,6 @@ def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: applicati
 def test_a_message_with_such_a_name_is_shown(opened: application.App, tmp_path: Path) -> None:
     opened.open(tmp_path / os.fsdecode(b"no\xff.gdf"))
     opened.draw()
-    message = opened.stage.work.message
+    message = opened.main_view.work.message
     assert message is not None
     assert "no\\udcff.gdf" in message.text

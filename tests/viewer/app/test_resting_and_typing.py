@@ -36,7 +36,7 @@ def test_a_tooltip_opens_under_a_mouse_that_rests_and_then_nothing_is_drawn(
     assert not tooltip_is_open()
     hand.rest()
     assert tooltip_is_open()
-    assert hand.stage.patience() is None
+    assert hand.main_view.next_frame_delay() is None
 
 
 def test_other_frames_meanwhile_do_not_take_the_tooltips_place(hand: Rig) -> None:
@@ -48,9 +48,9 @@ def test_other_frames_meanwhile_do_not_take_the_tooltips_place(hand: Rig) -> Non
 
 
 def test_rest_takes_a_bounded_number_of_frames() -> None:
-    made = pace.Pace()
+    made = pace.FramePacer()
     frames = 0
-    while (wait := made.patience(())) is not None:
+    while (wait := made.next_frame_delay(())) is not None:
         made.step(max(wait, 1 / 60))
         frames += 1
     assert frames == 2 * pace.SETTLE_FRAMES + 1
@@ -67,7 +67,7 @@ def type_fast(hand: Rig, text: str, *keys: tuple[imgui.Key, str]) -> None:
         pressed.append(Press(chord, event_id=inputs.next_event_id()))
         hand.io.add_key_event(key, True)
         hand.io.add_key_event(key, False)
-    hand.stage.wake()
+    hand.main_view.wake()
     hand.frame(keys=Keys(tuple(pressed)))
     hand.settle()
 
@@ -78,7 +78,7 @@ def test_a_value_typed_faster_than_frames_arrives_whole_and_before_enter(hand: R
     hand.modifier(imgui.Key.mod_ctrl, False)
     type_fast(hand, "0.1122", (imgui.Key.enter, "Enter"))
     assert hand.strengths[0] == pytest.approx(0.1122)
-    assert hand.stage.work.renaming is None, "this Enter was the field's"
+    assert hand.main_view.work.renaming is None, "this Enter was the field's"
 
 
 def test_what_follows_the_click_at_once_is_typed_too(hand: Rig) -> None:
@@ -92,21 +92,21 @@ def test_what_follows_the_click_at_once_is_typed_too(hand: Rig) -> None:
 
 
 def test_keys_wait_while_a_text_field_opens(hand: Rig) -> None:
-    hand.stage.wake()
+    hand.main_view.wake()
     hand.frame(keys=Keys((Press("Enter"), Press("B"))))
-    assert hand.stage.opening
+    assert hand.main_view.opening
     hand.settle()
-    assert hand.stage.work.renaming is not None
-    assert not hand.stage.work.view.brush.active, "the letter belongs to the name"
+    assert hand.main_view.work.renaming is not None
+    assert not hand.main_view.work.view.brush.active, "the letter belongs to the name"
 
 
 def test_escape_closes_the_list_of_keys_first(hand: Rig) -> None:
     hand.key("F1")
     hand.key("Escape")
-    assert not hand.stage.work.help
-    assert hand.stage.work.focus is not None
+    assert not hand.main_view.work.help
+    assert hand.main_view.work.focus is not None
     hand.key("Escape")
-    assert hand.stage.work.focus is None
+    assert hand.main_view.work.focus is None
 
 
 def test_the_chosen_segment_keeps_its_colour_under_the_mouse(hand: Rig) -> None:

@@ -35,8 +35,8 @@ def test_every_question_lies_within_the_window_with_eight_recent_files(
 ) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
-        hand.stage.recent = tuple(Path(f"/scenes/{name}_{i}.gdf") for i in range(recent.MOST))
-        hand.stage.ask(
+        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.gdf") for i in range(recent.MOST))
+        hand.main_view.ask(
             Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
         )
         hand.frame(4)
@@ -52,25 +52,25 @@ def test_every_question_lies_within_the_window_with_eight_recent_files(
 def test_the_controls_of_the_timeline_stay_in_a_narrow_window(points: tuple[int, int]) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         hand.key("K")
-        assert hand.stage.work.player.shown
+        assert hand.main_view.work.player.shown
         (bar,) = windows("timeline")
         assert bar.pos.y + bar.size.y <= points[1]
         assert bar.content_size.x <= bar.size.x
         y = points[1] - timeline_bar.ROW_PX + 6.0
         hand.click(30.0, y)
-        assert hand.stage.work.view.timeline.keys[0].easing == "linear"
+        assert hand.main_view.work.view.timeline.keys[0].easing == "linear"
         hand.click(92.0, y)
-        assert hand.stage.work.view.timeline.ping_pong
+        assert hand.main_view.work.view.timeline.ping_pong
 
 
 def test_home_is_upright_and_framed_under_another_up_axis() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (700, 640)) as hand:
-        first = hand.stage.work.view.camera
+        first = hand.main_view.work.view.camera
         hand.key("Shift+F")
-        assert hand.stage.work.view.camera == first
+        assert hand.main_view.work.view.camera == first
         turned_by_hand(hand, (0.0, 0.0, 1.0))
         hand.key("Shift+F")
-        home = hand.stage.work.view.camera
+        home = hand.main_view.work.view.camera
         assert home.up == (0.0, 0.0, 1.0)
         fitted = turntable.fit_subject(home, bear().scene, 400 / 640)
         assert home.distance == pytest.approx(fitted.distance, rel=1e-4), (
@@ -79,12 +79,12 @@ def test_home_is_upright_and_framed_under_another_up_axis() -> None:
         assert home.pivot == pytest.approx(fitted.pivot, abs=1e-3)
         turned_by_hand(hand, first.up)
         hand.key("Shift+F")
-        assert hand.stage.work.view.camera == first
+        assert hand.main_view.work.view.camera == first
 
 
 def turned_by_hand(hand: Rig, up: tuple[float, float, float]) -> None:
-    camera = turntable.with_up(hand.stage.work.view.camera, up)
-    hand.stage.work = workspace.with_camera(hand.stage.work, replace(camera, azimuth=70.0))
+    camera = turntable.with_up(hand.main_view.work.view.camera, up)
+    hand.main_view.work = workspace.with_camera(hand.main_view.work, replace(camera, azimuth=70.0))
 
 
 def test_the_first_look_under_an_axis_is_the_first_camera_that_has_it() -> None:

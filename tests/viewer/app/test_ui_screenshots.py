@@ -90,7 +90,7 @@ def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
 def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("F1")
-        hand.stage.tell(
+        hand.main_view.show_message(
             "shirt.gdf was made for another scene: it has 41 203 Gaussians, bear.ply has 1 500", True
         )
         hand.settle()
@@ -117,8 +117,10 @@ def test_a_value_being_typed(screenshot: Compare) -> None:
 def test_the_timings_of_a_picture(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("F10")
-        hand.stage.canvas.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500, share=0.03)
-        hand.stage.latencies_ms.extend([20.0, 21.0, 34.0])
+        hand.main_view.canvas.timings = FrameTimings(
+            1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500, share=0.03
+        )
+        hand.main_view.latencies_ms.extend([20.0, 21.0, 34.0])
         hand.frame()
         screenshot("ui_timings", hand.image()[:210, :240])
 
@@ -160,8 +162,8 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
             hand.key(chord)
         hand.frame(5)
         hand.wheel(900.0, 400.0, -100.0)
-        hand.stage.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
-        hand.stage.ask(Dialog("open"))
+        hand.main_view.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+        hand.main_view.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())
 

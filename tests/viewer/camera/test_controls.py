@@ -225,7 +225,7 @@ def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
     row = LayerRow(3, (0.5, 0.5, 0.5), (), "", Bounds())
     facts = SceneFacts("bear.ply", 3, Bounds(), (row,))
     for layers in ((), (LayerState(0, "scarf", 0.5),)):
-        work = workspace.opened(ViewState(layers=layers))
+        work = workspace.new_workspace(ViewState(layers=layers))
         for key in controls.KEYS:
             after = workspace.perform(work, key.action, facts)
             assert usable(after.view.camera)

@@ -17,7 +17,7 @@ from progdf.gaussians import ATTRIBUTES, normalize_quats
 from tests.helpers.sessions import full_view
 from tests.helpers.ui_rig import bear
 from viewer.files import document, session
-from viewer.files.session import Session
+from viewer.files.session import WindowSession
 from viewer.pictures import film
 from viewer.render.engine import Engine
 from viewer.state import timeline
@@ -29,7 +29,7 @@ SMALL = ("--size", "64x48", "--engine", "cpu")
 def saved(folder: Path, view: ViewState) -> Path:
     """work.session.json in `folder`, beside the bear and its edits."""
     scene, *gdfs = bear().save(folder)
-    session.save(folder / "work.session.json", Session(document.load(scene, gdfs), view))
+    session.save(folder / "work.session.json", WindowSession(document.load(scene, gdfs), view))
     return folder / "work.session.json"
 
 
@@ -68,7 +68,7 @@ def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) ->
     opened = document.load(scene, [scarf, ears, ears])
     for layers in (view.layers, three, three[::-1]):
         shown = replace(view, layers=layers)
-        session.save(here / "work.session.json", Session(opened, shown))
+        session.save(here / "work.session.json", WindowSession(opened, shown))
         assert run("export", "--session", "work.session.json", "-o", "edited.ply") == 0
         expected, found = Engine(None, opened.scene, opened.gdfs).gaussians(shown), load_ply("edited.ply")
         for name in ATTRIBUTES:
@@ -97,7 +97,7 @@ def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: 
     view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
     scene, _, ears = bear().save(here)
     opened = document.load(scene, [ears, ears])
-    session.save(here / "work.session.json", Session(opened, view))
+    session.save(here / "work.session.json", WindowSession(opened, view))
     for name, given in (("own", ()), ("sum", ("--blend", "sum"))):
         assert run("export", "work.session.json", "--set", "ears=1", *given, "-o", f"{name}.ply") == 0
         shown = replace(view, blend=given[1] if given else view.blend)
@@ -166,7 +166,7 @@ def test_the_sessions_own_timeline_can_be_filmed(here: Path) -> None:
     assert run(*given, "-o", "frames") == 0
     assert len(list(Path("frames").iterdir())) == 9
     expected = Engine(None, bear().scene, bear().gdfs).image(
-        timeline.shown_at(view.timeline, 5, view), (64, 48)
+        timeline.state_at(view.timeline, 5, view), (64, 48)
     )
     found = np.asarray(Image.open("frames/frame_0005.png")).astype(int)
     assert np.abs(found - film.to_pixels(expected)).max() <= 1

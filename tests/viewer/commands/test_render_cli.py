@@ -22,7 +22,7 @@ from progdf.io.cameras import read_camera, save_cameras
 from progdf.rasterize import render
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import ViewCamera
-from viewer.commands.arguments import fitted, layers_of, parse_orbit
+from viewer.commands.arguments import fit_camera, layers_of, parse_orbit
 from viewer.files.document import load_edits
 from viewer.pictures import film
 
@@ -306,10 +306,10 @@ def test_the_last_camera_is_minus_one(folder: Path, stack: Stack) -> None:
 
 def test_another_size_shows_the_same_height_undistorted(stack: Stack) -> None:
     camera = stack.demo.cameras[0]
-    wide = fitted(camera, (2 * camera.width, camera.height))
+    wide = fit_camera(camera, (2 * camera.width, camera.height))
     assert float(wide.K[0, 0]) == float(wide.K[1, 1]) == float(camera.K[1, 1])
     assert float(wide.K[0, 2]) == camera.width
-    half = fitted(camera, (camera.width // 2, camera.height // 2))
+    half = fit_camera(camera, (camera.width // 2, camera.height // 2))
     assert torch.allclose(half.K, camera.resized(camera.width // 2, camera.height // 2).K)
 
 

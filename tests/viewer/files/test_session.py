@@ -24,7 +24,7 @@ from viewer.app import app as application
 from viewer.camera.view_camera import eye, from_camera, to_camera
 from viewer.files import json_form as plain
 from viewer.files import session
-from viewer.files.session import Session
+from viewer.files.session import WindowSession
 from viewer.state.view_state import Comparison
 
 
@@ -135,21 +135,21 @@ def test_what_an_older_file_does_not_hold_has_its_default(saved: Path) -> None:
 
 def test_arrays_come_back_bit_for_bit() -> None:
     for array in (np.linspace(0, 1, 7, dtype=np.float32), np.zeros((0, 3), np.uint8)):
-        packed = json.loads(json.dumps(plain.plain(array)))
-        again = plain.restored(np.ndarray, packed)
+        packed = json.loads(json.dumps(plain.to_json(array)))
+        again = plain.from_json(np.ndarray, packed)
         assert again.dtype == array.dtype
         assert np.array_equal(again, array)
-    with pytest.raises(plain.NotPlainError):
-        plain.restored(np.ndarray, {"dtype": "O", "shape": [1], "zlib": ""})
-    with pytest.raises(plain.NotPlainError):
-        plain.restored(np.ndarray, {"dtype": "<f4", "shape": [1 << 40], "zlib": ""})
+    with pytest.raises(plain.JsonFormError):
+        plain.from_json(np.ndarray, {"dtype": "O", "shape": [1], "zlib": ""})
+    with pytest.raises(plain.JsonFormError):
+        plain.from_json(np.ndarray, {"dtype": "<f4", "shape": [1 << 40], "zlib": ""})
 
 
 def test_a_save_that_fails_leaves_the_old_session(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = saved.read_bytes()
     broken = replace(full_view(), background=(float("nan"), 0.0, 0.0))
     with pytest.raises(ValueError, match="JSON"):
-        session.save(saved, Session(opened_document(saved.parent), broken))
+        session.save(saved, WindowSession(opened_document(saved.parent), broken))
     assert saved.read_bytes() == before
     assert not list(saved.parent.glob(".*"))
 
@@ -167,7 +167,7 @@ def test_info_tells_what_a_session_holds(saved: Path, capsys: pytest.CaptureFixt
 
 def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: Path) -> None:
     view = replace(full_view(), compare=Comparison())
-    session.save(saved, Session(opened_document(saved.parent), view))
+    session.save(saved, WindowSession(opened_document(saved.parent), view))
     out, size = tmp_path / "a.png", ("--size", "64x48", "--engine", "cpu")
     assert main(["render", "--session", str(saved), *size, "-o", str(out)]) == 0
     from viewer.render.engine import Engine

@@ -31,7 +31,7 @@ STACK = ViewState(
 
 @dataclass
 class Hand:
-    """Draws the panel frame by frame, as the stage does, and keeps what it gives back."""
+    """Draws the panel frame by frame, as the main view does, and keeps what it gives back."""
 
     ui: UiContext
     work: Workspace
@@ -48,7 +48,7 @@ class Hand:
         self.work = replace(self.work, view=result.state, focus=result.focus)
         self.actions += result.actions
         if not imgui.is_any_item_active():
-            self.work = workspace.settled(self.work)
+            self.work = workspace.record_undo(self.work)
 
     def move(self, x: float, y: float) -> None:
         imgui.get_io().add_mouse_pos_event(x * self.ui.scale, y * self.ui.scale)
@@ -81,7 +81,7 @@ class Hand:
 
 
 def hand_on(view: ViewState, scale: float = 1.0) -> Hand:
-    hand = Hand(UiContext(scale), workspace.opened(view))
+    hand = Hand(UiContext(scale), workspace.new_workspace(view))
     io = imgui.get_io()
     io.display_size = imgui.ImVec2(SIZE[0] * scale, SIZE[1] * scale)
     io.delta_time = 1 / 60
@@ -109,7 +109,7 @@ def at(strength: float) -> float:
 
 
 def test_drawing_changes_nothing(hand: Hand) -> None:
-    assert hand.work == workspace.opened(STACK)
+    assert hand.work == workspace.new_workspace(STACK)
     assert hand.actions == []
 
 
@@ -314,8 +314,8 @@ def test_long_names_are_shortened_to_their_room() -> None:
     hand = hand_on(STACK)
     imgui.new_frame()
     room = imgui.calc_text_size("a long name").x
-    assert widgets.elided("a long name", room) == "a long name"
-    short = widgets.elided("a long name that goes on and on", room)
+    assert widgets.elide("a long name", room) == "a long name"
+    short = widgets.elide("a long name that goes on and on", room)
     assert short.endswith("…")
     assert imgui.calc_text_size(short).x <= room
     imgui.render()

@@ -34,7 +34,7 @@ def keyed(view: ViewState | None = None, length: int = 40) -> ViewState:
     there = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 60.0))
     layers = (replace(view.layers[0], strength=1.0), view.layers[1])
     made = timeline.with_key(made, length // 2, replace(there, layers=layers))
-    return replace(view, timeline=timeline.eased(made, length // 2, "linear"))
+    return replace(view, timeline=timeline.set_easing(made, length // 2, "linear"))
 
 
 @pytest.fixture
@@ -48,35 +48,35 @@ def at(hand: Rig, frame: float) -> tuple[float, float]:
     """Where a frame of the ruler stands on the window."""
     left = 10.0 + 3 * 25.0 + 2 * 2.0 + 10.0
     wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar._SETTINGS_PX
-    shown = hand.stage.work.view.timeline
+    shown = hand.main_view.work.view.timeline
     return timeline_bar.place(shown, frame, left + 8.0, wide - 16.0), WINDOW[1] - 24.0
 
 
 def frames_of(hand: Rig) -> list[int]:
-    return [key.frame for key in hand.stage.work.view.timeline.keys]
+    return [key.frame for key in hand.main_view.work.view.timeline.keys]
 
 
 def test_dragging_the_playhead_moves_strengths_and_picture_and_leaves_nothing_to_undo(hand: Rig) -> None:
     before = hand.picture()
     hand.drag(at(hand, 5), at(hand, 20))
-    assert hand.stage.work.player.frame == 20
+    assert hand.main_view.work.player.frame == 20
     assert hand.strengths == [1.0, 0.3]
     assert np.abs(hand.picture().astype(int) - before).max() > 50
-    assert hand.stage.work.past.past == ()
+    assert hand.main_view.work.past.past == ()
 
 
 def test_dragging_a_key_moves_it_with_the_playhead_as_one_entry(hand: Rig) -> None:
     hand.drag(at(hand, 20), at(hand, 31))
     assert frames_of(hand) == [0, 31]
-    assert hand.stage.work.player.frame == 31
-    assert len(hand.stage.work.past.past) == 1
+    assert hand.main_view.work.player.frame == 31
+    assert len(hand.main_view.work.past.past) == 1
     hand.key("Ctrl+Z")
     assert frames_of(hand) == [0, 20]
 
 
 def test_a_click_on_a_key_goes_there_and_delete_takes_it_away(hand: Rig) -> None:
     hand.drag(at(hand, 20.4), at(hand, 20.4))
-    assert (hand.stage.work.player.frame, frames_of(hand)) == (20, [0, 20])
+    assert (hand.main_view.work.player.frame, frames_of(hand)) == (20, [0, 20])
     hand.key("Delete")
     assert frames_of(hand) == [0]
     hand.key("Ctrl+Z")
@@ -88,7 +88,7 @@ def test_k_after_a_drag_of_a_slider_sets_a_key_and_two_undos_take_both_back(hand
     hand.drag(hand.slider(1, 0.3), hand.slider(1, 0.9))
     hand.key("K")
     assert frames_of(hand) == [0, 1, 20]
-    assert dict(hand.stage.work.view.timeline.keys[1].strengths)[1] == pytest.approx(0.9, abs=0.01)
+    assert dict(hand.main_view.work.view.timeline.keys[1].strengths)[1] == pytest.approx(0.9, abs=0.01)
     hand.key("Ctrl+Z")
     assert frames_of(hand) == [0, 20]
     hand.key("Ctrl+Z")
@@ -97,33 +97,33 @@ def test_k_after_a_drag_of_a_slider_sets_a_key_and_two_undos_take_both_back(hand
 
 def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(hand: Rig) -> None:
     hand.key("Space")
-    started = hand.stage.work.player.frame
+    started = hand.main_view.work.player.frame
     hand.frame(30)
-    assert hand.stage.work.player.frame - started == pytest.approx(30 * STEP_S * 24, abs=1)
-    waits = hand.stage.patience()
+    assert hand.main_view.work.player.frame - started == pytest.approx(30 * STEP_S * 24, abs=1)
+    waits = hand.main_view.next_frame_delay()
     assert waits is not None
     assert 0.0 < waits <= 1 / 24, "it sleeps until the next frame of the film, not less"
-    assert len(hand.stage.latencies_ms) == 0, "a film is no slider"
+    assert len(hand.main_view.latencies_ms) == 0, "a film is no slider"
     hand.key("Space")
-    paused, drawn = hand.stage.work.player.frame, hand.stage.drawn
+    paused, drawn = hand.main_view.work.player.frame, hand.main_view.pictures_drawn
     hand.frame(60)
-    assert (hand.stage.work.player.frame, hand.stage.drawn) == (paused, drawn)
-    assert hand.stage.patience() is None
-    assert hand.stage.work.past.past == ()
+    assert (hand.main_view.work.player.frame, hand.main_view.pictures_drawn) == (paused, drawn)
+    assert hand.main_view.next_frame_delay() is None
+    assert hand.main_view.work.past.past == ()
 
 
 def test_a_frame_between_two_of_the_film_draws_no_splats(hand: Rig) -> None:
     hand.key("Space")
-    drawn, frame = hand.stage.drawn, hand.stage.work.player.frame
+    drawn, frame = hand.main_view.pictures_drawn, hand.main_view.work.player.frame
     hand.frame(60)
-    assert hand.stage.drawn - drawn <= (hand.stage.work.player.frame - frame) % 41 + 1
+    assert hand.main_view.pictures_drawn - drawn <= (hand.main_view.work.player.frame - frame) % 41 + 1
 
 
 def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) -> None:
     seen = []
     for chord in (".", ".", ",", "Shift+.", "Shift+.", "Shift+,"):
         hand.key(chord)
-        seen.append(hand.stage.work.player.frame)
+        seen.append(hand.main_view.work.player.frame)
     assert seen == [1, 2, 1, 20, 40, 20]
 
 
@@ -138,27 +138,27 @@ def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
     hand.move(22.0, y)
     hand.press()
     hand.release()
-    assert hand.stage.work.player.playing
+    assert hand.main_view.work.player.playing
     hand.key("Space")
     settings = WINDOW[0] - panel.WIDTH_PX - 10.0 - timeline_bar._SETTINGS_PX + 12.0
     hand.move(settings + 30.0, y)
     hand.press()
     hand.release()
-    assert hand.stage.work.view.timeline.keys[0].easing != keyed().timeline.keys[0].easing or (
-        hand.stage.work.view.timeline.keys[1].easing != "linear"
+    assert hand.main_view.work.view.timeline.keys[0].easing != keyed().timeline.keys[0].easing or (
+        hand.main_view.work.view.timeline.keys[1].easing != "linear"
     )
     hand.move(settings + 80.0, y)
     hand.press()
     hand.release()
-    assert hand.stage.work.view.timeline.ping_pong
+    assert hand.main_view.work.view.timeline.ping_pong
     hand.drag((settings + 120.0, y), (settings + 160.0, y))
-    assert hand.stage.work.view.timeline.length > 40
+    assert hand.main_view.work.view.timeline.length > 40
 
 
 def test_what_the_bar_covers_is_not_the_pictures_to_orbit(hand: Rig) -> None:
-    camera = hand.stage.work.view.camera
+    camera = hand.main_view.work.view.camera
     hand.drag((300.0, WINDOW[1] - 44.0), (380.0, WINDOW[1] - 44.0))
-    assert hand.stage.work.view.camera == camera
+    assert hand.main_view.work.view.camera == camera
 
 
 def test_hiding_the_interface_hides_the_bar(hand: Rig) -> None:
@@ -174,9 +174,9 @@ def test_ctrl_k_saves_the_timeline_and_render_makes_the_frames_of_it_that_the_wi
 ) -> None:
     hand.key("Ctrl+K")
     saved = tmp_path / "bear_timeline_001.json"
-    view = hand.stage.work.view
+    view = hand.main_view.work.view
     assert timeline_file.load(saved, view.layers) == view.timeline
-    message = hand.stage.work.message
+    message = hand.main_view.work.message
     assert message is not None
     assert saved.name in message.text
     monkeypatch.chdir(tmp_path)
@@ -189,8 +189,8 @@ def test_ctrl_k_saves_the_timeline_and_render_makes_the_frames_of_it_that_the_wi
     assert names == [f"frame_{i:04d}.png" for i in range(41)]
     assert all((Path("shown") / n).read_bytes() == (Path("again") / n).read_bytes() for n in names)
     for frame in (0, 13, 20):
-        state = timeline.shown_at(view.timeline, frame, view)
-        expected = film.to_pixels(hand.stage.engine.image(state, (64, 48)))
+        state = timeline.state_at(view.timeline, frame, view)
+        expected = film.to_pixels(hand.main_view.engine.image(state, (64, 48)))
         found = np.asarray(Image.open(f"shown/frame_{frame:04d}.png"))
         assert np.abs(found.astype(int) - expected).max() <= 1
 

@@ -53,27 +53,27 @@ def test_y_shows_the_original_left_and_the_edited_right_of_the_divider(draw: str
 @pytest.mark.gl
 def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
     hand.key("Y")
-    before, drawn = hand.stage.work.view.camera, hand.stage.drawn
+    before, drawn = hand.main_view.work.view.camera, hand.main_view.pictures_drawn
     hand.drag((170.0, 300.0), (100.0, 310.0))
-    assert hand.stage.work.view.compare.divider == pytest.approx(100 / 340)
-    assert (hand.stage.work.view.camera, hand.stage.drawn) == (before, drawn)
+    assert hand.main_view.work.view.compare.divider == pytest.approx(100 / 340)
+    assert (hand.main_view.work.view.camera, hand.main_view.pictures_drawn) == (before, drawn)
     left, right = beside_line(hand.picture(), 100)
     assert np.array_equal(left, beside_line(whole(0.0, 0.0), 100)[0])
     assert np.array_equal(right, beside_line(whole(1.0, 1.0), 100)[1])
     hand.drag((100.0, 300.0), (-50.0, 300.0))
-    assert hand.stage.work.view.compare.divider == 0.0
-    assert hand.stage.work.past.past == (), "where one looks is not an edit"
+    assert hand.main_view.work.view.compare.divider == 0.0
+    assert hand.main_view.work.past.past == (), "where one looks is not an edit"
 
 
 @pytest.mark.gl
 def test_beside_the_divider_a_drag_turns_both_sides(hand: Rig) -> None:
     hand.key("Y")
     hand.drag((250.0, 300.0), (280.0, 300.0))
-    view = hand.stage.work.view
+    view = hand.main_view.work.view
     assert view.compare.divider == 0.5
     left, right = beside_line(hand.picture(), 170)
     for side, shown in ((left, replace(view, layers=())), (right, view)):
-        image = hand.stage.engine.image(replace(shown, compare=Comparison()), SIZE)
+        image = hand.main_view.engine.image(replace(shown, compare=Comparison()), SIZE)
         expected = beside_line(np.clip(image, 0, 1) * 255, 170)[0 if side is left else 1]
         assert np.abs(side - expected).max() <= 0.51
 
@@ -94,16 +94,16 @@ def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
 @pytest.mark.gl
 def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_psnr(hand: Rig) -> None:
     hand.key("Shift+Y")
-    view = hand.stage.work.view
-    edited = hand.stage.engine.image(view, SIZE).clip(0, 1)
-    original = hand.stage.engine.image(replace(view, layers=()), SIZE).clip(0, 1)
+    view = hand.main_view.work.view
+    edited = hand.main_view.engine.image(view, SIZE).clip(0, 1)
+    original = hand.main_view.engine.image(replace(view, layers=()), SIZE).clip(0, 1)
     expected = np.round((4.0 * np.abs(edited - original)).clip(0, 1) * 255)
     hand.frame()
     assert np.abs(hand.picture()[BANNER:] - expected[BANNER:]).max() <= 1
     assert (hand.picture()[BANNER:] == 0).mean() > 0.5
     found = psnr(torch.from_numpy(edited), torch.from_numpy(original))
-    assert hand.stage.canvas.comparer.psnr == pytest.approx(found, abs=1e-6)
-    hand.stage.change(replace(view, compare=replace(view.compare, amplify=16.0)))
+    assert hand.main_view.canvas.comparer.psnr == pytest.approx(found, abs=1e-6)
+    hand.main_view.change(replace(view, compare=replace(view.compare, amplify=16.0)))
     hand.settle()
     assert hand.picture()[BANNER:].astype(int).sum() > 1.5 * expected[BANNER:].sum()
 
@@ -113,8 +113,8 @@ def test_equal_pictures_have_no_difference() -> None:
     with rig(first_view(bear(), 0.0, 0.0)) as hand:
         hand.key("Shift+Y")
         assert hand.picture()[BANNER:].max() == 0
-        assert hand.stage.canvas.comparer.psnr == math.inf
-        assert hand.stage.canvas.comparer.labels(hand.stage.work.view).line == "difference: none"
+        assert hand.main_view.canvas.comparer.psnr == math.inf
+        assert hand.main_view.canvas.comparer.labels(hand.main_view.work.view).line == "difference: none"
 
 
 @pytest.mark.gl
@@ -134,10 +134,10 @@ def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
     for chord in ("Y", "Shift+Y"):
         hand.key(chord)
         hand.frame(60)  # a tooltip may wait for a second of rest
-        drawn = hand.stage.drawn
+        drawn = hand.main_view.pictures_drawn
         hand.frame(3)
-        assert hand.stage.patience() is None
-        assert hand.stage.drawn == drawn
+        assert hand.main_view.next_frame_delay() is None
+        assert hand.main_view.pictures_drawn == drawn
 
 
 @pytest.mark.gl
@@ -155,10 +155,10 @@ def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) ->
 
 def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:
     view = ViewState()
-    split = compare.switched(view, "split")
+    split = compare.toggle_mode(view, "split")
     assert split.compare.mode == "split"
-    assert compare.switched(split, "split") == view
-    assert compare.switched(split, "difference").compare.mode == "difference"
+    assert compare.toggle_mode(split, "split") == view
+    assert compare.toggle_mode(split, "difference").compare.mode == "difference"
 
 
 @pytest.fixture

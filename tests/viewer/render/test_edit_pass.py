@@ -52,7 +52,7 @@ class Edited:
         self.textures.write(scene)
         self.edit_pass = EditPass(ctx, self.textures, scene, gdfs)
 
-    def bring(self, stack: Stack, blend: str = "normalised", changed: Sequence[int] | None = None) -> None:
+    def update(self, stack: Stack, blend: str = "normalised", changed: Sequence[int] | None = None) -> None:
         edits = frozenset(range(len(self.gdfs)) if changed is None else changed)
         self.edit_pass.run([(edit, layer) for edit, layer in stack if layer.active], blend, edits)
 
@@ -136,7 +136,7 @@ def painted(members: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("blend", BLENDS)
 def test_overlapping_layers_are_what_compose_gives(edited: Edited, blend: str) -> None:
     layers = [Layer(gdf, s) for gdf, s in zip(edited.gdfs, (0.7, 0.4, 1.0, 0.55), strict=True)]
-    edited.bring(list(enumerate(layers)), blend)
+    edited.update(list(enumerate(layers)), blend)
     assert edited.apart(compose_layers(edited.scene, layers, blend)) <= FEW_ULPS
 
 
@@ -147,7 +147,7 @@ def test_painted_weights_gains_and_overshoot_are_what_compose_gives(edited: Edit
         Layer(edited.gdfs[0], 0.6, gains=Gains(geometry=0.0, opacity=0.3)),
         Layer(edited.gdfs[3], 0.9, gains=Gains(colour=0.0), weights=painted(200, 1)),
     ]
-    edited.bring(list(zip((2, 0, 3), layers, strict=True)), blend)
+    edited.update(list(zip((2, 0, 3), layers, strict=True)), blend)
     assert edited.apart(compose_layers(edited.scene, layers, blend)) <= FEW_ULPS
 
 
@@ -171,7 +171,7 @@ def test_any_stack_is_what_compose_gives(
         (edit, Layer(edited.gdfs[edit], s, True, Gains(gain, 1.0, gain), _weights(edited, edit, paints)))
         for edit, s, gain, paints in path
     ]
-    edited.bring(stack, blend)
+    edited.update(stack, blend)
     assert edited.apart(compose_layers(edited.scene, [layer for _, layer in stack], blend)) <= FEW_ULPS
 
 
@@ -181,9 +181,9 @@ def _weights(edited: Edited, edit: int, paints: bool) -> torch.Tensor | None:
 
 @pytest.mark.parametrize("blend", BLENDS)
 def test_strength_zero_is_the_original_bit_for_bit(edited: Edited, blend: str) -> None:
-    edited.bring([(0, Layer(edited.gdfs[0], 0.8)), (2, Layer(edited.gdfs[2], 0.7))], blend)
+    edited.update([(0, Layer(edited.gdfs[0], 0.8)), (2, Layer(edited.gdfs[2], 0.7))], blend)
     assert not edited.same_bits(edited.scene)
-    edited.bring([(0, Layer(edited.gdfs[0], 0.0)), (2, Layer(edited.gdfs[2], -0.0))], blend)
+    edited.update([(0, Layer(edited.gdfs[0], 0.0)), (2, Layer(edited.gdfs[2], -0.0))], blend)
     assert edited.same_bits(edited.scene)
 
 
@@ -192,14 +192,14 @@ def test_strength_zero_is_the_original_bit_for_bit(edited: Edited, blend: str) -
 def test_one_layer_at_full_strength_is_the_recorded_end_bit_for_bit(
     edited: Edited, edit: int, blend: str
 ) -> None:
-    edited.bring([(edit, Layer(edited.gdfs[edit], 1.0))], blend)
+    edited.update([(edit, Layer(edited.gdfs[edit], 1.0))], blend)
     assert edited.same_bits(compose_layers(edited.scene, [Layer(edited.gdfs[edit], 1.0)], blend))
 
 
 def test_rows_of_weight_zero_and_kinds_of_gain_zero_keep_their_bits(edited: Edited) -> None:
     weights = painted(400)
     layer = Layer(edited.gdfs[0], 0.6, gains=Gains(opacity=0.0), weights=weights)
-    edited.bring([(0, layer)])
+    edited.update([(0, layer)])
     unpainted = edited.gdfs[0].region.members[weights == 0.0].numpy()
     for name, got in edited.found().items():
         rows = slice(None) if name == "logit_opacities" else unpainted
@@ -207,8 +207,8 @@ def test_rows_of_weight_zero_and_kinds_of_gain_zero_keep_their_bits(edited: Edit
 
 
 def test_a_layer_leaves_the_members_of_others_alone(edited: Edited) -> None:
-    edited.bring([])
-    edited.bring([(1, Layer(edited.gdfs[1], 0.5))], changed=[1])
+    edited.update([])
+    edited.update([(1, Layer(edited.gdfs[1], 0.5))], changed=[1])
     assert edited.apart(compose_layers(edited.scene, [Layer(edited.gdfs[1], 0.5)])) <= FEW_ULPS
     outside = np.setdiff1d(np.arange(COUNT), edited.gdfs[1].region.members.numpy())
     for name, got in edited.found().items():
@@ -220,9 +220,9 @@ def test_a_layer_leaves_the_members_of_others_alone(edited: Edited) -> None:
 def test_weights_that_torch_writes_into_are_seen(edited: Edited) -> None:
     weights = torch.ones(400)
     layer = Layer(edited.gdfs[0], 0.7, weights=weights)
-    edited.bring([(0, layer)])
+    edited.update([(0, layer)])
     weights[:200] = 0.25
-    edited.bring([(0, layer)])
+    edited.update([(0, layer)])
     assert edited.apart(compose_layers(edited.scene, [layer])) <= FEW_ULPS
 
 
@@ -231,7 +231,7 @@ def test_every_band_of_spherical_harmonics_is_edited(ctx: moderngl.Context, degr
     scene = random_gaussians(300, seed=degree, sh_degree=degree)
     made = Edited(ctx, scene, [gdf_of(scene, 120, 1)])
     layer = Layer(made.gdfs[0], 0.6)
-    made.bring([(0, layer)])
+    made.update([(0, layer)])
     assert made.apart(compose_layers(scene, [layer])) <= FEW_ULPS
     assert made.apart(scene) > 0.1
     made.release()
@@ -258,9 +258,9 @@ def test_every_form_of_field_is_what_compose_gives(ctx: moderngl.Context, kind: 
     gdf = edit_of(scene, some_rows(scene, 150, 3), _fields(150)[kind])
     made = Edited(ctx, scene, [gdf])
     for s in (0.013, 0.5, 0.77, 1.2):
-        made.bring([(0, Layer(gdf, s))])
+        made.update([(0, Layer(gdf, s))])
         assert made.apart(compose_layers(scene, [Layer(gdf, s)])) <= FEW_ULPS, s
-    made.bring([(0, Layer(gdf, 1.0))])
+    made.update([(0, Layer(gdf, 1.0))])
     assert made.same_bits(compose_layers(scene, [Layer(gdf, 1.0)]))
     made.release()
 
@@ -271,7 +271,7 @@ def test_edits_without_members_and_tiny_scenes_are_survived(ctx: moderngl.Contex
     gdfs = [gdf_of(scene, 0, 1), gdf_of(scene, count, 2)]
     made = Edited(ctx, scene, gdfs)
     layers = [Layer(gdf, 0.5) for gdf in gdfs]
-    made.bring(list(enumerate(layers)))
+    made.update(list(enumerate(layers)))
     assert made.apart(compose_layers(scene, layers)) <= FEW_ULPS
     assert EditSample(scene, gdfs).error(made.edit_pass, list(enumerate(layers)), "normalised") <= FEW_ULPS
     assert ctx.error == "GL_NO_ERROR"
@@ -291,7 +291,7 @@ def test_huge_offsets_overflow_as_they_do_on_the_cpu(ctx: moderngl.Context) -> N
     gdf = edit_of(scene, torch.arange(60), replace(field, attributes=big))
     made = Edited(ctx, scene, [gdf])
     for s in (0.3, 1.0, 1.2):
-        made.bring([(0, Layer(gdf, s))])
+        made.update([(0, Layer(gdf, s))])
         assert made.apart(compose_layers(scene, [Layer(gdf, s)])) <= FEW_ULPS, s
     made.release()
 
@@ -328,9 +328,9 @@ def test_what_is_sent_for_a_new_strength_does_not_grow_with_members_or_scene(
     for count, members in ((100, 20), (COUNT, 900)):
         scene = random_gaussians(count)
         made = Edited(ctx, scene, [gdf_of(scene, members, 1)])
-        made.bring([(0, Layer(made.gdfs[0], 0.4))])
+        made.update([(0, Layer(made.gdfs[0], 0.4))])
         sent.clear()
-        made.bring([(0, Layer(made.gdfs[0], 0.5))])
+        made.update([(0, Layer(made.gdfs[0], 0.5))])
         taken.append(sum(sent))
         made.release()
     assert taken[0] == taken[1] < 500
@@ -350,7 +350,7 @@ def test_edits_that_no_texture_can_hold_are_refused(
 def test_the_sample_sees_a_wrong_texel(edited: Edited) -> None:
     sample = EditSample(edited.scene, edited.gdfs)
     stack = [(0, Layer(edited.gdfs[0], 0.5, weights=painted(400))), (3, Layer(edited.gdfs[3], 0.9))]
-    edited.bring(stack, "over")
+    edited.update(stack, "over")
     assert sample.error(edited.edit_pass, stack, "over") <= FEW_ULPS
     middle = int(edited.gdfs[0].region.members[200])
     place = (middle % SPLATS_PER_ROW, middle // SPLATS_PER_ROW, 1, 1)

@@ -25,7 +25,7 @@ from viewer.render import engine as engine_module
 from viewer.render.attribute_updates import GpuEditing
 from viewer.render.engine import Engine, FrameTimings
 from viewer.render.headless import headless_context, is_software
-from viewer.state.paint import encoded
+from viewer.state.paint import encode
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (96, 72)
@@ -133,7 +133,7 @@ def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
     weights = np.linspace(0.0, 1.0, len(stack.gdfs[EARS].region), dtype=np.float32)
     for scarf, ears, gains in ((1.0, 0.0, Gains()), (0.3, 1.2, Gains(geometry=0.5)), (0.0, 0.0, Gains())):
         view = replace(view_of(stack, scarf, ears), blend=blend)
-        painted = replace(view.layers[EARS], paint=encoded(weights), gains=gains)
+        painted = replace(view.layers[EARS], paint=encode(weights), gains=gains)
         view = replace(view, layers=(view.layers[SCARF], painted))
         apart = np.abs(by_gpu.image(view, SIZE) - by_cpu.image(view, SIZE))
         assert float((apart**2).mean()) <= 1e-10, "100 dB; on llvmpipe they are the same"
@@ -207,7 +207,7 @@ def test_the_same_state_draws_nothing(engine: Engine, stack: Stack, monkeypatch:
     view = view_of(stack, 0.5)
     assert engine.needs_draw(view, SIZE)
     engine.image(view, SIZE)
-    draws = Count(monkeypatch, engine._painter, "draw")
+    draws = Count(monkeypatch, engine._renderer, "draw")
     assert not engine.needs_draw(view, SIZE)
     assert not engine.needs_draw(replace(view, overlay=True, panel=False), SIZE)
     engine.image(replace(view, overlay=True), SIZE)
@@ -246,7 +246,7 @@ def test_a_camera_move_composes_nothing(
     view = view_of(stack, 0.5)
     engine.image(view, SIZE)
     composed = Count(monkeypatch, engine._editing, "bring")
-    uploaded = Count(monkeypatch, engine._painter, "update")
+    uploaded = Count(monkeypatch, engine._renderer, "update")
     engine.image(replace(view, camera=replace(view.camera, azimuth=50.0)), SIZE)
     assert (composed.calls, uploaded.calls) == (0, 0)
     assert engine.timings.compose_ms == engine.timings.upload_ms == 0.0

@@ -59,7 +59,7 @@ def row(layer: int) -> float:
 
 
 def layers(hand: Rig) -> tuple[LayerState, ...]:
-    return hand.stage.work.view.layers
+    return hand.main_view.work.view.layers
 
 
 def names(hand: Rig) -> list[str]:
@@ -89,41 +89,46 @@ def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> N
 
 
 def test_what_is_alone_shows_though_its_eye_is_closed_and_nothing_else_does() -> None:
-    view = stack.soloed(THREE, 1)
-    view = stack.changed(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))
-    assert [layer.name for layer in stack.shown(view)] == ["b"]
-    assert [layer.name for layer in stack.shown(stack.soloed(view, 2))] == ["b", "c"]
-    assert stack.shown(stack.all_shown(view)) == THREE.layers
+    view = stack.toggle_solo(THREE, 1)
+    view = stack.change_layer(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))
+    assert [layer.name for layer in stack.visible_layers(view)] == ["b"]
+    assert [layer.name for layer in stack.visible_layers(stack.toggle_solo(view, 2))] == ["b", "c"]
+    assert stack.visible_layers(stack.show_all(view)) == THREE.layers
 
 
 def test_a_layer_moves_within_the_stack_and_stops_at_its_ends() -> None:
     for to, order in ((-5, "bac"), (0, "bac"), (1, "abc"), (2, "acb"), (9, "acb")):
-        assert "".join(layer.name for layer in stack.moved(THREE, 1, to).layers) == order
-    assert stack.moved(THREE, 3, 0) == THREE
+        assert "".join(layer.name for layer in stack.move_layer(THREE, 1, to).layers) == order
+    assert stack.move_layer(THREE, 3, 0) == THREE
 
 
 def test_names_stay_apart_on_one_line_and_never_empty() -> None:
-    assert stack.renamed(THREE, 0, " b\n ").layers[0].name == "b-2"
-    assert stack.renamed(THREE, 0, "  \t ") == THREE
-    assert stack.renamed(THREE, 1, "b") == THREE
-    assert len(stack.renamed(THREE, 0, "x" * 500).layers[0].name) == stack.LONGEST_NAME
+    assert stack.rename_layer(THREE, 0, " b\n ").layers[0].name == "b-2"
+    assert stack.rename_layer(THREE, 0, "  \t ") == THREE
+    assert stack.rename_layer(THREE, 1, "b") == THREE
+    assert len(stack.rename_layer(THREE, 0, "x" * 500).layers[0].name) == stack.LONGEST_NAME
 
 
 def test_a_lock_holds_strength_and_gains() -> None:
     locked = LayerState(0, "a", 0.5, locked=True)
-    for dial in stack.DIALS:
-        assert stack.remap_slider(locked, dial, 0.1) == locked
-        assert stack.dial_value(stack.remap_slider(LayerState(0, "a", 0.5), dial, 0.1), dial) == 0.1
+    for active_slider in stack.SLIDERS:
+        assert stack.with_slider_value(locked, active_slider, 0.1) == locked
+        assert (
+            stack.slider_value(
+                stack.with_slider_value(LayerState(0, "a", 0.5), active_slider, 0.1), active_slider
+            )
+            == 0.1
+        )
 
 
 def test_without_overshoot_nothing_stands_beyond_one() -> None:
     over = stack.with_overshoot(THREE, True)
-    assert stack.nudged(over, 0, "strength", 0.6).layers[0].strength == 1.1
-    assert stack.nudged(over, 0, "strength", 9.0).layers[0].strength == stack.OVERSHOOT
-    assert stack.nudged(over, 0, "colour", 9.0).layers[0].gains.colour == 1.0
-    back = stack.with_overshoot(stack.nudged(over, 0, "strength", 9.0), False)
+    assert stack.nudge(over, 0, "strength", 0.6).layers[0].strength == 1.1
+    assert stack.nudge(over, 0, "strength", 9.0).layers[0].strength == stack.OVERSHOOT
+    assert stack.nudge(over, 0, "colour", 9.0).layers[0].gains.colour == 1.0
+    back = stack.with_overshoot(stack.nudge(over, 0, "strength", 9.0), False)
     assert back.layers[0].strength == 1.0
-    assert parse_strength("130%", stack.most(over)) == stack.OVERSHOOT
+    assert parse_strength("130%", stack.largest_strength(over)) == stack.OVERSHOOT
 
 
 def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
@@ -140,12 +145,12 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     hand.key("Alt+H")
     assert all(layer.enabled and not layer.solo for layer in layers(hand))
     hand.key("G")
-    assert hand.stage.work.view.unfolded == (1,)
+    assert hand.main_view.work.view.unfolded == (1,)
     hand.key("Alt+Down")
     assert names(hand) == ["ears", "scarf"]
-    assert hand.stage.work.focus == 0, "the focus goes with its layer"
+    assert hand.main_view.work.focus == 0, "the focus goes with its layer"
     hand.key("M")
-    assert hand.stage.work.view.blend == BLENDS[1]
+    assert hand.main_view.work.view.blend == BLENDS[1]
     hand.key("O")
     for _ in range(9):
         hand.key("Shift+Right")
@@ -157,41 +162,41 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
 def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
     hand.key("2")
     hand.key("Tab")
-    assert hand.stage.work.dial == "colour", "a change of colour has no other gain"
-    assert hand.stage.work.view.unfolded == (0,)
+    assert hand.main_view.work.active_slider == "colour", "a change of colour has no other gain"
+    assert hand.main_view.work.view.unfolded == (0,)
     hand.key("Shift+Left")
     assert layers(hand)[0].gains == Gains(colour=0.9)
     assert hand.strengths == [0.5, 0.5]
     hand.key("Tab")
-    assert hand.stage.work.dial == "strength"
+    assert hand.main_view.work.active_slider == "strength"
     hand.key("1")
     hand.key("Shift+Tab")
     hand.key("Shift+Tab")
-    assert hand.stage.work.dial == "geometry"
+    assert hand.main_view.work.active_slider == "geometry"
 
 
 def test_every_change_of_a_layer_is_one_undo_entry_and_comes_back(hand: Rig) -> None:
     before = hand.picture()
     for i, chord in enumerate(("Shift+H", "L", "Alt+Down", "O"), 1):
         hand.key(chord)
-        assert len(hand.stage.work.past.past) == i
+        assert len(hand.main_view.work.past.past) == i
     assert not np.array_equal(hand.picture(), before)
     for _ in range(4):
         hand.key("Ctrl+Z")
-    assert hand.stage.work.view == first_view(bear(), 0.5, 0.5)
+    assert hand.main_view.work.view == first_view(bear(), 0.5, 0.5)
     assert np.array_equal(hand.picture(), before)
 
 
 def test_unfolding_is_no_undo_entry(hand: Rig) -> None:
     hand.key("G")
-    assert hand.stage.work.past.past == ()
+    assert hand.main_view.work.past.past == ()
 
 
 @pytest.mark.parametrize(("name", "field"), [("solo", "solo"), ("lock", "locked")])
 def test_the_toggles_of_a_card_turn_their_own_layer(hand: Rig, name: str, field: str) -> None:
     toggle(hand, name, 1)
     assert [getattr(layer, field) for layer in layers(hand)] == [False, True]
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
     toggle(hand, name, 1)
     assert not any(getattr(layer, field) for layer in layers(hand))
 
@@ -213,8 +218,8 @@ def test_what_is_alone_is_what_one_sees(hand: Rig) -> None:
 
 
 def test_the_original_is_held_also_while_a_layer_is_alone() -> None:
-    view = stack.soloed(THREE, 0)
-    assert stack.shown(original(view)) == ()
+    view = stack.toggle_solo(THREE, 0)
+    assert stack.visible_layers(original(view)) == ()
 
 
 def test_a_locked_slider_does_not_move(hand: Rig) -> None:
@@ -228,12 +233,12 @@ def test_a_locked_slider_does_not_move(hand: Rig) -> None:
 
 def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> None:
     toggle(hand, "fold", 1)
-    before = hand.stage.engine.gaussians(hand.stage.work.view).sh0.clone()
+    before = hand.main_view.engine.gaussians(hand.main_view.work.view).sh0.clone()
     y = 249.0 + row(1)  # the first gain
     hand.drag((POINTS[0] - 76, y), (LEFT + 90, y))
     assert layers(hand)[1].gains == Gains(geometry=0.0)
-    assert len(hand.stage.work.past.past) == 1
-    after = hand.stage.engine.gaussians(hand.stage.work.view)
+    assert len(hand.main_view.work.past.past) == 1
+    after = hand.main_view.engine.gaussians(hand.main_view.work.view)
     assert torch.equal(after.sh0, before)
     assert torch.equal(after.means, bear().scene.means)
     hand.frame(30)
@@ -249,25 +254,25 @@ def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
         assert names(hand) == ["scarf", "ears"], "the order changes with the release"
     hand.release()
     assert names(hand) == ["ears", "scarf"]
-    assert hand.stage.work.focus == 0
-    assert len(hand.stage.work.past.past) == 1
+    assert hand.main_view.work.focus == 0
+    assert len(hand.main_view.work.past.past) == 1
     hand.key("Ctrl+Z")
     assert names(hand) == ["scarf", "ears"]
-    assert hand.stage.work.focus == 1
+    assert hand.main_view.work.focus == 1
 
 
 def test_a_name_dragged_and_brought_back_changes_nothing(hand: Rig) -> None:
     hand.drag((LEFT + 100, HEADS), (LEFT + 100, HEADS + 30))
-    assert hand.stage.work.past.past == ()
+    assert hand.main_view.work.past.past == ()
 
 
 def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
     hand.double_click(LEFT + 100, HEADS + row(1))
     type_name(hand, "golden ears")
     assert names(hand) == ["scarf", "golden ears"]
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
     assert not imgui.get_io().want_text_input
-    assert hand.stage.work.renaming is None
+    assert hand.main_view.work.renaming is None
 
 
 def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None:
@@ -275,7 +280,7 @@ def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None
     hand.key("Enter")
     type_name(hand, "nothing", imgui.Key.escape)
     assert names(hand) == ["scarf", "ears"]
-    assert hand.stage.work.renaming is None
+    assert hand.main_view.work.renaming is None
     hand.key("Enter")
     type_name(hand, "ears")
     assert names(hand) == ["ears-2", "ears"]
@@ -287,27 +292,27 @@ def test_a_click_on_a_splat_focuses_its_layer_and_a_drag_does_not(hand: Rig) -> 
     hand.key("2")
     at = on_screen(hand, ear)
     hand.drag(at, (at[0] + 40, at[1]))
-    assert hand.stage.work.focus == 0
+    assert hand.main_view.work.focus == 0
     hand.frame(30)  # no double click
     at = on_screen(hand, ear)
-    before = hand.stage.work.view
+    before = hand.main_view.work.view
     click(hand, *at)
-    assert hand.stage.work.focus == 1
-    assert hand.stage.work.view == before
+    assert hand.main_view.work.focus == 1
+    assert hand.main_view.work.view == before
     click(hand, 5.0, 5.0)
-    assert hand.stage.work.focus == 1, "the background is nobody's"
+    assert hand.main_view.work.focus == 1, "the background is nobody's"
 
 
 def on_screen(hand: Rig, point: torch.Tensor) -> tuple[float, float]:
-    camera = to_camera(hand.stage.work.view.camera, round(LEFT), POINTS[1])
+    camera = to_camera(hand.main_view.work.view.camera, round(LEFT), POINTS[1])
     x, y, z = (camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]).tolist()
     return float(camera.K[0, 0]) * x / z + LEFT / 2, float(camera.K[1, 1]) * y / z + POINTS[1] / 2
 
 
 def test_a_double_click_still_sets_the_pivot(hand: Rig) -> None:
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.double_click(*on_screen(hand, bear().scene.means[bear().gdfs[0].region.members].mean(0)))
-    after = hand.stage.work.view.camera
+    after = hand.main_view.work.view.camera
     assert after.pivot != before.pivot
     assert eye(after) == pytest.approx(eye(before), abs=1e-4)
 
@@ -403,31 +408,31 @@ def menu(hand: Rig, layer: int, item: int) -> None:
 def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
     """As the rule "over" has it: the last of the layers, and the first card."""
     click(hand, LEFT + 150, HEADS)
-    assert hand.stage.work.focus == 1
+    assert hand.main_view.work.focus == 1
     hand.key("2")
-    assert hand.stage.work.focus == 0
+    assert hand.main_view.work.focus == 0
     hand.key("Alt+Up")
     assert names(hand) == ["ears", "scarf"]
-    hand.stage.change(stack.added(hand.stage.work.view, 0, "new"))
+    hand.main_view.change(stack.add_layer(hand.main_view.work.view, 0, "new"))
     hand.settle()
     click(hand, LEFT + 150, HEADS)
-    assert layers(hand)[hand.stage.work.focus or 0].name == "new"
+    assert layers(hand)[hand.main_view.work.focus or 0].name == "new"
 
 
 def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> None:
-    before, picture = hand.stage.work.view, hand.picture()
+    before, picture = hand.main_view.work.view, hand.picture()
     menu(hand, 1, 3)
     assert names(hand) == ["scarf"]
-    assert hand.stage.work.focus == 0
+    assert hand.main_view.work.focus == 0
     assert not np.array_equal(hand.picture(), picture)
     hand.key("Ctrl+Z")
-    assert hand.stage.work.view.layers == before.layers
+    assert hand.main_view.work.view.layers == before.layers
     assert np.array_equal(hand.picture(), picture)
     hand.key("1")
     hand.key("Ctrl+Delete")
     hand.key("Ctrl+Delete")
     assert names(hand) == []
-    assert hand.stage.work.focus is None
+    assert hand.main_view.work.focus is None
     hand.key("Ctrl+Delete")
 
 
@@ -437,7 +442,7 @@ def test_the_menu_renames_and_asks_the_window_for_the_rest(hand: Rig) -> None:
     assert names(hand) == ["shawl", "ears"]
     menu(hand, 0, 1)
     menu(hand, 1, 2)
-    assert hand.stage.take_requests() == ("duplicate:0", "replace:1")
+    assert hand.main_view.take_requests() == ("duplicate:0", "replace:1")
     toggle(hand, "menu", 0)
     assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
     hand.modifier(imgui.Key.escape)
@@ -448,21 +453,23 @@ def test_the_menu_renames_and_asks_the_window_for_the_rest(hand: Rig) -> None:
 def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
     hand.double_click(*hand.slider(1, 0.5))
     assert hand.strengths == [0.5, 0.0]
-    assert len(hand.stage.work.past.past) == 1, "on the handle it is one step"
+    assert len(hand.main_view.work.past.past) == 1, "on the handle it is one step"
     lens = (LEFT + 210, 396.0)
     hand.frame(30)
     click(hand, *lens)
-    assert hand.stage.work.view.camera.fov_y != 45.0
+    assert hand.main_view.work.view.camera.fov_y != 45.0
     hand.frame(30)
     hand.double_click(*lens)
     hand.frame(3)
-    assert hand.stage.work.view.camera.fov_y == 45.0
+    assert hand.main_view.work.view.camera.fov_y == 45.0
 
 
 def test_a_replaced_layer_keeps_its_place_strength_and_keys(hand: Rig) -> None:
-    view = stack.changed(hand.stage.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x"))
+    view = stack.change_layer(
+        hand.main_view.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x")
+    )
     view = timeline_with_key(view)
-    after = stack.replaced(view, 0, 7, "ears")
+    after = stack.replace_edit(view, 0, 7, "ears")
     assert after.layers[0] == LayerState(7, "ears-2", 0.3)
     assert after.layers[1] == view.layers[1]
     assert dict(after.timeline.keys[0].strengths) == {7: 0.3, 1: 0.5}

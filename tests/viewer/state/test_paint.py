@@ -39,12 +39,12 @@ def hand() -> Iterator[Rig]:
 
 
 def weights(hand: Rig, layer: int = 0) -> np.ndarray:
-    found = paint.decoded(hand.stage.work.view.layers[layer].paint, len(bear().gdfs[layer].region))
+    found = paint.decode(hand.main_view.work.view.layers[layer].paint, len(bear().gdfs[layer].region))
     return np.ones(len(bear().gdfs[layer].region)) if found is None else found.numpy()
 
 
 def camera_of(hand: Rig) -> Camera:
-    return to_camera(hand.stage.work.view.camera, POINTS[0] - 300, POINTS[1])
+    return to_camera(hand.main_view.work.view.camera, POINTS[0] - 300, POINTS[1])
 
 
 def scarf_on_screen(hand: Rig) -> tuple[float, float]:
@@ -55,38 +55,38 @@ def scarf_on_screen(hand: Rig) -> tuple[float, float]:
 
 def test_paint_survives_its_text_to_a_255th_and_full_paint_is_no_text() -> None:
     drawn = torch.rand(300, generator=torch.Generator().manual_seed(0)).numpy()
-    found = paint.decoded(paint.encoded(drawn), 300)
+    found = paint.decode(paint.encode(drawn), 300)
     assert found is not None
     assert np.abs(found.numpy() - drawn).max() <= 0.5 / 255 + 1e-6
-    assert paint.encoded(np.ones(300, np.float32)) == paint.FULL
-    assert paint.decoded(paint.FULL, 300) is None
+    assert paint.encode(np.ones(300, np.float32)) == paint.FULL
+    assert paint.decode(paint.FULL, 300) is None
 
 
-@pytest.mark.parametrize("text", ["no base64!", "AAAA", paint.encoded(np.zeros(7, np.float32))])
+@pytest.mark.parametrize("text", ["no base64!", "AAAA", paint.encode(np.zeros(7, np.float32))])
 def test_damaged_or_foreign_paint_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ProgdfError, match="paint it anew"):
-        paint.decoded(text, 5)
+        paint.decode(text, 5)
 
 
 def test_a_brush_is_full_inside_fades_to_its_edge_and_reaches_no_further() -> None:
-    stroke = paint.drawn_to(LINE, 0.0, 0.0, ERASE)
+    stroke = paint.extend_stroke(LINE, 0.0, 0.0, ERASE)
     assert stroke.reached.tolist() == pytest.approx([1.0, 1.0, 0.0, 0.0, 0.0])
-    hazy = paint.drawn_to(LINE, 0.0, 0.0, replace(ERASE, softness=1.0))
+    hazy = paint.extend_stroke(LINE, 0.0, 0.0, replace(ERASE, softness=1.0))
     assert hazy.reached.tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0, 0.0])
-    dense = paint.drawn_to(LINE, 0.0, 0.0, ERASE, density=4.0)
+    dense = paint.extend_stroke(LINE, 0.0, 0.0, ERASE, density=4.0)
     assert dense.reached[3] == 1.0, "the radius is in pixels at 1×"
 
 
 def test_a_stroke_does_not_depend_on_how_many_events_it_came_in() -> None:
-    whole = paint.drawn_to(paint.drawn_to(LINE, -20.0, 0.0, ERASE), 25.0, 0.0, ERASE)
+    whole = paint.extend_stroke(paint.extend_stroke(LINE, -20.0, 0.0, ERASE), 25.0, 0.0, ERASE)
     steps = LINE
     for x in np.linspace(-20.0, 25.0, 31):
-        steps = paint.drawn_to(steps, float(x), 0.0, ERASE)
+        steps = paint.extend_stroke(steps, float(x), 0.0, ERASE)
     assert steps.reached == pytest.approx(whole.reached, abs=1e-5)
 
 
 def result(stroke: Stroke, brush: Brush = ERASE, mode: str = "erase") -> np.ndarray:
-    found = paint.decoded(paint.painted(replace(stroke, mode=mode), brush), len(stroke.before))
+    found = paint.decode(paint.apply_stroke(replace(stroke, mode=mode), brush), len(stroke.before))
     return np.ones(len(stroke.before)) if found is None else found.numpy()
 
 
@@ -143,10 +143,10 @@ def test_a_mean_of_neighbours_stays_within_them_and_does_not_depend_on_where_cel
 
 def test_feathering_softens_painted_edges_more_each_time_and_leaves_full_paint_full(hand: Rig) -> None:
     hand.key("Shift+X")
-    assert hand.stage.work.view.layers[0].paint == paint.FULL
+    assert hand.main_view.work.view.layers[0].paint == paint.FULL
     x, y = scarf_on_screen(hand)
-    hand.stage.work = replace(
-        hand.stage.work, view=replace(hand.stage.work.view, brush=replace(ERASE, softness=0.0))
+    hand.main_view.work = replace(
+        hand.main_view.work, view=replace(hand.main_view.work.view, brush=replace(ERASE, softness=0.0))
     )
     hand.drag((x - 15, y), (x + 15, y))
     hard = weights(hand)
@@ -157,7 +157,7 @@ def test_feathering_softens_painted_edges_more_each_time_and_leaves_full_paint_f
         away.append(np.abs(weights(hand) - hard).sum())
     assert 0.0 < away[0] < away[1]
     assert ((weights(hand) > 0.05) & (weights(hand) < 0.95)).sum() > 5
-    assert len(hand.stage.work.past.past) == 3
+    assert len(hand.main_view.work.past.past) == 3
     for _ in range(2):
         hand.key("Ctrl+Z")
     assert (weights(hand) == hard).all()
@@ -184,13 +184,13 @@ def test_shift_held_at_the_press_smooths_for_one_stroke(hand: Rig) -> None:
     hand.drag((x - 15, y), (x, y))
     hand.modifier(imgui.Key.mod_shift, False)
     assert weights(hand).min() > hard.min(), "smoothing brings some back"
-    assert hand.stage.work.view.brush.mode == "erase"
+    assert hand.main_view.work.view.brush.mode == "erase"
 
 
 def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Rig) -> None:
     gdf, scene = bear().gdfs[0], bear().scene
-    front = paint.begun(paint.FULL, gdf, scene, camera_of(hand), through=False)
-    through = paint.begun(paint.FULL, gdf, scene, camera_of(hand), through=True)
+    front = paint.begin_stroke(paint.FULL, gdf, scene, camera_of(hand), through=False)
+    through = paint.begin_stroke(paint.FULL, gdf, scene, camera_of(hand), through=True)
     assert not np.isnan(through.places).any()
     hidden = np.isnan(front.places[:, 0])
     assert 0.2 < hidden.mean() < 0.8, "a scarf goes around the neck"
@@ -200,21 +200,23 @@ def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Ri
 
 
 def test_a_stroke_on_the_picture_takes_the_edit_away_there_as_one_undo_entry(hand: Rig) -> None:
-    camera, before = hand.stage.work.view.camera, hand.picture()
+    camera, before = hand.main_view.work.view.camera, hand.picture()
     x, y = scarf_on_screen(hand)
     hand.drag((x - 15, y), (x + 15, y))
-    assert hand.stage.work.view.camera == camera, "the left button paints"
+    assert hand.main_view.work.view.camera == camera, "the left button paints"
     assert weights(hand).min() < 0.02
     assert weights(hand, 1).min() == 1.0, "only the focused layer"
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
     expected = compose_layers(
         bear().scene,
         [Layer(bear().gdfs[0], 1.0, weights=torch.from_numpy(weights(hand))), Layer(bear().gdfs[1], 1.0)],
     )
-    assert torch.allclose(hand.stage.engine.gaussians(hand.stage.work.view).sh0, expected.sh0, atol=1e-6)
+    assert torch.allclose(
+        hand.main_view.engine.gaussians(hand.main_view.work.view).sh0, expected.sh0, atol=1e-6
+    )
     assert np.abs(hand.picture().astype(int) - before).max() > 20
     hand.key("Ctrl+Z")
-    assert hand.stage.work.view.layers[0].paint == paint.FULL
+    assert hand.main_view.work.view.layers[0].paint == paint.FULL
 
 
 def test_locked_hidden_or_no_layers_are_not_painted_and_the_window_says_why(hand: Rig) -> None:
@@ -223,26 +225,26 @@ def test_locked_hidden_or_no_layers_are_not_painted_and_the_window_says_why(hand
         hand.key(chord)
         hand.drag((x, y), (x + 5, y))
         assert weights(hand).min() == 1.0
-        assert hand.stage.work.message is not None
-        assert told in hand.stage.work.message.text
+        assert hand.main_view.work.message is not None
+        assert told in hand.main_view.work.message.text
         hand.key(chord)
         hand.frame(30)
 
 
 def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
     hand.key("B")
-    assert not hand.stage.work.view.brush.active
+    assert not hand.main_view.work.view.brush.active
     for chord in ("B", "X", "Shift+B", "]", "Shift+["):
         hand.key(chord)
-    assert hand.stage.work.view.brush == Brush(True, 25.0, 0.4, "smooth", True)
+    assert hand.main_view.work.view.brush == Brush(True, 25.0, 0.4, "smooth", True)
     for _ in range(40):
         hand.key("]")
-    assert hand.stage.work.view.brush.radius == paint.LARGEST_PX
+    assert hand.main_view.work.view.brush.radius == paint.LARGEST_PX
     hand.key("Backspace")
     assert weights(hand).max() == 0.0
     hand.key("Shift+Backspace")
-    assert hand.stage.work.view.layers[0].paint == paint.FULL
-    assert hand.stage.work.past.past[0].edit.layers[0].paint == paint.FULL
+    assert hand.main_view.work.view.layers[0].paint == paint.FULL
+    assert hand.main_view.work.past.past[0].edit.layers[0].paint == paint.FULL
 
 
 def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) -> None:
@@ -255,7 +257,7 @@ def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) 
         stack_of(bear().gdfs, [], paint=[f"scarf={tmp_path / name}.npy"])[0] for name in ("scene", "region")
     ]
     assert layers[0] == layers[1]
-    assert layers[0].paint == paint.encoded(of_region)
+    assert layers[0].paint == paint.encode(of_region)
     np.save(tmp_path / "long.npy", np.zeros(3))
     np.save(tmp_path / "large.npy", of_region + 1.0)
     for text, told in (

@@ -27,7 +27,7 @@ from viewer.pictures import compare_labels
 from viewer.render.engine import Engine
 from viewer.state import comparison as compare
 from viewer.state import recordings
-from viewer.state.recordings import Recording
+from viewer.state.recordings import RecordingFile
 from viewer.state.view_state import Comparison, ViewState
 
 AT = 0.4  # a strength between the snapshots at 0.31 and 0.5
@@ -60,14 +60,14 @@ def hand(runs: list[Path]) -> Iterator[Rig]:
 
 def test_the_recording_of_an_edit_is_found_in_its_run_folder(runs: list[Path]) -> None:
     for gdf, path in zip(bear().gdfs, runs[1:], strict=True):
-        assert recordings.found(gdf, path) == Recording(path.with_name(FILE_NAME))
+        assert recordings.find_recording(gdf, path) == RecordingFile(path.with_name(FILE_NAME))
 
 
 def test_between_two_snapshots_the_recording_goes_straight_as_the_runs_own_errors_are_taken(
     runs: list[Path],
 ) -> None:
     scarf = bear().gdfs[0]
-    found = recordings.recorded(scarf, recordings.found(scarf, runs[1]))
+    found = recordings.load_recorded(scarf, recordings.find_recording(scarf, runs[1]))
     trajectory = recording_of(scarf)
     members = scarf.region.members
     for s in (0.0, 0.31, AT, 0.9, 1.0):
@@ -78,31 +78,31 @@ def test_between_two_snapshots_the_recording_goes_straight_as_the_runs_own_error
 
 def test_an_edit_outside_its_run_folder_has_no_recording(runs: list[Path], tmp_path: Path) -> None:
     shutil.copy(runs[1], tmp_path / "alone.gdf")
-    found = recordings.found(bear().gdfs[0], tmp_path / "alone.gdf")
+    found = recordings.find_recording(bear().gdfs[0], tmp_path / "alone.gdf")
     assert (found.path, found.reason) == (None, f"there is no {FILE_NAME} beside alone.gdf")
 
 
 def test_the_recording_of_another_edit_is_not_taken_for_this_ones(runs: list[Path]) -> None:
     ears = bear().gdfs[1]
     save_gdf(runs[1].with_name("ears.gdf"), ears)
-    found = recordings.found(ears, runs[1].with_name("ears.gdf"))
+    found = recordings.find_recording(ears, runs[1].with_name("ears.gdf"))
     assert found.path is None
     assert "belongs to another edit" in found.reason
 
 
 def test_a_damaged_recording_is_no_recording_and_says_why(runs: list[Path]) -> None:
     runs[1].with_name(FILE_NAME).write_bytes(b"\x40\x00\x00\x00\x00\x00\x00\x00{broken")
-    found = recordings.found(bear().gdfs[0], runs[1])
+    found = recordings.find_recording(bear().gdfs[0], runs[1])
     assert found.path is None
     assert "is damaged" in found.reason
 
 
 def test_the_words_say_which_snapshots_are_shown_and_which_edits_have_none() -> None:
-    here, nowhere = Recording(Path("trajectory.safetensors")), Recording()
+    here, nowhere = RecordingFile(Path("trajectory.safetensors")), RecordingFile()
     gdfs = bear().gdfs
 
-    def told(scarf: float, ears: float, *found: Recording) -> str:
-        return recordings.told(first_view(bear(), scarf, ears), gdfs, found)
+    def told(scarf: float, ears: float, *found: RecordingFile) -> str:
+        return recordings.describe(first_view(bear(), scarf, ears), gdfs, found)
 
     assert told(AT, 0.0, here, here) == "recorded, between 0.31 and 0.5"
     assert told(0.5, 0.0, here, here) == "recorded at 0.5"
@@ -120,7 +120,7 @@ def test_alt_y_shows_the_recorded_snapshots_left_and_the_field_right(runs: list[
     recorded, field = (drawn(view, which) for which in ((True, True), (False, False)))
     with rig(view, gdf_paths=runs[1:], draw=draw) as hand:
         hand.key("Alt+Y")
-        assert hand.stage.work.view.compare == Comparison("split", against="recorded")
+        assert hand.main_view.work.view.compare == Comparison("split", against="recorded")
         found = hand.picture().astype(float)
         near = 0.51 if draw == "cpu" else 2.0  # OpenGL is held to the CPU in test_gl_parity
         for side, expected in zip(beside_line(found, 170), (recorded, field), strict=True):
@@ -132,18 +132,18 @@ def test_alt_y_shows_the_recorded_snapshots_left_and_the_field_right(runs: list[
 
 @pytest.mark.gl
 def test_the_psnr_of_field_against_recording_is_told_on_the_fields_side(hand: Rig) -> None:
-    view = hand.stage.work.view
+    view = hand.main_view.work.view
     recorded, field = (drawn(view, which).clip(0, 1) for which in ((True, True), (False, False)))
     expected = psnr(torch.from_numpy(recorded), torch.from_numpy(field))
     hand.key("Alt+Y")
-    comparer = hand.stage.canvas.comparer
+    comparer = hand.main_view.canvas.comparer
     assert comparer.psnr == pytest.approx(expected, abs=1e-3)
-    said = comparer.labels(hand.stage.work.view)
+    said = comparer.labels(hand.main_view.work.view)
     assert said.right == f"field · PSNR {expected:.1f} dB"
     assert said.left == "recorded: scarf 0.31–0.5, ears 0.31–0.5"
     hand.key("Shift+Y")
     assert comparer.psnr == pytest.approx(expected, abs=1e-3)
-    assert comparer.labels(hand.stage.work.view).line == (
+    assert comparer.labels(hand.main_view.work.view).line == (
         f"difference × 4 · PSNR {expected:.1f} dB · {said.left}"
     )
     apart = np.round((4 * np.abs(recorded - field)).clip(0, 1) * 255)
@@ -154,7 +154,7 @@ def test_the_psnr_of_field_against_recording_is_told_on_the_fields_side(hand: Ri
 def test_a_slider_moves_both_sides_at_the_same_strength(hand: Rig) -> None:
     hand.key("Alt+Y")
     hand.drag(hand.slider(0, AT), hand.slider(0, 0.8))
-    view = hand.stage.work.view
+    view = hand.main_view.work.view
     assert view.layers[0].strength == pytest.approx(0.8, abs=0.02)
     expected = drawn(view, (True, True)).clip(0, 1) * 255
     left = beside_line(hand.picture().astype(float), 170)[0]
@@ -164,14 +164,14 @@ def test_a_slider_moves_both_sides_at_the_same_strength(hand: Rig) -> None:
 @pytest.mark.gl
 def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_is_shown(hand: Rig) -> None:
     hand.key("Shift+Y")
-    before, psnr_before = hand.picture(), hand.stage.canvas.comparer.psnr
+    before, psnr_before = hand.picture(), hand.main_view.canvas.comparer.psnr
     hand.key("Y")
     for _ in range(5):
         hand.key("2")  # the lower layer, the scarf
         hand.key("Shift+Right")
     hand.key("Shift+Y")
     assert not np.array_equal(hand.picture()[BANNER:], before[BANNER:])
-    assert hand.stage.canvas.comparer.psnr != psnr_before
+    assert hand.main_view.canvas.comparer.psnr != psnr_before
 
 
 @pytest.mark.gl
@@ -183,7 +183,7 @@ def test_an_edit_without_a_recording_shows_its_field_on_both_sides(runs: list[Pa
         hand.key("Alt+Y")
         left = beside_line(hand.picture().astype(float), 170)[0]
         assert np.abs(left - beside_line(expected, 170)[0]).max() <= 0.51
-        said = hand.stage.canvas.comparer.labels(hand.stage.work.view)
+        said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
         assert said.left == "recorded: scarf 0.31–0.5; field: ears"
 
 
@@ -202,13 +202,13 @@ def test_where_nothing_was_recorded_the_original_is_shown_and_the_reason_told() 
     original = drawn(first_view(bear(), 0.0, 0.0), (False, False)).clip(0, 1) * 255
     with rig(view) as hand:
         hand.key("Alt+Y")
-        said = hand.stage.canvas.comparer.labels(hand.stage.work.view)
+        said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
         assert said.notice == f"Against the original: {recordings.NO_FILE}"
         left = beside_line(hand.picture().astype(float), 170)[0][BANNER:]
         assert np.abs(left - beside_line(original, 170)[0][BANNER:]).max() <= 0.51
         shown = hand.picture()
         hand.key("Alt+Y")
-        assert hand.stage.canvas.comparer.labels(hand.stage.work.view).notice == ""
+        assert hand.main_view.canvas.comparer.labels(hand.main_view.work.view).notice == ""
         assert not np.array_equal(hand.picture()[:100], shown[:100]), "the notice is gone"
 
 
@@ -217,21 +217,21 @@ def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it
     hand.key("Y")
     place = recorded_button(hand)
     hand.click(*place)
-    assert hand.stage.work.view.compare.against == "recorded"
+    assert hand.main_view.work.view.compare.against == "recorded"
     with rig(first_view(bear(), AT, AT)) as bare:
         bare.key("Y")
         bare.click(*place)
-        assert bare.stage.work.view.compare.against == "original"
+        assert bare.main_view.work.view.compare.against == "original"
 
 
 def recorded_button(hand: Rig) -> tuple[float, float]:
     """Where the panel's button "Recorded" is: the first place in its column that chooses it."""
     x = hand.points[0] - 50.0
     for y in range(250, hand.points[1] - 40, 8):
-        before = hand.stage.work.view
+        before = hand.main_view.work.view
         hand.click(x, y)
-        found = hand.stage.work.view.compare.against == "recorded"
-        hand.stage.change(before)
+        found = hand.main_view.work.view.compare.against == "recorded"
+        hand.main_view.change(before)
         hand.settle()
         if found:
             return x, float(y)
@@ -244,7 +244,7 @@ def test_a_recording_that_breaks_after_it_was_found_is_no_crash(runs: list[Path]
         for path in runs[1:]:
             path.with_name(FILE_NAME).unlink()
         hand.key("Alt+Y")
-        said = hand.stage.canvas.comparer.labels(hand.stage.work.view)
+        said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
         assert said.left == compare_labels.ORIGINAL
         assert "does not exist" in said.notice
 
@@ -254,14 +254,14 @@ def test_a_recording_that_does_not_fit_its_edit_is_one_line(runs: list[Path]) ->
     extra = {"members": scarf.region.members}
     save_trajectory(runs[1].with_name(FILE_NAME), recording_of(ears), extra, {})
     with pytest.raises(ProgdfError, match="belongs to another edit"):
-        recordings.recorded(scarf, recordings.found(scarf, runs[1]))
+        recordings.load_recorded(scarf, recordings.find_recording(scarf, runs[1]))
 
 
 def test_against_the_recording_goes_on_with_a_split_and_back_to_the_original() -> None:
-    on = compare.turned(ViewState())
+    on = compare.toggle_against(ViewState())
     assert on.compare == Comparison("split", against="recorded")
-    assert compare.turned(on).compare == Comparison("split")
-    apart = compare.switched(on, "difference")
+    assert compare.toggle_against(on).compare == Comparison("split")
+    apart = compare.toggle_mode(on, "difference")
     assert apart.compare == Comparison("difference", against="recorded")
 
 

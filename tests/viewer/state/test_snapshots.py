@@ -14,17 +14,17 @@ from viewer.state import snapshots, workspace
 
 
 def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
-    work = workspace.opened(first_view(bear(), 0.5, 0.5))
+    work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
 
     def act(work: workspace.Workspace, action: str) -> workspace.Workspace:
-        return workspace.settled(workspace.perform(work, action, facts))
+        return workspace.record_undo(workspace.perform(work, action, facts))
 
     work = act(work, "snapshot")
     assert act(work, "snapshot").snapshots == work.snapshots, "the same twice is once"
     work = act(work, "nudge:0.25")
     work = act(work, "snapshot")
-    assert [s.name for s in snapshots.shown(work.snapshots, work.view)] == ["original", "1", "2"]
+    assert [s.name for s in snapshots.with_original(work.snapshots, work.view)] == ["original", "1", "2"]
     entries = len(work.past.past)
     back = act(work, "restore:1")
     assert [layer.strength for layer in back.view.layers] == [0.5, 0.5]
@@ -43,8 +43,8 @@ def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original(
 
 def test_going_back_keeps_edits_that_were_opened_since_at_zero() -> None:
     view = first_view(bear(), 0.5, 0.5)
-    kept = snapshots.taken((), replace(view, layers=view.layers[:1]))
-    back = snapshots.back_to(view, kept[0])
+    kept = snapshots.take((), replace(view, layers=view.layers[:1]))
+    back = snapshots.restore(view, kept[0])
     assert [(layer.name, layer.strength) for layer in back.layers] == [("scarf", 0.5), ("ears", 0.0)]
 
 
@@ -56,22 +56,22 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
             hand.key(chord)
         hand.wheel(900.0, 400.0, -100.0)
         hand.rest()
-        assert hand.stage.patience() is None, "the small pictures are there"
-        entries, drawn = len(hand.stage.work.past.past), hand.image()[515:565, 745:1005]
+        assert hand.main_view.next_frame_delay() is None, "the small pictures are there"
+        entries, drawn = len(hand.main_view.work.past.past), hand.image()[515:565, 745:1005]
         assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
         hand.move(874.0, 540.0)
         hand.press()
         hand.release()
         assert hand.strengths == [0.5, 0.5]
         assert np.array_equal(hand.picture(), first)
-        assert len(hand.stage.work.past.past) == entries + 1
+        assert len(hand.main_view.work.past.past) == entries + 1
         hand.press(1)
         hand.release(1)
-        assert [kept.name for kept in hand.stage.work.snapshots] == ["1", "2"], "only a menu opens"
+        assert [kept.name for kept in hand.main_view.work.snapshots] == ["1", "2"], "only a menu opens"
         hand.click(874.0 + 30.0, 540.0 + 18.0 + 21.0)
-        assert [kept.name for kept in hand.stage.work.snapshots] == ["2"]
+        assert [kept.name for kept in hand.main_view.work.snapshots] == ["2"]
         hand.key("Ctrl+Z")
-        assert [kept.name for kept in hand.stage.work.snapshots] == ["1", "2"]
+        assert [kept.name for kept in hand.main_view.work.snapshots] == ["1", "2"]
         hand.move(874.0, 540.0)
         hand.press(1)
         hand.release(1)
@@ -81,4 +81,4 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
         hand.settle()
         hand.modifier(imgui.Key.enter)
         hand.settle()
-        assert [kept.name for kept in hand.stage.work.snapshots] == ["dusk", "2"]
+        assert [kept.name for kept in hand.main_view.work.snapshots] == ["dusk", "2"]

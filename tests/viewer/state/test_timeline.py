@@ -34,12 +34,12 @@ def view(scarf: float = 0.2, ears: float = 0.4, **camera: object) -> ViewState:
 def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
     made = timeline.with_key(Timeline(length=length), 0, view(0.0, 1.0, azimuth=170.0, distance=1.0))
     made = timeline.with_key(made, length, view(1.0, 0.5, azimuth=-170.0, distance=100.0))
-    return timeline.eased(made, 0, easing)
+    return timeline.set_easing(made, 0, easing)
 
 
 def act(work: Workspace, *actions: str) -> Workspace:
     for action in actions:
-        work = workspace.settled(workspace.perform(work, action, FACTS))
+        work = workspace.record_undo(workspace.perform(work, action, FACTS))
     return work
 
 
@@ -94,7 +94,7 @@ def test_the_camera_turns_the_shortest_way_and_its_distance_grows_in_proportion(
 
 
 def test_turning_on_over_several_keys_goes_more_than_once_around() -> None:
-    assert tween.unwound([0.0, 170.0, -20.0, 150.0, 0.0]) == [0.0, 170.0, 340.0, 510.0, 360.0]
+    assert tween.unwrap([0.0, 170.0, -20.0, 150.0, 0.0]) == [0.0, 170.0, 340.0, 510.0, 360.0]
 
 
 ups = st.sampled_from([(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0.8, 0.0)])
@@ -130,30 +130,30 @@ def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
 
 
 def test_before_the_first_key_and_after_the_last_everything_rests() -> None:
-    made = timeline.resized(timeline.moved_key(two_keys(), 0, 5), 40)
-    assert timeline.shown_at(made, 0, view()).layers == timeline.shown_at(made, 5, view()).layers
-    assert timeline.shown_at(made, 40, view()).camera == timeline.shown_at(made, 20, view()).camera
+    made = timeline.set_length(timeline.move_key(two_keys(), 0, 5), 40)
+    assert timeline.state_at(made, 0, view()).layers == timeline.state_at(made, 5, view()).layers
+    assert timeline.state_at(made, 40, view()).camera == timeline.state_at(made, 20, view()).camera
 
 
 def test_an_edit_opened_after_the_keys_is_left_alone_and_one_that_is_gone_is_no_trouble() -> None:
     third = LayerState(2, "frost", 0.7)
-    shown = timeline.shown_at(two_keys(), 20, replace(view(), layers=(LAYERS[1], third)))
+    shown = timeline.state_at(two_keys(), 20, replace(view(), layers=(LAYERS[1], third)))
     assert [layer.strength for layer in shown.layers] == [0.5, 0.7]
 
 
 def test_keys_stay_in_order_and_none_stands_on_another_or_off_the_timeline() -> None:
     made = timeline.with_key(two_keys(), 7, view())
     assert [key.frame for key in made.keys] == [0, 7, 20]
-    assert timeline.moved_key(made, 7, 20) == made
-    assert timeline.moved_key(made, 7, 21) == made
-    assert timeline.moved_key(made, 7, -1) == made
-    assert [key.frame for key in timeline.moved_key(made, 0, 12).keys] == [7, 12, 20]
+    assert timeline.move_key(made, 7, 20) == made
+    assert timeline.move_key(made, 7, 21) == made
+    assert timeline.move_key(made, 7, -1) == made
+    assert [key.frame for key in timeline.move_key(made, 0, 12).keys] == [7, 12, 20]
     assert [key.frame for key in timeline.without_key(made, 7).keys] == [0, 20]
 
 
 def test_a_timeline_is_never_shorter_than_its_last_key() -> None:
-    assert timeline.resized(two_keys(), 3).length == 20
-    assert timeline.resized(Timeline(), -5).length == 1
+    assert timeline.set_length(two_keys(), 3).length == 20
+    assert timeline.set_length(Timeline(), -5).length == 1
     assert timeline.with_fps(Timeline(), 0).fps == 1
 
 
@@ -174,7 +174,7 @@ def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bo
     made = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
     player, seen = Player(playing=True), [0]
     for _ in range(11):
-        player = playback.advanced(player, made, 0.1 + 1e-9)
+        player = playback.advance(player, made, 0.1 + 1e-9)
         seen.append(player.frame)
     assert seen == (list(timeline.film_frames(made)) * 3)[:12]
 
@@ -183,13 +183,13 @@ def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
     made = replace(two_keys(length=20), fps=10)
     fast, slow = Player(playing=True), Player(playing=True)
     for _ in range(47):
-        fast = playback.advanced(fast, made, 0.0155)
-    slow = playback.advanced(slow, made, 47 * 0.0155)
+        fast = playback.advance(fast, made, 0.0155)
+    slow = playback.advance(slow, made, 47 * 0.0155)
     assert fast.frame == slow.frame == 7
 
 
 def test_a_key_is_set_at_the_playhead_with_camera_and_strengths_and_can_be_undone() -> None:
-    work = act(workspace.opened(view(0.3, azimuth=33.0)), "seek:12", "key")
+    work = act(workspace.new_workspace(view(0.3, azimuth=33.0)), "seek:12", "key")
     assert work.view.timeline.keys == (Keyframe(12, ((0, 0.3), (1, 0.4)), work.view.camera),)
     assert work.player.shown
     undone = act(work, "undo")
@@ -198,7 +198,7 @@ def test_a_key_is_set_at_the_playhead_with_camera_and_strengths_and_can_be_undon
 
 
 def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo() -> None:
-    work = workspace.opened(replace(view(0.0, 1.0), timeline=two_keys()))
+    work = workspace.new_workspace(replace(view(0.0, 1.0), timeline=two_keys()))
     entries = len(work.past.past)
     for action, scarf in (("seek:20", 1.0), ("step:-20", 0.0), ("jump:1", 1.0), ("seek:10", 0.5)):
         work = act(work, action)
@@ -211,23 +211,23 @@ def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo()
 
 @pytest.mark.parametrize("leaves", [["seek:11", "seek:12", "seek:13"], ["step:1"], ["jump:1"], ["play"]])
 def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves: list[str]) -> None:
-    work = workspace.opened(replace(view(0.0, 1.0), timeline=two_keys()))
+    work = workspace.new_workspace(replace(view(0.0, 1.0), timeline=two_keys()))
     work = act(work, "seek:10", "focus:2", "nudge:0.3")
     entries = len(work.past.past)
     left = work
     for action in leaves:  # of one drag: nothing is settled in between
         left = workspace.perform(left, action, FACTS)
-    left = workspace.settled(workspace.played(left, 0.1))
+    left = workspace.record_undo(workspace.advance(left, 0.1))
     assert left.view.layers != work.view.layers
     assert len(left.past.past) == entries + 1, "one drag is one entry"
     assert act(left, "undo").view.layers == work.view.layers
 
 
 def test_one_key_leaves_strengths_and_camera_to_the_hand() -> None:
-    work = act(workspace.opened(view(0.3)), "key", "focus:2", "nudge:0.5")
+    work = act(workspace.new_workspace(view(0.3)), "key", "focus:2", "nudge:0.5")
     there = act(work, "seek:30", "seek:0")
     assert there.view == work.view
-    only = timeline.shown_at(work.view.timeline, 0, work.view)
+    only = timeline.state_at(work.view.timeline, 0, work.view)
     assert only.layers[0].strength == 0.3, "in a film a single key still counts"
 
 
@@ -236,25 +236,25 @@ def test_a_gesture_under_way_is_still_one_entry_when_the_film_plays_on() -> None
         (Keyframe(0, ((0, 0.0),)), Keyframe(20, ((0, 1.0),))),
         length=20,
     )
-    work = act(workspace.opened(replace(view(), timeline=made)), "play")
+    work = act(workspace.new_workspace(replace(view(), timeline=made)), "play")
     for strength in (0.5, 0.6, 0.7):  # a hand on the other slider
         layers = (work.view.layers[0], replace(work.view.layers[1], strength=strength))
-        work = workspace.played(replace(work, view=replace(work.view, layers=layers)), 0.1)
-    work = workspace.settled(work)
+        work = workspace.advance(replace(work, view=replace(work.view, layers=layers)), 0.1)
+    work = workspace.record_undo(work)
     assert work.view.layers[0].strength > 0.1
     assert len(work.past.past) == 1
     assert act(work, "undo").view.layers[1].strength == 0.4
 
 
 def test_a_moved_key_takes_the_playhead_along_and_the_picture_stays() -> None:
-    work = act(workspace.opened(replace(view(), timeline=two_keys())), "seek:20", "length:40")
+    work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "seek:20", "length:40")
     moved = act(work, "move_key:20>31")
     assert moved.player.frame == 31
     assert (moved.view.layers, moved.view.camera) == (work.view.layers, work.view.camera)
 
 
 def test_easing_goes_round_for_the_key_before_the_playhead() -> None:
-    work = act(workspace.opened(replace(view(), timeline=two_keys())), "seek:5")
+    work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "seek:5")
     found = []
     for _ in range(3):
         work = act(work, "easing")
@@ -264,17 +264,19 @@ def test_easing_goes_round_for_the_key_before_the_playhead() -> None:
 
 
 def test_one_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
-    work = act(workspace.opened(view()), "key", "play")
+    work = act(workspace.new_workspace(view()), "key", "play")
     assert not work.player.playing
-    work = act(workspace.opened(replace(view(), timeline=two_keys())), "play")
-    assert playback.patience(work.player, work.view.timeline) == pytest.approx(1 / 24)
+    work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "play")
+    assert playback.next_frame_delay(work.player, work.view.timeline) == pytest.approx(1 / 24)
     hidden = act(work, "timeline")
     assert not hidden.player.playing
-    assert playback.patience(hidden.player, hidden.view.timeline) is None
+    assert playback.next_frame_delay(hidden.player, hidden.view.timeline) is None
 
 
 def test_undo_of_a_longer_timeline_leaves_a_playhead_that_still_works() -> None:
-    work = act(workspace.opened(replace(view(), timeline=two_keys())), "length:90", "seek:80", "undo", "undo")
+    work = act(
+        workspace.new_workspace(replace(view(), timeline=two_keys())), "length:90", "seek:80", "undo", "undo"
+    )
     assert work.view.timeline.length == 20
     assert act(work, "step:1").player.frame == 20
 

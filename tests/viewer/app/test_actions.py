@@ -1,4 +1,4 @@
-"""The desk of the window: what is asked, saved, opened, dropped and remembered."""
+"""The file_actions of the window: what is asked, saved, opened, dropped and remembered."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def window(folder: Path, saved: Path) -> Iterator[application.App]:
 
 
 def message(app: application.App) -> str:
-    return app.stage.work.message.text if app.stage.work.message else ""
+    return app.main_view.work.message.text if app.main_view.work.message else ""
 
 
 def question(app: application.App) -> Dialog:
-    assert app.stage.work.dialog is not None
-    return app.stage.work.dialog
+    assert app.main_view.work.dialog is not None
+    return app.main_view.work.dialog
 
 
 def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
@@ -66,26 +66,26 @@ def test_ctrl_s_asks_where_once_and_then_saves_there(window: application.App, fo
     press(window, "Ctrl+S")
     assert question(window).text == str(folder / "bear.session.json")
     press(window, "Enter")
-    assert window.stage.work.dialog is None
+    assert window.main_view.work.dialog is None
     assert (folder / "bear.session.json").is_file()
     assert "Saved" in message(window)
     press(window, "Shift+Left")
-    assert window.desk.unsaved
+    assert window.file_actions.has_unsaved
     press(window, "Ctrl+S")
-    assert not window.desk.unsaved
+    assert not window.file_actions.has_unsaved
     again = session.open_session(folder / "bear.session.json")
-    assert again.view.layers == window.stage.work.view.layers
+    assert again.view.layers == window.main_view.work.view.layers
 
 
 @pytest.mark.gl
 def test_keys_do_nothing_behind_a_question_and_escape_takes_it_away(window: application.App) -> None:
     press(window, "Ctrl+O", "V", "Shift+Left")
-    assert window.stage.work.view.camera.mode == "orbit"
-    assert window.stage.work.view.layers[0].strength == 0.5
+    assert window.main_view.work.view.camera.mode == "orbit"
+    assert window.main_view.work.view.layers[0].strength == 0.5
     press(window, "Escape")
-    assert window.stage.work.dialog is None
+    assert window.main_view.work.dialog is None
     press(window, "V")
-    assert window.stage.work.view.camera.mode == "fly"
+    assert window.main_view.work.view.camera.mode == "fly"
 
 
 @pytest.mark.gl
@@ -95,9 +95,9 @@ def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: P
     for _ in range(3):
         window.draw()
     press(window, "Enter")
-    assert window.stage.work.view == full_view()
-    assert window.desk.path == saved
-    assert [s.name for s in window.stage.work.snapshots] == ["1"]
+    assert window.main_view.work.view == full_view()
+    assert window.file_actions.path == saved
+    assert [s.name for s in window.main_view.work.snapshots] == ["1"]
 
 
 @pytest.mark.gl
@@ -125,16 +125,16 @@ def test_discarding_leaves_and_writes_nothing(window: application.App, folder: P
 def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
     window: application.App, folder: Path
 ) -> None:
-    assert window.desk.autosave(0.0) is None, "nothing to lose"
+    assert window.file_actions.autosave(0.0) is None, "nothing to lose"
     press(window, "Shift+Left")
-    waits = window.desk.autosave(10.0)
+    waits = window.file_actions.autosave(10.0)
     assert waits == autosave.AUTOSAVE_S
     beside = folder / "bear.autosave.session.json"
     assert not beside.exists()
-    assert window.desk.autosave(10.0 + autosave.AUTOSAVE_S) is None
-    assert session.open_session(beside).view.layers == window.stage.work.view.layers
-    assert window.desk.autosave(99.0) is None, "the same again is not written again"
-    window.desk.save(folder / "bear.session.json")
+    assert window.file_actions.autosave(10.0 + autosave.AUTOSAVE_S) is None
+    assert session.open_session(beside).view.layers == window.main_view.work.view.layers
+    assert window.file_actions.autosave(99.0) is None, "the same again is not written again"
+    window.file_actions.save(folder / "bear.session.json")
     assert not beside.exists()
 
 
@@ -142,24 +142,24 @@ def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
 def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left")
     beside = left_over(window, folder)
-    window.desk.save(folder / "bear.session.json")
+    window.file_actions.save(folder / "bear.session.json")
     window.open(folder / "bear.session.json")
     assert question(window) == Dialog("restore", str(beside))
     press(window, "R")
-    assert window.desk.path == folder / "bear.session.json"
-    assert window.desk.unsaved
-    assert window.stage.work.view.layers[-1].strength == pytest.approx(0.4)
+    assert window.file_actions.path == folder / "bear.session.json"
+    assert window.file_actions.has_unsaved
+    assert window.main_view.work.view.layers[-1].strength == pytest.approx(0.4)
     press(window, "Ctrl+S")
     assert not beside.exists(), "saved, it has done its work"
 
 
 def left_over(window: application.App, folder: Path) -> Path:
     """An autosave of the present work as a crash leaves it: the window knows nothing of it."""
-    window.desk.autosave(0.0)
-    window.desk.autosave(autosave.AUTOSAVE_S)
+    window.file_actions.autosave(0.0)
+    window.file_actions.autosave(autosave.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
     kept = beside.read_bytes()
-    window.desk.serve("discard")
+    window.file_actions.handle("discard")
     for discarded in folder.glob("*.discarded*"):
         discarded.unlink()
     beside.write_bytes(kept)
@@ -173,17 +173,17 @@ def test_a_new_sessions_autosave_never_takes_the_place_of_one_that_was_left(
     press(window, "Shift+Left")
     beside = left_over(window, folder)
     kept = beside.read_bytes()
-    window.desk.offer_autosave()
+    window.file_actions.offer_autosave()
     assert question(window).kind == "restore"
-    assert beside in window.stage.recent
+    assert beside in window.main_view.recent
     press(window, "Escape", "Shift+Left")
-    window.desk.autosave(100.0)
-    window.desk.autosave(100.0 + autosave.AUTOSAVE_S)
+    window.file_actions.autosave(100.0)
+    window.file_actions.autosave(100.0 + autosave.AUTOSAVE_S)
     assert beside.read_bytes() == kept
     own = [path for path in folder.glob("*.autosave*") if path != beside]
-    assert [session.open_session(path).view.layers for path in own] == [window.stage.work.view.layers]
-    window.desk.offer_autosave()
-    assert window.stage.work.dialog is None, "it asks once"
+    assert [session.open_session(path).view.layers for path in own] == [window.main_view.work.view.layers]
+    window.file_actions.offer_autosave()
+    assert window.main_view.work.dialog is None, "it asks once"
     press(window, "Ctrl+Q", "D")
     assert not own[0].exists()
     assert beside.read_bytes() == kept
@@ -197,31 +197,31 @@ def test_discarded_work_stays_under_another_name_the_last_three(
     for _ in range(autosave.MOST_DISCARDED + 2):
         press(window, "Shift+Left")
         left_over_now = folder / "bear.autosave.session.json"
-        window.desk.autosave(0.0)
-        window.desk.autosave(autosave.AUTOSAVE_S)
-        strengths.append(window.stage.work.view.layers[-1].strength)
-        window.desk.offer_autosave()
-        assert window.stage.work.dialog is None, "its own autosave is nothing that was left"
-        window.desk.serve(f"discard_autosave:{left_over_now}")
-        window.desk._autosave = autosave.Autosave()
+        window.file_actions.autosave(0.0)
+        window.file_actions.autosave(autosave.AUTOSAVE_S)
+        strengths.append(window.main_view.work.view.layers[-1].strength)
+        window.file_actions.offer_autosave()
+        assert window.main_view.work.dialog is None, "its own autosave is nothing that was left"
+        window.file_actions.handle(f"discard_autosave:{left_over_now}")
+        window.file_actions._autosave = autosave.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
     assert len(kept) == autosave.MOST_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
     assert sorted(found) == sorted(strengths[-autosave.MOST_DISCARDED :])
-    assert kept[-1] in window.stage.recent
-    window.desk.serve("discard")
+    assert kept[-1] in window.main_view.recent
+    window.file_actions.handle("discard")
     window.open(kept[-1])
-    assert window.desk.path is None, "saving it asks where"
-    assert window.desk.unsaved
+    assert window.file_actions.path is None, "saving it asks where"
+    assert window.file_actions.has_unsaved
 
 
 @pytest.mark.gl
 def test_work_that_never_had_a_name_is_not_saved_over_a_session_that_has_it(
     window: application.App, folder: Path
 ) -> None:
-    window.desk.save(folder / "bear.session.json")
+    window.file_actions.save(folder / "bear.session.json")
     yesterday = (folder / "bear.session.json").read_bytes()
-    window.desk.path = None  # the next day, from the scene
+    window.file_actions.path = None  # the next day, from the scene
     press(window, "Shift+Left", "Ctrl+S")
     assert question(window).text == str(folder / "bear-2.session.json")
     press(window, "Enter")
@@ -234,7 +234,7 @@ def test_a_name_that_a_session_has_is_asked_about(window: application.App, folde
     yesterday = saved.read_bytes()
     press(window, "Shift+Left")
     for answer in ("Escape", "Enter"):  # Cancel; Rename…, which asks where again
-        window.desk.serve(f"save_to:{saved}")
+        window.file_actions.handle(f"save_to:{saved}")
         assert question(window).kind == "overwrite"
         press(window, answer)
     assert question(window).kind == "save"
@@ -242,11 +242,11 @@ def test_a_name_that_a_session_has_is_asked_about(window: application.App, folde
     by_hand(window, text="another name")
     assert question(window).text == "another name", "the field has the keyboard"
     assert saved.read_bytes() == yesterday
-    window.desk.serve(f"overwrite:{saved}")
-    assert window.stage.work.dialog is None
-    assert session.open_session(saved).view.layers == window.stage.work.view.layers
+    window.file_actions.handle(f"overwrite:{saved}")
+    assert window.main_view.work.dialog is None
+    assert session.open_session(saved).view.layers == window.main_view.work.view.layers
     press(window, "Shift+Left", "Ctrl+S")
-    assert window.stage.work.dialog is None, "its own file is replaced without a question"
+    assert window.main_view.work.dialog is None, "its own file is replaced without a question"
 
 
 @pytest.mark.gl
@@ -264,39 +264,39 @@ def test_a_layer_is_duplicated_replaced_and_saved_without_what_was_deleted(
     window: application.App, folder: Path
 ) -> None:
     def layers() -> list[tuple[str, int]]:
-        return [(layer.name, layer.gdf) for layer in window.stage.work.view.layers]
+        return [(layer.name, layer.gdf) for layer in window.main_view.work.view.layers]
 
     press(window, "2", "Ctrl+D")  # the lower one
     assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
-    assert window.stage.work.focus == 1
-    assert window.stage.work.view.layers[1].strength == 0.5
-    window.desk.serve(f"replace_by:1:{folder / 'edits' / 'ears.gdf'}")
+    assert window.main_view.work.focus == 1
+    assert window.main_view.work.view.layers[1].strength == 0.5
+    window.file_actions.handle(f"replace_by:1:{folder / 'edits' / 'ears.gdf'}")
     assert layers() == [("scarf", 0), ("ears-2", 3), ("ears", 1)]
-    assert window.stage.work.view.layers[1].strength == 0.5
+    assert window.main_view.work.view.layers[1].strength == 0.5
     press(window, "Ctrl+Z")
     assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
     press(window, "Ctrl+Shift+Z", "3", "Ctrl+Delete")
     assert layers() == [("ears-2", 3), ("ears", 1)]
-    shown = window.engine.gaussians(window.stage.work.view).means.clone()
-    window.desk.save(folder / "two")
+    shown = window.engine.gaussians(window.main_view.work.view).means.clone()
+    window.file_actions.save(folder / "two")
     (folder / "edits" / "scarf.gdf").unlink()
     again = session.open_session(folder / "two.session.json")
     assert [(layer.name, layer.gdf) for layer in again.view.layers] == [("ears-2", 1), ("ears", 0)]
     assert len(again.document.gdfs) == 2
-    window.desk.open(folder / "two.session.json")
-    assert torch.equal(window.engine.gaussians(window.stage.work.view).means, shown)
+    window.file_actions.open(folder / "two.session.json")
+    assert torch.equal(window.engine.gaussians(window.main_view.work.view).means, shown)
 
 
 @pytest.mark.gl
 def test_an_edit_of_another_scene_replaces_nothing_and_is_one_line(
     window: application.App, folder: Path, tmp_path: Path
 ) -> None:
-    before = window.stage.work.view
-    window.desk.serve(f"replace_by:0:{folder / 'bear.ply'}")
-    assert window.stage.work.view == before
+    before = window.main_view.work.view
+    window.file_actions.handle(f"replace_by:0:{folder / 'bear.ply'}")
+    assert window.main_view.work.view == before
     assert "\n" not in message(window)
-    assert window.stage.work.message is not None
-    assert window.stage.work.message.error
+    assert window.main_view.work.message is not None
+    assert window.main_view.work.message.error
 
 
 @pytest.mark.gl
@@ -305,14 +305,14 @@ def test_files_are_told_apart_by_content_however_they_are_called(
 ) -> None:
     saved.rename(folder / "session.txt")
     window.open(folder / "session.txt")
-    assert window.stage.work.view == full_view(), message(window)
+    assert window.main_view.work.view == full_view(), message(window)
     (folder / "edits" / "scarf.gdf").rename(folder / "scarf.bin")
     window.open(folder / "scarf.bin")
-    assert [layer.name for layer in window.stage.work.view.layers][-1] == "scarf-2", message(window)
-    window.desk.serve("discard")
+    assert [layer.name for layer in window.main_view.work.view.layers][-1] == "scarf-2", message(window)
+    window.file_actions.handle("discard")
     (folder / "bear.ply").rename(folder / "scene.dat")
     window.open(folder / "scene.dat")
-    assert window.stage.facts.title == "scene.dat", message(window)
+    assert window.main_view.facts.title == "scene.dat", message(window)
 
 
 @pytest.mark.gl
@@ -320,7 +320,7 @@ def test_a_dropped_camera_file_is_looked_through(window: application.App, folder
     camera = bear().demo.cameras[2]
     save_cameras(folder / "cameras.json", [camera])
     window.open(folder / "cameras.json")
-    shown = to_camera(window.stage.work.view.camera, camera.width, camera.height)
+    shown = to_camera(window.main_view.work.view.camera, camera.width, camera.height)
     assert np.abs(shown.viewmat.numpy() - camera.viewmat.numpy()).max() < 1e-4
     assert np.abs(shown.K.numpy() - camera.K.numpy()).max() < 1e-2
 
@@ -331,20 +331,20 @@ def test_a_scene_dropped_on_unsaved_work_asks_first(window: application.App, fol
     press(window, "Shift+Left")
     window.open(folder / "half.ply")
     window.draw()
-    assert window.stage.facts.title == "bear.ply"
+    assert window.main_view.facts.title == "bear.ply"
     press(window, "D")
-    assert window.stage.facts.title == "half.ply"
-    assert window.stage.work.dialog is None
-    assert window.stage.recent[0] == folder / "half.ply"
+    assert window.main_view.facts.title == "half.ply"
+    assert window.main_view.work.dialog is None
+    assert window.main_view.recent[0] == folder / "half.ply"
 
 
 @pytest.mark.gl
 def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
     window: application.App, folder: Path, saved: Path
 ) -> None:
-    before = window.stage.work.view
+    before = window.main_view.work.view
     window.open(spoilt(saved, "scene", "sha256", value="0" * 64))
-    assert window.stage.work.view == before
+    assert window.main_view.work.view == before
     assert "saved with another bear.ply" in message(window)
 
 
@@ -352,21 +352,21 @@ def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
 def test_saving_never_writes_over_another_kind_of_file(window: application.App, folder: Path) -> None:
     save_cameras(folder / "cameras.json", list(bear().demo.cameras[:1]))
     before = (folder / "cameras.json").read_bytes()
-    window.desk.serve(f"save_to:{folder / 'cameras.json'}")
+    window.file_actions.handle(f"save_to:{folder / 'cameras.json'}")
     assert (folder / "cameras.json").read_bytes() == before
     assert "is not a session" in question(window).error
 
 
 def by_hand(window: application.App, *keys: imgui.Key, text: str = "") -> None:
     """Keys as the path field hears them, then a text."""
-    window.stage.ui.make_current()
+    window.main_view.ui.make_current()
     io = imgui.get_io()
     for key in keys:
         for down in (True, False):
             io.add_key_event(key, down)
             window.draw()
     io.add_input_characters_utf8(text)
-    window.stage.wake()
+    window.main_view.wake()
     for _ in range(4):
         window.draw()
 
@@ -380,26 +380,26 @@ def test_a_place_that_cannot_be_written_is_asked_for_again_with_what_was_typed(
     by_hand(window, text=typed)
     by_hand(window, imgui.Key.enter)  # the field lets go of the keys
     press(window, "Enter")
-    asked, before = question(window), window.stage.work.view
+    asked, before = question(window), window.main_view.work.view
     assert asked.text == typed
     assert "gone does not exist" in asked.error
-    assert window.desk.unsaved
+    assert window.file_actions.has_unsaved
     press(window, "V", "Shift+Left")
-    assert window.stage.work.view == before, "keys are no shortcuts meanwhile"
+    assert window.main_view.work.view == before, "keys are no shortcuts meanwhile"
     by_hand(window, *[imgui.Key.end] * 2, *[imgui.Key.backspace] * len(".session.json"), text="-2")
     assert question(window).text == str(folder / "gone" / "bear-2")
     (folder / "gone").mkdir()
     press(window, "Enter")
-    assert window.stage.work.dialog is None
+    assert window.main_view.work.dialog is None
     assert (folder / "gone" / "bear-2.session.json").is_file()
     press(window, "V")
-    assert window.stage.work.view.camera.mode == "fly"
+    assert window.main_view.work.view.camera.mode == "fly"
 
 
 @pytest.mark.gl
 def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application.App, folder: Path) -> None:
     (folder / "kept").mkdir()
-    window.desk.save(folder / "kept" / "bear")
+    window.file_actions.save(folder / "kept" / "bear")
     (folder / "kept").rename(folder / "away")
     press(window, "Shift+Left", "Ctrl+Q", "S")
     assert "kept does not exist" in question(window).error
@@ -409,14 +409,14 @@ def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application
     (folder / "away").rename(folder / "kept")
     press(window, "Enter")
     assert window._left
-    assert not window.desk.unsaved
+    assert not window.file_actions.has_unsaved
 
 
 @pytest.mark.gl
 def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: application.App) -> None:
-    window.desk.serve("save_to:~nobody-here/bear")
+    window.file_actions.handle("save_to:~nobody-here/bear")
     assert "~nobody-here does not exist" in question(window).error
-    window.desk.serve("open_file:~nobody-here/bear.ply")
+    window.file_actions.handle("open_file:~nobody-here/bear.ply")
     assert "~nobody-here/bear.ply" in message(window)
 
 
@@ -424,12 +424,12 @@ def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: app
 @pytest.mark.parametrize("name", ["x" * 300, "/".join(["x" * 200] * 30), "a\0b", "\x1b[2J\n"])
 def test_a_path_that_no_file_can_have_is_one_line(window: application.App, name: str) -> None:
     for request in (f"open_file:{name}", f"replace_by:0:{name}"):
-        window.desk.serve(request)
+        window.file_actions.handle(request)
         assert message(window)
         assert "\x1b" not in message(window)
         window.draw()
     for path in (f"no folder/{name}", "/"):
-        window.desk.serve(f"save_to:{path}")
+        window.file_actions.handle(f"save_to:{path}")
         assert question(window).error
         window.draw()
 
@@ -438,13 +438,13 @@ def test_f4_keeps_each_view_as_a_camera_beside_the_session(window: application.A
     assert window.document.path is not None
     kept = folder / f"{window.document.path.stem}.cameras.json"
     for azimuth in (10.0, 70.0):
-        camera = replace(window.stage.work.view.camera, azimuth=azimuth)
-        window.stage.work = workspace.with_camera(window.stage.work, camera)
+        camera = replace(window.main_view.work.view.camera, azimuth=azimuth)
+        window.main_view.work = workspace.with_camera(window.main_view.work, camera)
         press(window, "F4")
         assert kept.name in message(window)
     found = load_cameras(kept)
     assert [camera.name for camera in found] == ["view_000", "view_001"]
-    shown = to_camera(window.stage.work.view.camera, *window.stage.picture_size)
+    shown = to_camera(window.main_view.work.view.camera, *window.main_view.picture_size)
     assert torch.equal(found[1].viewmat, shown.viewmat)
     assert torch.equal(found[1].K, shown.K)
     assert not torch.equal(found[0].viewmat, found[1].viewmat)

@@ -44,7 +44,7 @@ class Desktop:
     def until_answered(self) -> None:
         """The window's loop, as long as the program is on screen; it never waits longer than a poll."""
         end = time.monotonic() + 60.0
-        while self.app.desk.choosing() is not None:
+        while self.app.file_actions.poll_dialog() is not None:
             assert time.monotonic() < end
             time.sleep(0.01)
             self.app.draw()
@@ -66,7 +66,7 @@ def desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desktop
 
 
 def question(desktop: Desktop) -> Dialog:
-    asked = desktop.app.stage.work.dialog
+    asked = desktop.app.main_view.work.dialog
     assert asked is not None
     return asked
 
@@ -76,7 +76,7 @@ def test_a_file_chosen_in_the_desktops_dialog_is_opened(desktop: Desktop) -> Non
     desktop.answers(f'echo "{ears}"')
     press(desktop.app, "Ctrl+O", "Ctrl+B")
     desktop.until_answered()
-    assert desktop.app.stage.work.dialog is None
+    assert desktop.app.main_view.work.dialog is None
     assert [gdf.name for gdf in desktop.app.document.gdfs] == ["scarf", "ears"]
     assert "--file-selection" in desktop.asked
     assert str(desktop.folder / "work") in desktop.asked, "it begins beside the scene"
@@ -88,8 +88,8 @@ def test_a_place_chosen_in_the_desktops_dialog_is_saved_to(desktop: Desktop) -> 
     press(desktop.app, "Shift+Left", "Ctrl+S", "Ctrl+B")
     desktop.until_answered()
     assert "--save" in desktop.asked
-    assert session.open_session(there).view.layers == desktop.app.stage.work.view.layers
-    assert not desktop.app.desk.unsaved
+    assert session.open_session(there).view.layers == desktop.app.main_view.work.view.layers
+    assert not desktop.app.file_actions.has_unsaved
 
 
 def test_cancelling_it_leaves_the_question_with_what_was_typed(desktop: Desktop) -> None:
@@ -107,17 +107,17 @@ def test_the_window_goes_on_while_it_is_open_and_takes_it_away_when_it_answers_i
 ) -> None:
     desktop.answers(f'echo $$ > "{desktop.folder}/pid"\nexec sleep 600')
     press(desktop.app, "Ctrl+O", "Ctrl+B")
-    frames = desktop.app.stage.frames
+    frames = desktop.app.main_view.frames
     pid = desktop.folder / "pid"
     while not (pid.is_file() and pid.read_text().strip()):
-        assert desktop.app.desk.choosing() == native.POLL_S
+        assert desktop.app.file_actions.poll_dialog() == native.POLL_S
         time.sleep(0.01)
     assert question(desktop).choosing
     press(desktop.app, "Ctrl+B")
-    assert desktop.app.stage.frames > frames, "nothing waits for the person"
+    assert desktop.app.main_view.frames > frames, "nothing waits for the person"
     press(desktop.app, "Escape")
-    assert desktop.app.stage.work.dialog is None
-    assert desktop.app.desk.choosing() is None
+    assert desktop.app.main_view.work.dialog is None
+    assert desktop.app.file_actions.poll_dialog() is None
     assert not alive(int(pid.read_text()))
 
 
@@ -127,7 +127,7 @@ def test_closing_the_window_takes_it_away(desktop: Desktop) -> None:
     pid = desktop.folder / "pid"
     while not (pid.is_file() and pid.read_text().strip()):
         time.sleep(0.01)
-    desktop.app.desk.release()
+    desktop.app.file_actions.release()
     assert not alive(int(pid.read_text()))
 
 
@@ -154,7 +154,7 @@ def test_without_such_a_program_one_line_says_so_and_the_path_field_stays(
     assert "; type the path" in native.obstacle()
     assert "\n" not in native.obstacle()
     assert not question(desktop).choosing
-    assert desktop.app.desk.choosing() is None
+    assert desktop.app.file_actions.poll_dialog() is None
     path = Path(question(desktop).text)
     press(desktop.app, "Enter")
     assert path.is_file()
@@ -163,12 +163,12 @@ def test_without_such_a_program_one_line_says_so_and_the_path_field_stays(
 @pytest.mark.parametrize("kind", ["open", "save"])
 def test_the_button_beside_the_path_field_asks_for_it(kind: str) -> None:
     with rig(points=(900, 640)) as hand:
-        hand.stage.ask(Dialog(kind, "/tmp/x"))
+        hand.main_view.ask(Dialog(kind, "/tmp/x"))
         hand.settle()
         x = (900 - 300) / 2 + 260 - 16 - 18
         for y in range(60, 320, 8):
             hand.click(x, float(y))
-            if "browse" in hand.stage.work.requests:
+            if "browse" in hand.main_view.work.requests:
                 break
-        assert "browse" in hand.stage.work.requests
-        assert hand.stage.work.dialog is not None, "the question stays"
+        assert "browse" in hand.main_view.work.requests
+        assert hand.main_view.work.dialog is not None, "the question stays"

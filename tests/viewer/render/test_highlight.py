@@ -14,10 +14,10 @@ from progdf.gaussians import Gaussians
 from progdf.sh import C0
 from tests.helpers.stacks import Stack
 from tests.helpers.ui_rig import bear, first_view, rig
-from viewer.render import highlight as tint
+from viewer.render import highlight
 from viewer.render.engine import Engine
 from viewer.render.headless import headless_context
-from viewer.render.highlight import Tint
+from viewer.render.highlight import Highlight
 from viewer.state import paint
 from viewer.state.view_state import Brush, Comparison, ViewState
 
@@ -34,7 +34,7 @@ def ctx() -> Iterator[moderngl.Context]:
 
 def half_painted() -> str:
     """The scarf with weights that rise from 0 to 1 along its members."""
-    return paint.encoded(np.linspace(0, 1, len(bear().gdfs[SCARF].region), dtype=np.float32))
+    return paint.encode(np.linspace(0, 1, len(bear().gdfs[SCARF].region), dtype=np.float32))
 
 
 def view(strength: float = 1.0, painted: str = paint.FULL) -> ViewState:
@@ -49,10 +49,10 @@ def shown(engine: Engine, state: ViewState, ctx: moderngl.Context) -> np.ndarray
     return np.frombuffer(screen.read(components=3, dtype="f4"), np.float32).reshape(SIZE[1], SIZE[0], 3)[::-1]
 
 
-def dyed(scene: Gaussians, shade: Tint) -> Gaussians:
+def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
     """The plain way: another scene, in which the members have the mixed colours."""
     members = bear().gdfs[shade.gdf].region.members
-    over = torch.from_numpy(tint.tints(shade, bear().gdfs).astype(np.float32)) / 255.0
+    over = torch.from_numpy(highlight.highlight_colors(shade, bear().gdfs).astype(np.float32)) / 255.0
     share = over[:, 3:]
     sh0, shN = scene.sh0.clone(), scene.shN.clone()
     sh0[members] = (1 - share) * sh0[members] + share * (over[:, :3] - 0.5) / C0
@@ -61,7 +61,7 @@ def dyed(scene: Gaussians, shade: Tint) -> Gaussians:
 
 
 def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colours() -> None:
-    ramp = tint.colours(np.linspace(0, 1, 256, dtype=np.float32)).astype(float)
+    ramp = highlight.ramp_colors(np.linspace(0, 1, 256, dtype=np.float32)).astype(float)
     assert tuple(ramp[0]) == (0x2B, 0x3F, 0xA8)
     assert tuple(ramp[-1]) == (0xF9, 0xE5, 0x58)
     lightness = ramp @ (0.2126, 0.7152, 0.0722)
@@ -72,16 +72,16 @@ def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colours() -> None:
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
 def test_what_is_shown_is_the_scene_with_mixed_colours(ctx: moderngl.Context, draw: str) -> None:
-    shade = Tint(SCARF, half_painted())
+    shade = Highlight(SCARF, half_painted())
     engine = Engine(ctx, bear().scene, bear().gdfs, draw)
-    plain = Engine(ctx, dyed(engine.gaussians(view(1.0, shade.paint)), shade), (), draw)
+    plain = Engine(ctx, highlighted(engine.gaussians(view(1.0, shade.paint)), shade), (), draw)
     expected = shown(plain, replace(view(), layers=()), ctx)
     before = shown(engine, view(1.0, shade.paint), ctx)
-    engine.tint = shade
+    engine.highlight = shade
     assert engine.needs_draw(view(1.0, shade.paint), SIZE)
     found = shown(engine, view(1.0, shade.paint), ctx)
     assert np.abs(found - before).max() > 0.2
-    # the tints are 8 bits on the one side and 32 on the other only within rounding
+    # the highlights are 8 bits on the one side and 32 on the other only within rounding
     assert np.abs(found - expected).max() < 1e-4
     assert not engine.needs_draw(view(1.0, shade.paint), SIZE)
     engine.release()
@@ -93,7 +93,7 @@ def test_both_ways_of_drawing_show_the_same_weights(ctx: moderngl.Context) -> No
     images = []
     for draw in ("cpu", "gl"):
         engine = Engine(ctx, bear().scene, bear().gdfs, draw)
-        engine.tint = Tint(SCARF, half_painted())
+        engine.highlight = Highlight(SCARF, half_painted())
         images.append(shown(engine, view(0.7), ctx))
         engine.release()
     assert np.sqrt(np.square(images[0] - images[1]).mean()) < 10 ** (-60 / 20)
@@ -108,17 +108,17 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
     weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
     for step in range(12):
         weights[rng.integers(len(weights), size=9)] = rng.random()
-        painted = paint.encoded(weights)
-        engine.tint = Tint(step % 5 == 4, painted if step % 5 < 4 else paint.FULL)
+        painted = paint.encode(weights)
+        engine.highlight = Highlight(step % 5 == 4, painted if step % 5 < 4 else paint.FULL)
         state = view(float(rng.choice([0.0, 0.3, 1.0])), painted)
         found = shown(engine, state, ctx)
         fresh = Engine(ctx, bear().scene, bear().gdfs, draw)
-        fresh.tint = engine.tint
+        fresh.highlight = engine.highlight
         assert np.array_equal(found, shown(fresh, state, ctx)), step
         assert np.array_equal(
             engine.image(state, SIZE), Engine(ctx, bear().scene, bear().gdfs, draw).image(state, SIZE)
         )
-    engine.tint = None
+    engine.highlight = None
     assert np.array_equal(shown(engine, view(0.6), ctx), clean)
 
 
@@ -126,41 +126,41 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
 def test_a_stroke_draws_only_the_part_of_the_picture_that_it_touched(ctx: moderngl.Context) -> None:
     engine = Engine(ctx, bear().scene, bear().gdfs, "cpu")
     weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
-    engine.tint = Tint(SCARF, paint.encoded(weights))
+    engine.highlight = Highlight(SCARF, paint.encode(weights))
     shown(engine, view(0.0), ctx)
     weights[:3] = 0.0
-    engine.tint = Tint(SCARF, paint.encoded(weights))
+    engine.highlight = Highlight(SCARF, paint.encode(weights))
     shown(engine, view(0.0), ctx)
     assert 0.0 < engine.timings.share < 0.5
 
 
 def test_weights_are_wanted_while_the_brush_is_out_over_a_layer_that_shows() -> None:
     out = replace(view(), brush=Brush(active=True))
-    assert tint.wanted(out, 0) == Tint(0, paint.FULL)
+    assert highlight.requested_highlight(out, 0) == Highlight(0, paint.FULL)
     for without in (
         view(),
         replace(out, brush=Brush(active=True, weights=False)),
         replace(out, compare=Comparison("split")),
         replace(out, layers=(replace(out.layers[0], enabled=False), *out.layers[1:])),
     ):
-        assert tint.wanted(without, 0) is None
-    assert tint.wanted(out, None) is None
-    assert tint.wanted(out, 7) is None
+        assert highlight.requested_highlight(without, 0) is None
+    assert highlight.requested_highlight(out, None) is None
+    assert highlight.requested_highlight(out, 7) is None
 
 
 @pytest.mark.gl
 def test_c_hides_the_weights_and_saved_pictures_never_show_them() -> None:
     with rig(replace(first_view(bear(), 1.0, 1.0), brush=Brush(active=True)), (700, 640)) as hand:
         weights = hand.picture().astype(int)
-        saved = hand.stage.canvas.image(hand.stage.work.view, (400, 640))
+        saved = hand.main_view.canvas.image(hand.main_view.work.view, (400, 640))
         hand.key("C")
-        assert not hand.stage.work.view.brush.weights
+        assert not hand.main_view.work.view.brush.weights
         plain = hand.picture().astype(int)
         assert np.abs(weights - plain).max() > 60
         assert np.abs(np.clip(saved, 0, 1) * 255 - plain)[100:].max() < 1.0, "below the brush's ring"
         hand.key("C")
         assert (hand.picture() == weights).all()
-        assert hand.stage.work.past.past == (), "looking is no edit"
+        assert hand.main_view.work.past.past == (), "looking is no edit"
 
 
 def test_an_overlap_colours_what_both_edits_have_and_nothing_else() -> None:
@@ -168,11 +168,11 @@ def test_an_overlap_colours_what_both_edits_have_and_nothing_else() -> None:
     moved = torch.cat([scarf.region.members[10:40], torch.arange(len(scarf.region) - 30)]).unique()
     assert len(moved) == len(scarf.region), "the bear's first splats are not of its scarf"
     part = replace(scarf, region=replace(scarf.region, members=moved))
-    found = tint.tints(Tint(0, others=(1, 2)), (scarf, part, ears))
+    found = highlight.highlight_colors(Highlight(0, others=(1, 2)), (scarf, part, ears))
     assert found.shape == (len(scarf.region), 4)
     assert (np.flatnonzero(found[:, 3]) == np.arange(10, 40)).all()
     assert (found[10, :3] == (0xFF, 0x3F, 0xA0)).all()
-    assert (tint.tints(Tint(1, others=(0,)), (scarf, part))[:, 3] > 0).sum() == 30
+    assert (highlight.highlight_colors(Highlight(1, others=(0,)), (scarf, part))[:, 3] > 0).sum() == 30
 
 
 @pytest.mark.gl
@@ -180,13 +180,13 @@ def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
     scarf = bear().gdfs[0]
     stack = Stack(bear().demo, (scarf, replace(scarf, name="frost")))
     with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:
-        before, saved = hand.picture().astype(int), hand.stage.work.past
+        before, saved = hand.picture().astype(int), hand.main_view.work.past
         hand.move(700 - 300 + 60, 166.0)
         hand.frame(60)
-        assert hand.stage.work.overlap == 1, "the upper layer's card is the first"
+        assert hand.main_view.work.overlap == 1, "the upper layer's card is the first"
         assert np.abs(hand.picture() - before).max() > 60
         hand.move(700 - 300 + 60, 136.0)
         hand.frame(3)
-        assert hand.stage.work.overlap is None
+        assert hand.main_view.work.overlap is None
         assert (hand.picture() == before).all()
-        assert hand.stage.work.past == saved
+        assert hand.main_view.work.past == saved

@@ -1,4 +1,4 @@
-"""What mouse and keys do on the stage, headless: drags, clicks, the wheel, chords, held keys."""
+"""What mouse and keys do on the main view, headless: drags, clicks, the wheel, chords, held keys."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def hand() -> Iterator[Rig]:
 
 
 def test_a_slow_frame_that_holds_a_whole_orbit_still_turns_the_camera(hand: Rig) -> None:
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.move(*VIEW)
     hand.io.add_mouse_button_event(0, True)
     hand.io.add_mouse_pos_event(VIEW[0] + 50, VIEW[1])
     hand.io.add_mouse_button_event(0, False)
     hand.frame(4)
-    assert hand.stage.work.view.camera.azimuth == pytest.approx(before.azimuth - 15.0)
+    assert hand.main_view.work.view.camera.azimuth == pytest.approx(before.azimuth - 15.0)
 
 
 def test_a_slow_frame_that_holds_several_chords_does_all_in_their_order(hand: Rig) -> None:
@@ -42,16 +42,16 @@ def test_a_slow_frame_that_holds_several_chords_does_all_in_their_order(hand: Ri
 
 
 def test_a_drag_that_begins_on_the_picture_goes_on_over_the_panel(hand: Rig) -> None:
-    azimuth = hand.stage.work.view.camera.azimuth
+    azimuth = hand.main_view.work.view.camera.azimuth
     hand.drag((300.0, 136.0), (500.0, 136.0))
     assert hand.strengths == [0.5, 0.5]
-    assert hand.stage.work.view.camera.azimuth == pytest.approx(azimuth - 60.0)
+    assert hand.main_view.work.view.camera.azimuth == pytest.approx(azimuth - 60.0)
 
 
 def test_a_drag_that_begins_on_a_slider_does_not_turn_the_camera(hand: Rig) -> None:
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.drag(hand.slider(1, 0.5), VIEW)
-    assert hand.stage.work.view.camera == before
+    assert hand.main_view.work.view.camera == before
     assert hand.strengths == [0.5, 0.0]
 
 
@@ -68,11 +68,11 @@ def test_a_drag_that_begins_on_a_slider_does_not_turn_the_camera(hand: Rig) -> N
 def test_the_other_buttons_do_what_the_table_says(
     hand: Rig, button: int, modifier: imgui.Key | None, kept: str
 ) -> None:
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     if modifier is not None:
         hand.modifier(modifier)
     hand.drag(VIEW, (VIEW[0] + 30, VIEW[1] + 30), button)
-    after = hand.stage.work.view.camera
+    after = hand.main_view.work.view.camera
     assert after != before
     if kept == "pivot":
         assert after.pivot == before.pivot
@@ -87,34 +87,34 @@ def test_the_other_buttons_do_what_the_table_says(
 
 def test_right_drag_looks_around_while_flying(hand: Rig) -> None:
     hand.key("V")
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.drag(VIEW, (VIEW[0] + 30, VIEW[1]), button=1)
-    after = hand.stage.work.view.camera
+    after = hand.main_view.work.view.camera
     assert eye(after) == pytest.approx(eye(before))
     assert after.pivot != before.pivot
 
 
 def test_the_wheel_zooms_over_the_picture_and_only_scrolls_over_the_panel(hand: Rig) -> None:
-    distance = hand.stage.work.view.camera.distance
+    distance = hand.main_view.work.view.camera.distance
     hand.wheel(500.0, 300.0, 2.0)
-    assert hand.stage.work.view.camera.distance == distance
+    assert hand.main_view.work.view.camera.distance == distance
     hand.wheel(*VIEW, 2.0)
-    assert hand.stage.work.view.camera.distance < distance
+    assert hand.main_view.work.view.camera.distance < distance
 
 
 def test_a_double_click_on_the_bear_makes_its_surface_the_pivot(hand: Rig) -> None:
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.double_click(170.0, 150.0)
-    after = hand.stage.work.view.camera
+    after = hand.main_view.work.view.camera
     assert after.pivot != before.pivot
     assert eye(after) == pytest.approx(eye(before), abs=1e-6)
     assert np.linalg.norm(after.pivot) < 2.0, "on the bear, not behind it"
 
 
 def test_a_double_click_on_the_background_leaves_the_pivot(hand: Rig) -> None:
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.double_click(20.0, 20.0)
-    assert hand.stage.work.view.camera == before
+    assert hand.main_view.work.view.camera == before
 
 
 def test_holding_backslash_shows_the_original_and_letting_go_brings_the_edit_back() -> None:
@@ -128,7 +128,7 @@ def test_holding_backslash_shows_the_original_and_letting_go_brings_the_edit_bac
         assert not np.array_equal(shown[:60], original[:60])
         hand.frame()
         assert np.array_equal(hand.picture(), edited)
-        assert hand.stage.work.past.past == ()
+        assert hand.main_view.work.past.past == ()
 
 
 @pytest.mark.parametrize(
@@ -144,34 +144,34 @@ def test_arrows_step_the_focused_strength(hand: Rig, chord: str, change: float) 
     hand.key("1")  # the top card: the last layer
     hand.key(chord)
     assert hand.strengths == pytest.approx([0.5, 0.5 + change], abs=1e-9)
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
 
 
 def test_a_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
     for again in (False, True, True, True):
         hand.frame(keys=Keys((Press("Right", again),), held=frozenset({"Right"})))
         hand.frame(keys=Keys(held=frozenset({"Right"})))
-    assert hand.stage.work.past.past == ()
+    assert hand.main_view.work.past.past == ()
     hand.frame()
     assert hand.strengths[1] == pytest.approx(0.54)
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
 
 
 def test_a_held_letter_does_not_switch_to_and_fro(hand: Rig) -> None:
     for again in (False, True):
         hand.frame(keys=Keys((Press("V", again),), held=frozenset({"V"})))
-    assert hand.stage.work.view.camera.mode == "fly"
+    assert hand.main_view.work.view.camera.mode == "fly"
 
 
 def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
     hand.key("1")
-    assert hand.stage.work.focus == 1, "the numbers go down the list, and the last layer is at its top"
+    assert hand.main_view.work.focus == 1, "the numbers go down the list, and the last layer is at its top"
     hand.key("Shift+2")
-    assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, True]
+    assert [layer.enabled for layer in hand.main_view.work.view.layers] == [False, True]
     hand.key("9")
-    assert hand.stage.work.focus == 1, "there is no ninth layer"
+    assert hand.main_view.work.focus == 1, "there is no ninth layer"
     hand.key("H")
-    assert [layer.enabled for layer in hand.stage.work.view.layers] == [False, False]
+    assert [layer.enabled for layer in hand.main_view.work.view.layers] == [False, False]
 
 
 def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
@@ -183,7 +183,7 @@ def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
         edge = np.abs(hand.image()[60:480, 353] - accent).max(axis=-1) <= 2
         assert edge.sum() > 80, "the whole card of the focused layer is in sight"
         hand.key("Shift+9")
-        assert not hand.stage.work.view.layers[0].enabled
+        assert not hand.main_view.work.view.layers[0].enabled
 
 
 def test_a_text_field_owns_the_keys(hand: Rig) -> None:
@@ -193,33 +193,33 @@ def test_a_text_field_owns_the_keys(hand: Rig) -> None:
     hand.release()
     hand.modifier(imgui.Key.mod_ctrl, False)
     assert hand.io.want_text_input
-    before = hand.stage.work.view.camera
+    before = hand.main_view.work.view.camera
     hand.key("V")
     hand.frame(5, keys=Keys(fly=frozenset("W")))
-    assert hand.stage.work.view.camera == before
+    assert hand.main_view.work.view.camera == before
 
 
 def test_f_frames_the_focused_layer_and_with_none_the_scene_in_this_window(hand: Rig) -> None:
-    home = hand.stage.work.view.camera
+    home = hand.main_view.work.view.camera
     hand.key("F")
-    framed = hand.stage.work.view.camera
+    framed = hand.main_view.work.view.camera
     hand.key("Escape")
     hand.key("F")
-    whole = hand.stage.work.view.camera
+    whole = hand.main_view.work.view.camera
     assert whole == fit_subject(home, bear().scene, 340 / 540)
     assert framed.distance < 0.9 * whole.distance
     assert axes(framed) == axes(home)
     hand.drag(VIEW, (VIEW[0] + 30, VIEW[1]))
     hand.key("Shift+F")
-    assert hand.stage.work.view.camera == home
+    assert hand.main_view.work.view.camera == home
 
 
 def test_w_flies_ahead_and_s_comes_back(hand: Rig) -> None:
-    home = hand.stage.work.view.camera
+    home = hand.main_view.work.view.camera
     hand.frame(10, keys=Keys(fly=frozenset("W")))
-    patience = hand.stage.patience()
-    ahead = hand.stage.work.view.camera
+    patience = hand.main_view.next_frame_delay()
+    ahead = hand.main_view.work.view.camera
     assert np.dot(np.subtract(eye(ahead), eye(home)), axes(home).back) < 0
     assert patience == 0.0, "frames go on while a key is held"
     hand.frame(10, keys=Keys(fly=frozenset("S")))
-    assert eye(hand.stage.work.view.camera) == pytest.approx(eye(home))
+    assert eye(hand.main_view.work.view.camera) == pytest.approx(eye(home))

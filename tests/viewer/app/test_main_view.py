@@ -29,7 +29,7 @@ def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 1.0))
     assert hand.strengths == [1.0, 0.5]
     assert np.abs(hand.picture().astype(int) - before).max() > 20
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
     hand.key("Ctrl+Z")
     assert hand.strengths == [0.5, 0.5]
     assert np.array_equal(hand.picture(), before)
@@ -43,7 +43,7 @@ def test_every_step_of_a_drag_is_on_screen_in_the_frame_that_handled_it(hand: Ri
     for strength in (0.6, 0.8, 0.3):
         hand.move(*hand.slider(0, strength))
         shown = hand.picture()
-        image = hand.stage.engine.image(hand.stage.work.view, (340, 540))
+        image = hand.main_view.engine.image(hand.main_view.work.view, (340, 540))
         assert np.abs(shown - np.clip(image, 0, 1) * 255).max() <= 0.51
     hand.release()
 
@@ -54,34 +54,34 @@ def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand:
     for strength in (0.6, 0.7, 0.9):
         hand.io.add_mouse_pos_event(*hand.slider(0, strength))
     hand.io.add_mouse_button_event(0, False)
-    drawn = hand.stage.drawn
+    drawn = hand.main_view.pictures_drawn
     hand.frame(4)
     assert hand.strengths[0] == pytest.approx(0.9, abs=0.005)
-    assert hand.stage.drawn <= drawn + 2, "values on the way are not drawn one by one"
-    assert len(hand.stage.work.past.past) == 1
+    assert hand.main_view.pictures_drawn <= drawn + 2, "values on the way are not drawn one by one"
+    assert len(hand.main_view.work.past.past) == 1
 
 
 def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
     hand.rest()  # the frames that tooltips get
-    drawn, frames = hand.stage.drawn, hand.stage.frames
-    assert hand.stage.patience() is None
-    assert (hand.stage.drawn, hand.stage.frames) == (drawn, frames)
+    drawn, frames = hand.main_view.pictures_drawn, hand.main_view.frames
+    assert hand.main_view.next_frame_delay() is None
+    assert (hand.main_view.pictures_drawn, hand.main_view.frames) == (drawn, frames)
 
 
 def test_moving_the_mouse_draws_the_interface_but_no_splats(hand: Rig) -> None:
-    drawn = hand.stage.drawn
+    drawn = hand.main_view.pictures_drawn
     for x in range(20, 600, 40):
         hand.move(x, 100.0)
-    assert hand.stage.drawn == drawn == 1
+    assert hand.main_view.pictures_drawn == drawn == 1
 
 
 def test_the_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
     hand.drag(VIEW, (VIEW[0] + 40, VIEW[1] + 10))
-    moved = hand.stage.work.view.camera
-    assert hand.stage.work.past.past == ()
+    moved = hand.main_view.work.view.camera
+    assert hand.main_view.work.past.past == ()
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.8))
     hand.key("Ctrl+Z")
-    assert hand.stage.work.view.camera == moved
+    assert hand.main_view.work.view.camera == moved
 
 
 def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Pat
         assert (first.name, second.name) == ("bear_001.png", "bear_002.png")
         assert np.array_equal(np.asarray(Image.open(first)), shown)
         assert np.asarray(Image.open(second)).shape == (540, 640, 3)
-        message = hand.stage.work.message
+        message = hand.main_view.work.message
         assert message is not None
         assert str(second) in message.text
 
@@ -101,7 +101,7 @@ def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Pat
 def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_path: Path) -> None:
     with rig(pictures=tmp_path / "gone") as hand:
         hand.key("F2")
-        message = hand.stage.work.message
+        message = hand.main_view.work.message
         assert message is not None
         assert message.error
         assert "\n" not in message.text
@@ -109,52 +109,52 @@ def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_p
 
 
 def test_messages_leave_by_themselves(hand: Rig) -> None:
-    hand.stage.tell("hello")
+    hand.main_view.show_message("hello")
     hand.settle()
-    assert hand.stage.patience() is not None
-    hand.stage.frame(hand.screen, hand.pixels, 7.0)
-    assert hand.stage.work.message is None
+    assert hand.main_view.next_frame_delay() is not None
+    hand.main_view.frame(hand.screen, hand.pixels, 7.0)
+    assert hand.main_view.work.message is None
 
 
 def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
     hand.key("F10")
-    assert hand.stage.work.view.overlay
-    assert hand.stage.drawn == 1, "showing figures draws no splats"
+    assert hand.main_view.work.view.overlay
+    assert hand.main_view.pictures_drawn == 1, "showing figures draws no splats"
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
-    names = [name.strip() for name, _ in hand.stage.figures()]
+    names = [name.strip() for name, _ in hand.main_view.figures()]
     assert {"frame", "sort", "draw", "slider p50 / p95", "splats"} <= set(names)
-    assert hand.stage.canvas.timings.total_ms > 0.0
+    assert hand.main_view.canvas.timings.total_ms > 0.0
 
 
 def test_f10_tells_the_error_of_the_gpus_edit_pass_or_why_the_cpu_does_its_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with rig(draw="gl", edit_pass="gpu") as by_gpu:
-        told = {name.strip(): figure for name, figure in by_gpu.stage.figures()}
+        told = {name.strip(): figure for name, figure in by_gpu.main_view.figures()}
         assert told["edited by"].startswith("GPU ±")
         assert "edit pass" in told
         assert "upload" not in told
     monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
     with rig(draw="gl", edit_pass="gpu") as stood_back:
-        told = {name.strip(): figure for name, figure in stood_back.stage.figures()}
+        told = {name.strip(): figure for name, figure in stood_back.main_view.figures()}
         assert told["edited by"] == "CPU: the edits are too large for a texture of this GPU"
         assert "upload" in told
     with rig() as by_cpu:
-        assert "edited by" not in dict(by_cpu.stage.figures())
+        assert "edited by" not in dict(by_cpu.main_view.figures())
 
 
 def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> None:
-    drawn = hand.stage.drawn
-    hand.stage.greet(hand.screen)
+    drawn = hand.main_view.pictures_drawn
+    hand.main_view.draw_splash(hand.screen)
     image = hand.image()
-    assert hand.stage.drawn == drawn
+    assert hand.main_view.pictures_drawn == drawn
     assert len(np.unique(image[:60].reshape(-1, 3), axis=0)) > 10, "a word"
     assert len(np.unique(image[60:].reshape(-1, 3), axis=0)) == 1, "on the background alone"
 
 
 def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:
     hand.key("F12")
-    assert hand.stage.work.view.panel is False
+    assert hand.main_view.work.view.panel is False
     background = np.array(bear().demo.background) * 255
     assert np.abs(hand.image()[5, -5] - background).max() <= 1
 
@@ -164,7 +164,7 @@ def test_the_picture_has_the_framebuffers_pixels_on_a_dense_screen(
     points: tuple[int, int], density: float, scale: float
 ) -> None:
     with rig(points=points, density=density, scale=scale) as hand:
-        image = hand.stage.engine.image(hand.stage.work.view, (680, 800))
+        image = hand.main_view.engine.image(hand.main_view.work.view, (680, 800))
         assert hand.image().shape == (800, 1280, 3)
         assert np.abs(hand.image()[:, :680] - np.clip(image, 0, 1) * 255).max() <= 0.51
 
@@ -180,7 +180,7 @@ def test_interface_and_splats_leave_each_others_gl_state_alone(draw: str) -> Non
         hand.key("F1")
         hand.move(*VIEW)
         hand.settle()
-        used, view = hand.image(), hand.stage.work.view
+        used, view = hand.image(), hand.main_view.work.view
     with rig(view, draw=draw) as fresh:
         assert np.array_equal(used[:, :340], fresh.picture())
     assert np.array_equal(used[:480, 340:], panel_before), "all but the undo buttons"
@@ -189,23 +189,23 @@ def test_interface_and_splats_leave_each_others_gl_state_alone(draw: str) -> Non
 def test_a_new_size_of_the_window_is_drawn_at_once(hand: Rig) -> None:
     hand.pixels = hand.points = (500, 300)
     hand.io.display_size = imgui.ImVec2(500, 300)
-    hand.screen = hand.stage.context.simple_framebuffer((500, 300))
+    hand.screen = hand.main_view.context.simple_framebuffer((500, 300))
     hand.frame()
-    image = hand.stage.engine.image(hand.stage.work.view, (200, 300))
+    image = hand.main_view.engine.image(hand.main_view.work.view, (200, 300))
     assert np.abs(hand.image()[:, :200] - np.clip(image, 0, 1) * 255).max() <= 0.51
 
 
 def test_a_window_narrower_than_the_panel_survives(hand: Rig) -> None:
     hand.io.display_size = imgui.ImVec2(200, 100)
-    hand.screen = hand.stage.context.simple_framebuffer((200, 100))
+    hand.screen = hand.main_view.context.simple_framebuffer((200, 100))
     hand.pixels = (200, 100)
     hand.frame(3)
 
 
 def test_an_unknown_layer_count_needs_no_scene(hand: Rig) -> None:
-    hand.stage.restart(replace(hand.stage.work.view, layers=()))
+    hand.main_view.restart(replace(hand.main_view.work.view, layers=()))
     hand.settle()
-    assert hand.stage.work.focus is None
+    assert hand.main_view.work.focus is None
     hand.key("Right")
     hand.key("H")
     assert hand.strengths == []

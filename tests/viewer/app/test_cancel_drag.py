@@ -43,18 +43,18 @@ def dragged_and_called_off(
 ) -> None:
     """A drag that is called off half way; the hand goes on and lets go only then."""
     hand.move(*start)
-    before, work = hand.picture(), hand.stage.work
+    before, work = hand.picture(), hand.main_view.work
     hand.press()
     for place in way:
         hand.move(*place)
     call_off(hand)
-    assert hand.stage.work.view == work.view
+    assert hand.main_view.work.view == work.view
     hand.move(*way[0])
     hand.move(*way[-1])
     hand.release()
-    assert hand.stage.work.view == work.view
-    assert hand.stage.work.past == work.past
-    assert hand.stage.work.focus == work.focus
+    assert hand.main_view.work.view == work.view
+    assert hand.main_view.work.past == work.past
+    assert hand.main_view.work.focus == work.focus
     hand.move(*start)
     assert (hand.picture() == before)[:-TIMELINE].all(), "the playhead stays where it was brought"
 
@@ -66,7 +66,7 @@ def test_a_slider_goes_back_to_where_it_was_pressed(hand: Rig, call_off: CallOff
     dragged_and_called_off(hand, call_off, hand.slider(0, 0.2), end)
     hand.drag(start, end)
     assert hand.strengths[0] == pytest.approx(0.9, abs=0.01)
-    assert len(hand.stage.work.past.past) == 1
+    assert len(hand.main_view.work.past.past) == 1
 
 
 @ways
@@ -74,27 +74,27 @@ def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig, call_o
     y = gain_row(hand)
     hand.frame(40)  # a press soon after the last would be a double click, which resets
     hand.drag((LEFT + 218, y), (LEFT + 150, y))
-    colour = hand.stage.work.view.layers[0].gains.colour
+    colour = hand.main_view.work.view.layers[0].gains.colour
     assert 0.0 < colour < 1.0
-    before = hand.stage.work
+    before = hand.main_view.work
     hand.move(LEFT + 150, y)
     hand.press()
     hand.move(LEFT + 180, y)
-    assert hand.stage.work.view.layers[0].gains.colour != colour
+    assert hand.main_view.work.view.layers[0].gains.colour != colour
     call_off(hand)
     hand.move(LEFT + 120, y)
     hand.release()
-    assert hand.stage.work.view == before.view
-    assert hand.stage.work.past == before.past
+    assert hand.main_view.work.view == before.view
+    assert hand.main_view.work.past == before.past
 
 
 def gain_row(hand: Rig) -> float:
     """Where the slider of the colour gain of the first layer stands."""
     for y in range(200, 400, 6):
-        before = hand.stage.work
+        before = hand.main_view.work
         hand.drag((LEFT + 218, y), (LEFT + 150, y))
-        moved = hand.stage.work.view.layers[0].gains.colour != 1.0
-        hand.stage.restart(before.view)
+        moved = hand.main_view.work.view.layers[0].gains.colour != 1.0
+        hand.main_view.restart(before.view)
         hand.settle()
         if moved:
             return float(y)
@@ -112,19 +112,19 @@ def test_a_layer_stays_in_its_place(hand: Rig, call_off: CallOff) -> None:
 @ways
 def test_a_stroke_is_taken_back_and_the_next_one_paints(hand: Rig, call_off: CallOff) -> None:
     brush = Brush(active=True, radius=60.0, softness=0.5)
-    hand.stage.restart(replace(hand.stage.work.view, brush=brush))
+    hand.main_view.restart(replace(hand.main_view.work.view, brush=brush))
     hand.settle()
     hand.key("2")
     dragged_and_called_off(hand, call_off, (180, 330), (200, 330), (230, 340))
     hand.drag((180, 330), (230, 340))
-    assert hand.stage.work.view.layers[0].paint
-    assert len(hand.stage.work.past.past) == 1
+    assert hand.main_view.work.view.layers[0].paint
+    assert len(hand.main_view.work.past.past) == 1
 
 
 @ways
 def test_a_key_of_the_timeline_goes_back(hand: Rig, call_off: CallOff) -> None:
     keys = (Keyframe(0, ((0, 0.5), (1, 0.5))), Keyframe(36, ((0, 0.5), (1, 0.5))))
-    hand.stage.restart(replace(hand.stage.work.view, timeline=Timeline(keys)))
+    hand.main_view.restart(replace(hand.main_view.work.view, timeline=Timeline(keys)))
     hand.key("T")
     y = POINTS[1] - ROW_PX - HEIGHT_PX / 2
     at = next(x for x in range(110, 400, 4) if grips_key(hand, float(x), y))
@@ -133,10 +133,10 @@ def test_a_key_of_the_timeline_goes_back(hand: Rig, call_off: CallOff) -> None:
 
 def grips_key(hand: Rig, x: float, y: float) -> bool:
     """Whether a drag from there moves the second key."""
-    before = hand.stage.work
+    before = hand.main_view.work
     hand.drag((x, y), (x + 40.0, y))
-    moved = hand.stage.work.view.timeline.keys[1].frame != 36
-    hand.stage.work = before
+    moved = hand.main_view.work.view.timeline.keys[1].frame != 36
+    hand.main_view.work = before
     hand.settle()
     return moved
 
@@ -147,19 +147,19 @@ def test_the_divider_of_a_split_goes_back(hand: Rig, call_off: CallOff) -> None:
     hand.drag((0.5 * LEFT, 300), (0.3 * LEFT, 300))
     dragged_and_called_off(hand, call_off, (0.3 * LEFT, 300), (0.6 * LEFT, 300), (0.8 * LEFT, 310))
     hand.drag((0.3 * LEFT, 300), (0.7 * LEFT, 300))
-    assert hand.stage.work.view.compare.divider == pytest.approx(0.7), "it can be gripped again"
+    assert hand.main_view.work.view.compare.divider == pytest.approx(0.7), "it can be gripped again"
 
 
 def test_escape_without_a_drag_and_while_the_camera_turns_focuses_no_layer(hand: Rig) -> None:
     hand.move(100, 200)
     hand.press()
     hand.move(160, 220)
-    camera = hand.stage.work.view.camera
+    camera = hand.main_view.work.view.camera
     hand.key("Escape")
-    assert hand.stage.work.focus is None
+    assert hand.main_view.work.focus is None
     hand.move(200, 240)
-    assert hand.stage.work.view.camera != camera, "the camera is still in the hand"
+    assert hand.main_view.work.view.camera != camera, "the camera is still in the hand"
     hand.release()
     hand.key("1")
     hand.key("Escape")
-    assert hand.stage.work.focus is None
+    assert hand.main_view.work.focus is None

@@ -11,7 +11,7 @@ import pytest
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys, Press
 from viewer.render import dynamic_resolution as draft
-from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, Draft
+from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution
 from viewer.render.engine import FrameTimings
 
 SLOW = FrameTimings(draw_ms=SLOW_MS + 1.0, share=1.0)
@@ -20,65 +20,67 @@ PART = FrameTimings(draw_ms=5.0, share=0.1)
 MIDDLE = (170.0, 270.0)
 
 
-def twice(known: Draft, timings: FrameTimings, turned: bool) -> Draft:
-    return draft.drawn(draft.drawn(known, timings, turned), timings, turned)
+def twice(known: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
+    return draft.after_draw(draft.after_draw(known, timings, turned), timings, turned)
 
 
 def test_a_slow_picture_is_coarse_while_the_camera_is_held() -> None:
-    known = twice(Draft(), SLOW, turned=True)
-    moving = draft.begun(known, "auto", held=True, turned=True, slid=False, now=1.0)
+    known = twice(DynamicResolution(), SLOW, turned=True)
+    moving = draft.before_draw(known, "auto", held=True, turned=True, slid=False, now=1.0)
     assert moving.pixels == COARSE
-    assert draft.patience(moving, 1.0) == pytest.approx(REST_S)
+    assert draft.next_frame_delay(moving, 1.0) == pytest.approx(REST_S)
 
 
 def test_a_quick_picture_never_is() -> None:
-    known = twice(Draft(), QUICK, turned=True)
-    assert draft.begun(known, "auto", held=True, turned=True, slid=True, now=1.0).pixels == 1
+    known = twice(DynamicResolution(), QUICK, turned=True)
+    assert draft.before_draw(known, "auto", held=True, turned=True, slid=True, now=1.0).pixels == 1
 
 
 def test_one_slow_picture_among_quick_ones_changes_nothing() -> None:
     """The first one of all waits for the kernels."""
-    known = draft.drawn(Draft(), SLOW, turned=True)
-    for then in (known, draft.drawn(draft.drawn(known, QUICK, turned=True), SLOW, turned=True)):
-        assert draft.begun(then, "auto", held=True, turned=True, slid=False, now=1.0).pixels == 1
+    known = draft.after_draw(DynamicResolution(), SLOW, turned=True)
+    for then in (known, draft.after_draw(draft.after_draw(known, QUICK, turned=True), SLOW, turned=True)):
+        assert draft.before_draw(then, "auto", held=True, turned=True, slid=False, now=1.0).pixels == 1
 
 
 def test_a_slider_that_touches_little_stays_sharp_in_a_slow_scene() -> None:
-    known = twice(twice(Draft(), SLOW, turned=True), PART, turned=False)
-    assert draft.begun(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels == 1
+    known = twice(twice(DynamicResolution(), SLOW, turned=True), PART, turned=False)
+    assert draft.before_draw(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels == 1
 
 
 def test_a_slider_whose_first_steps_were_slow_goes_on_coarse() -> None:
-    first = draft.begun(Draft(), "auto", held=True, turned=False, slid=True, now=1.0)
+    first = draft.before_draw(DynamicResolution(), "auto", held=True, turned=False, slid=True, now=1.0)
     assert first.pixels == 1, "nothing is known of it yet"
     second = twice(first, SLOW, turned=False)
-    assert draft.begun(second, "auto", held=True, turned=False, slid=True, now=1.1).pixels == COARSE
-    let_go = draft.begun(second, "auto", held=False, turned=False, slid=False, now=1.1)
-    assert draft.begun(let_go, "auto", held=True, turned=False, slid=True, now=1.2).pixels == 1
+    assert draft.before_draw(second, "auto", held=True, turned=False, slid=True, now=1.1).pixels == COARSE
+    let_go = draft.before_draw(second, "auto", held=False, turned=False, slid=False, now=1.1)
+    assert draft.before_draw(let_go, "auto", held=True, turned=False, slid=True, now=1.2).pixels == 1
 
 
 def test_one_click_is_drawn_sharp_at_once() -> None:
-    known = twice(Draft(), SLOW, turned=True)
-    assert draft.begun(known, "on", held=False, turned=True, slid=True, now=1.0).pixels == 1
+    known = twice(DynamicResolution(), SLOW, turned=True)
+    assert draft.before_draw(known, "on", held=False, turned=True, slid=True, now=1.0).pixels == 1
 
 
 def test_it_stays_coarse_between_two_steps_of_a_hand_and_is_sharp_at_rest() -> None:
-    moving = draft.begun(Draft(), "on", held=True, turned=True, slid=False, now=1.0)
-    between = draft.begun(moving, "on", held=True, turned=False, slid=False, now=1.0 + 0.5 * REST_S)
+    moving = draft.before_draw(DynamicResolution(), "on", held=True, turned=True, slid=False, now=1.0)
+    between = draft.before_draw(moving, "on", held=True, turned=False, slid=False, now=1.0 + 0.5 * REST_S)
     assert between.pixels == COARSE
-    rested = draft.begun(between, "on", held=True, turned=False, slid=False, now=1.0 + REST_S)
+    rested = draft.before_draw(between, "on", held=True, turned=False, slid=False, now=1.0 + REST_S)
     assert rested.pixels == 1
-    assert draft.patience(rested, 2.0) is None
+    assert draft.next_frame_delay(rested, 2.0) is None
 
 
 def test_what_a_coarse_picture_took_is_not_remembered() -> None:
-    moving = draft.begun(Draft(camera_ms=(90.0, 90.0)), "auto", held=True, turned=True, slid=False, now=1.0)
-    assert draft.drawn(moving, QUICK, turned=True).camera_ms == (90.0, 90.0)
+    moving = draft.before_draw(
+        DynamicResolution(camera_ms=(90.0, 90.0)), "auto", held=True, turned=True, slid=False, now=1.0
+    )
+    assert draft.after_draw(moving, QUICK, turned=True).camera_ms == (90.0, 90.0)
 
 
 def test_off_is_off() -> None:
-    moving = Draft(pixels=COARSE, rest_at=2.0, camera_ms=(500.0, 500.0))
-    assert draft.begun(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
+    moving = DynamicResolution(pixels=COARSE, rest_at=2.0, camera_ms=(500.0, 500.0))
+    assert draft.before_draw(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
 
 
 @pytest.fixture
@@ -88,7 +90,7 @@ def hand() -> Iterator[Rig]:
 
 
 def shown(hand: Rig) -> dict[str, str]:
-    return {name.strip(): figure for name, figure in hand.stage.figures()}
+    return {name.strip(): figure for name, figure in hand.main_view.figures()}
 
 
 def hold_and_orbit(hand: Rig) -> None:
@@ -98,7 +100,7 @@ def hold_and_orbit(hand: Rig) -> None:
 
 
 def wait(hand: Rig, seconds: float) -> None:
-    hand.stage.frame(hand.screen, hand.pixels, seconds)
+    hand.main_view.frame(hand.screen, hand.pixels, seconds)
 
 
 @pytest.mark.gl
@@ -107,13 +109,13 @@ def test_an_orbit_is_coarse_in_the_hand_and_sharp_where_the_hand_rests(hand: Rig
     hold_and_orbit(hand)
     assert shown(hand)["picture"] == "170×270, coarse"
     coarse = hand.picture().astype(float)
-    assert hand.stage.patience() == 0.0
+    assert hand.main_view.next_frame_delay() == 0.0
     hand.settle()
-    assert 0.0 < (hand.stage.patience() or 0.0) <= REST_S
+    assert 0.0 < (hand.main_view.next_frame_delay() or 0.0) <= REST_S
     wait(hand, REST_S)
     assert shown(hand)["picture"] == "340×540"
     sharp = hand.picture()
-    image = hand.stage.engine.image(hand.stage.work.view, (340, 540))
+    image = hand.main_view.engine.image(hand.main_view.work.view, (340, 540))
     assert np.abs(sharp - np.round(np.clip(image, 0.0, 1.0) * 255.0)).max() <= 1
     assert 0.05 < np.abs(coarse - sharp).mean() < 2.0, "the same bear in the same place, softer"
     hand.release()
@@ -135,11 +137,11 @@ def test_a_rested_picture_draws_nothing_more(hand: Rig) -> None:
     hold_and_orbit(hand)
     hand.release()
     wait(hand, REST_S)
-    drawn = hand.stage.drawn
+    drawn = hand.main_view.pictures_drawn
     hand.event()
     wait(hand, 1.0)
-    assert hand.stage.drawn == drawn
-    assert hand.stage.patience() in (0.0, None) or hand.stage.patience() > REST_S
+    assert hand.main_view.pictures_drawn == drawn
+    assert hand.main_view.next_frame_delay() in (0.0, None) or hand.main_view.next_frame_delay() > REST_S
 
 
 @pytest.mark.gl
@@ -159,9 +161,9 @@ def test_a_split_is_coarse_on_both_sides_and_a_difference_never(hand: Rig) -> No
 
 @pytest.mark.gl
 def test_the_key_goes_through_the_modes(hand: Rig) -> None:
-    modes = [hand.stage.work.view.draft]
+    modes = [hand.main_view.work.view.draft]
     for _ in range(3):
-        hand.stage.wake()
+        hand.main_view.wake()
         hand.frame(keys=Keys((Press("Shift+F10"),), frozenset({"F10"})))
-        modes.append(hand.stage.work.view.draft)
+        modes.append(hand.main_view.work.view.draft)
     assert modes == ["on", "off", "auto", "on"]

@@ -23,8 +23,8 @@ from progdf.region import Region
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.gl.screen import read_rgb
-from viewer.render import cpu_renderer as cpu_painter
-from viewer.render.dirty_rectangles import MOST_BOXES, area, boxes
+from viewer.render import cpu_renderer as cpu_renderer
+from viewer.render.dirty_rectangles import MOST_RECTANGLES, area, dirty_rectangles
 from viewer.render.engine import Engine
 from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
@@ -47,8 +47,8 @@ def ctx() -> Iterator[moderngl.Context]:
 @pytest.fixture(autouse=True)
 def _small_boxes_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     """As they would in a larger picture."""
-    monkeypatch.setattr(cpu_painter, "_FLOOR", 64)
-    monkeypatch.setattr(cpu_painter, "_PIXELS_PER_GAUSSIAN", 0.0)
+    monkeypatch.setattr(cpu_renderer, "_FLOOR", 64)
+    monkeypatch.setattr(cpu_renderer, "_PIXELS_PER_GAUSSIAN", 0.0)
 
 
 def view_of(stack: Stack, *strengths: float) -> ViewState:
@@ -121,7 +121,7 @@ def test_a_picture_that_was_handed_out_stays_as_it_is(stack: Stack) -> None:
 def test_where_many_are_touched_the_picture_is_drawn_as_a_whole(
     stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cpu_painter, "MANY", 3)
+    monkeypatch.setattr(cpu_renderer, "MANY", 3)
     engine, fresh = Engine(None, stack.scene, stack.gdfs), Engine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.2), SIZE)
     changed = engine.image(view_of(stack, 0.7), SIZE)
@@ -197,7 +197,7 @@ def test_boxes_hold_all_marks_and_do_not_overlap(marks: list[tuple[int, int]], w
     for row, column in marks:
         cells[row, column] = True
     size = (20 * CELL - 3, 15 * CELL - 5)
-    found = boxes(cells, size, worth)
+    found = dirty_rectangles(cells, size, worth)
     cover: NDArray[np.int64] = np.zeros((size[1], size[0]), np.int64)
     for x0, y0, x1, y1 in found:
         assert 0 <= x0 < x1 <= size[0]
@@ -205,12 +205,12 @@ def test_boxes_hold_all_marks_and_do_not_overlap(marks: list[tuple[int, int]], w
         cover[y0:y1, x0:x1] += 1
     assert cover.max(initial=0) <= 1
     assert (cover[np.kron(cells, np.ones((CELL, CELL), bool))[: size[1], : size[0]]] == 1).all()
-    assert len(found) <= MOST_BOXES
+    assert len(found) <= MOST_RECTANGLES
     assert area(found) == cover.sum()
 
 
 def test_two_far_corners_are_two_small_boxes() -> None:
     cells = np.zeros((15, 20), np.bool_)
     cells[0, 0] = cells[14, 19] = True
-    assert area(boxes(cells, (160, 120), 1000)) == 2 * CELL**2
-    assert len(boxes(cells, (160, 120), 10**6)) == 1
+    assert area(dirty_rectangles(cells, (160, 120), 1000)) == 2 * CELL**2
+    assert len(dirty_rectangles(cells, (160, 120), 10**6)) == 1
