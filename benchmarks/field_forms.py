@@ -125,6 +125,9 @@ def baked_forms(course: KnownCourse) -> list[Form]:
 def stored_numbers(field: BakedField) -> int:
     """How many numbers the field holds for all members together, coefficients included."""
     return sum(
-        bases.full.numel() + bases.rest.numel() + bases.step.numel() + bases.coefficients.numel()
+        bases.end_offset.numel()
+        + bases.residual_basis.numel()
+        + bases.scale.numel()
+        + bases.coefficients.numel()
         for bases in field.attributes.values()
     )

@@ -70,9 +70,11 @@ def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
     for name, size in spread.items():
         width = 4 if name == "quats" else 3
         attributes[name] = AttributeBases(
-            full=size * torch.randn(len(region), width, generator=rng),
-            rest=torch.randint(-127, 128, (RANKS, len(region), width), generator=rng, dtype=torch.int8),
-            step=torch.full((RANKS, width), 2e-3 * size),
+            end_offset=size * torch.randn(len(region), width, generator=rng),
+            residual_basis=torch.randint(
+                -127, 128, (RANKS, len(region), width), generator=rng, dtype=torch.int8
+            ),
+            scale=torch.full((RANKS, width), 2e-3 * size),
             coefficients=coefficients.clone(),
         )
     score = torch.zeros(len(scene)).index_fill(0, region, 1.0)

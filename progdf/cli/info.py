@@ -133,15 +133,15 @@ class _Timeline(msgspec.Struct):
 
 def _form(gdf: GdfHead) -> str:
     """What a field is made of."""
-    # the first is the offset at strength 1 as it was recorded, see `AttributeBases.full`
+    # the first is the offset at strength 1 as it was recorded, see `AttributeBases.end_offset`
     bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
     network = gdf.field.network
     if network is None:
-        return f"{gdf.nodes} nodes; bases: {bases or 'none, nothing moves'}"
+        return f"{gdf.knots} knots; bases: {bases or 'none, nothing moves'}"
     error = ", ".join(f"{name} {value:.4g}" for name, value in network.bake_error.items())
     return (
         f"{grouped(gdf.parameters)} numbers in {network.shape.layers} layers of "
-        f"{network.shape.width}; baked at {gdf.nodes} nodes with bases: {bases}; baking costs: {error}"
+        f"{network.shape.width}; baked at {gdf.knots} knots with bases: {bases}; baking costs: {error}"
     )
 
 

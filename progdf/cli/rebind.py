@@ -140,7 +140,7 @@ def rebound(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     flipped = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
     attributes = {}
     for name, bases in gdf.field.attributes.items():
-        full, rest, step = bases.full[source], bases.rest[:, source], bases.step
+        full, rest, step = bases.end_offset[source], bases.residual_basis[:, source], bases.scale
         if name == "quats":
             full = torch.where(flipped[:, None], -full, full)
             rest = torch.where(flipped[None, :, None], -rest, rest)
@@ -150,7 +150,7 @@ def rebound(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
             attributes[name] = AttributeBases(full, rest, step, bases.coefficients)
     field = BakedField(
         kind="separable" if gdf.field.origin is not None else gdf.field.kind,
-        nodes=gdf.field.nodes,
+        knots=gdf.field.knots,
         attributes=attributes,
         channels=BASE_CHANNELS + (3 * b.shN.shape[1] if "shN" in attributes else 0),
         recorded=gdf.field.recorded,

@@ -153,23 +153,31 @@ def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> F
             if bases is None:
                 continue
             full = len(float_lines)
-            float_lines += list(bases.full.numpy().T)
-            rest = bases.rest.permute(2, 0, 1).flatten(0, 1)  # the bases of a channel side by side
-            is_float = bases.rest.dtype != torch.int8
+            float_lines += list(bases.end_offset.numpy().T)
+            rest = bases.residual_basis.permute(2, 0, 1).flatten(0, 1)  # the bases of a channel side by side
+            is_float = bases.residual_basis.dtype != torch.int8
             lines = len(float_lines) if is_float else len(byte_lines)
             if is_float:
                 float_lines += list(rest.float().numpy())
             else:
                 byte_lines += list(rest.numpy())
             table, step = ends[2], ends[2] + bases.coefficients.numel()
-            tables += [bases.coefficients.numpy().reshape(-1), bases.step.numpy().reshape(-1)]
-            ends[2] = step + bases.step.numel()
-            parts[i, j] = full, lines, is_float, len(bases.rest), table, step, coverages[KINDS[name]]
+            tables += [bases.coefficients.numpy().reshape(-1), bases.scale.numpy().reshape(-1)]
+            ends[2] = step + bases.scale.numel()
+            parts[i, j] = (
+                full,
+                lines,
+                is_float,
+                len(bases.residual_basis),
+                table,
+                step,
+                coverages[KINDS[name]],
+            )
         edits[i] = ends[0], len(float_lines), ends[1], len(byte_lines)
         floats.append(in_blocks(float_lines, np.float32))
         bytes_.append(in_blocks(byte_lines, np.int8))
         ends[:2] = ends[0] + len(floats[-1]), ends[1] + len(bytes_[-1])
-    nodes = tuple(tuple(gdf.field.nodes.tolist()) for gdf in gdfs)
+    nodes = tuple(tuple(gdf.field.knots.tolist()) for gdf in gdfs)
     flat = (np.concatenate(floats), np.concatenate(bytes_), np.concatenate(tables))
     return FlatEdits(edits, parts, *flat, nodes)
 

@@ -37,26 +37,26 @@ class BakePlan:
     """How a field is baked, so that every load gives the same.
 
     Args:
-        nodes: strengths at which the field is asked, ascending from 0 to 1. [S] float32
+        knots: strengths at which the field is asked, ascending from 0 to 1. [S] float32
         ranks: bases beside the full offset, by attribute
         end_correction: how much of what the field misses of the end is added at each node, by attribute, 0
             first and 1 last; no entry: nothing is missed. [S] float32
     """
 
-    nodes: Tensor
+    knots: Tensor
     ranks: Mapping[str, int]
     end_correction: Mapping[str, Tensor]
 
     def __post_init__(self) -> None:
-        if self.nodes.ndim != 1 or not 2 <= len(self.nodes) <= MOST_NODES:
-            raise ValueError(f"a bake at nodes {list(self.nodes.shape)}, expected 2 to {MOST_NODES}")
+        if self.knots.ndim != 1 or not 2 <= len(self.knots) <= MOST_NODES:
+            raise ValueError(f"a bake at nodes {list(self.knots.shape)}, expected 2 to {MOST_NODES}")
         for name, rank in self.ranks.items():
             if not 0 <= rank <= MOST_RANK:
                 raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MOST_RANK}")
         for name, share in self.end_correction.items():
-            if share.shape != self.nodes.shape or share.dtype != torch.float32:
+            if share.shape != self.knots.shape or share.dtype != torch.float32:
                 raise ValueError(
-                    f"the end correction of {name} is {list(share.shape)}, expected {len(self.nodes)} nodes"
+                    f"the end correction of {name} is {list(share.shape)}, expected {len(self.knots)} nodes"
                 )
 
 
@@ -85,7 +85,7 @@ class NeuralForm:
         """
         network = self.network
         trajectory = pinned_trajectory(network.bound(rows), full_end(network), self.plan)
-        baked = fit_separable(self.plan.nodes, trajectory, self.plan.ranks, recorded=network.recorded)
+        baked = fit_separable(self.plan.knots, trajectory, self.plan.ranks, recorded=network.recorded)
         return replace(baked, kind="neural", origin=self)
 
 
@@ -145,7 +145,7 @@ def pinned_trajectory(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
 
     What the field misses of the end is spread over the way, so that nothing jumps where the slider arrives.
     """
-    asked = torch.stack([field.offsets(float(s)) for s in plan.nodes])
+    asked = torch.stack([field.offsets(float(s)) for s in plan.knots])
     asked[0] = 0.0
     missing = end - asked[-1]
     for name, columns in moving_attributes(asked).items():
@@ -163,8 +163,8 @@ def bake_error(field: Field, baked: BakedField, plan: BakePlan, render: Render |
     psnrs = []
     for s in sample_strengths():
         pinned = field.offsets(s)
-        right = int(torch.searchsorted(plan.nodes, torch.tensor(s)).clamp(1, len(plan.nodes) - 1))
-        share = (s - float(plan.nodes[right - 1])) / float(plan.nodes[right] - plan.nodes[right - 1])
+        right = int(torch.searchsorted(plan.knots, torch.tensor(s)).clamp(1, len(plan.knots) - 1))
+        share = (s - float(plan.knots[right - 1])) / float(plan.knots[right] - plan.knots[right - 1])
         for name, columns in moving_attributes(end[None]).items():
             if name in plan.end_correction:
                 end_correction = torch.lerp(

@@ -70,7 +70,7 @@ def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
     """
     if field.origin is not None:
         raise ValueError("a network's slider is its own; only separable and keyframe fields take another")
-    nodes = field.nodes.double()
+    nodes = field.knots.double()
     far = (remap.old[:, None] - nodes).abs().amin(dim=1) > _NEAR
     asked = torch.cat([nodes, remap.old[far]]).sort().values
     moved = remap(asked).float()
@@ -85,4 +85,4 @@ def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
         for name, bases in field.attributes.items()
     }
     ticks = remap(torch.tensor(field.recorded, dtype=torch.float64)).tolist()
-    return replace(field, nodes=moved[kept], attributes=attributes, recorded=tuple(ticks))
+    return replace(field, knots=moved[kept], attributes=attributes, recorded=tuple(ticks))

@@ -16,7 +16,8 @@ from progdf.gaussians import ATTRIBUTES
 
 from .header import FieldTable, NetworkTable
 
-_PARTS = ("full", "rest", "step", "coefficients")
+_PARTS = {"end_offset": "full", "residual_basis": "rest", "scale": "step", "coefficients": "coefficients"}
+"""Parts of `AttributeBases`, and what they are called in a file."""
 _NETWORK = "network."
 
 
@@ -29,15 +30,15 @@ def packed_field(field: BakedField) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "recorded": list(field.recorded),
     }
     if field.origin is None:
-        tensors = {"nodes": field.nodes}
+        tensors = {"nodes": field.knots}
         for name, bases in field.attributes.items():
-            for part in _PARTS:
-                tensors[f"{name}.{part}"] = getattr(bases, part)
+            for part, key in _PARTS.items():
+                tensors[f"{name}.{key}"] = getattr(bases, part)
         return tensors, described
     form = field.origin
     network, plan = form.network, form.plan
     tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
-    tensors |= {"nodes": plan.nodes, "end": network.end}
+    tensors |= {"nodes": plan.knots, "end": network.end}
     tensors |= {f"pull.{name}": share for name, share in plan.end_correction.items()}
     if network.shape.code:
         tensors |= {"codes": network.codes, "code_step": network.code_step}
@@ -62,7 +63,7 @@ def unpacked_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[Ba
             raise ValueError(f"there is no attribute {name}")
     if table.network is None:
         attributes = {
-            name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS})
+            name: AttributeBases(**{part: tensors[f"{name}.{key}"] for part, key in _PARTS.items()})
             for name in table.attributes
         }
         return BakedField(table.kind, tensors["nodes"], attributes, table.channels, recorded), None

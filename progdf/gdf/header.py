@@ -145,7 +145,7 @@ class GdfHead:
         return sum(self.numbers(name) for name in self.tensors if name.startswith(learned) or name == "codes")
 
     @property
-    def nodes(self) -> int:
+    def knots(self) -> int:
         """At how many strengths the coefficients are given."""
         return self.numbers("nodes")
 

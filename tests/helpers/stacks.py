@@ -101,9 +101,9 @@ def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets
     coefficients[-1] = torch.tensor([1.0, 0.0])
     attributes = {
         attribute: AttributeBases(
-            full=full,
-            rest=(0.1 * full)[None].half(),
-            step=torch.ones(1, full.shape[1]),
+            end_offset=full,
+            residual_basis=(0.1 * full)[None].half(),
+            scale=torch.ones(1, full.shape[1]),
             coefficients=coefficients.clone(),
         )
         for attribute, full in offsets.items()

@@ -47,12 +47,10 @@ def small(part: str = "scarf", size: int = 1500, count: int = 6, image_size: int
     return Small(demo.gaussians, region, choose_views(demo.gaussians, region, cameras, count, WHITE).views)
 
 
-AttributeTrajectory = tuple[
-    Tensor, list[CropScene], list[CropScene], list[TargetStage], Objective, PgsSettings
-]
+Optimization = tuple[Tensor, list[CropScene], list[CropScene], list[TargetStage], Objective, PgsSettings]
 
 
-def course(case: Small, steps: int = 40, **more: object) -> AttributeTrajectory:
+def course(case: Small, steps: int = 40, **more: object) -> Optimization:
     """What `optimise` needs to recolour a small bear's part in two stages."""
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)

@@ -201,6 +201,9 @@ def stored_numbers(field: BakedField) -> int:
         network = field.origin.network
         return network.parameters + network.end.numel()
     return sum(
-        bases.full.numel() + bases.rest.numel() + bases.step.numel() + bases.coefficients.numel()
+        bases.end_offset.numel()
+        + bases.residual_basis.numel()
+        + bases.scale.numel()
+        + bases.coefficients.numel()
         for bases in field.attributes.values()
     )

@@ -127,7 +127,7 @@ def pack_edits(scene: Gaussians, gdfs: Sequence[Gdf]) -> PackedEdits:
         places.reshape(-1),
         tuple(edits),
         tuple(covers),
-        tuple(gdf.field.nodes.double().numpy() for gdf in gdfs),
+        tuple(gdf.field.knots.double().numpy() for gdf in gdfs),
         shown,
     )
 
@@ -155,14 +155,14 @@ def _target(
     attributes: Mapping[str, AttributeBases], shown: int, floats: _List, levels: _List
 ) -> TargetBases:
     """Put the attributes of one target side by side, members in turn, each with all its bases."""
-    rank = max(bases.rest.shape[0] for bases in attributes.values())
-    as_floats = any(bases.rest.dtype != torch.int8 for bases in attributes.values())
+    rank = max(bases.residual_basis.shape[0] for bases in attributes.values())
+    as_floats = any(bases.residual_basis.dtype != torch.int8 for bases in attributes.values())
     full = rest = np.zeros(0)
     movers = []
     for name, bases in attributes.items():
         place = PLACES[name]
-        own = _texels(bases.full.numpy(), place, shown)
-        own_rest = bases.rest.float() if as_floats else bases.rest
+        own = _texels(bases.end_offset.numpy(), place, shown)
+        own_rest = bases.residual_basis.float() if as_floats else bases.residual_basis
         if not full.size:
             full = np.zeros((len(own), 4), np.float32)
             rest = np.zeros((len(own), rank, 4), np.float32 if as_floats else np.int8)
@@ -171,7 +171,7 @@ def _target(
         for k in range(len(own_rest)):
             rest[:, k, columns] = _texels(own_rest[k].numpy(), place, shown)
         width = shown if name == "shN" else 1
-        step = bases.step[:, : width * place.components].numpy()
+        step = bases.scale[:, : width * place.components].numpy()
         movers.append(Mover(name, bases.coefficients.numpy(), step))
     if as_floats:
         together = np.concatenate([full[:, None], rest], axis=1).reshape(-1, 4)

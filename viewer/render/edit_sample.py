@@ -82,7 +82,9 @@ def difference(found: NDArray[np.float32], wanted: NDArray[np.float32]) -> float
 def _select_members(gdf: Gdf, chosen: Tensor, rows: NDArray[np.int64], scene: Gaussians) -> Gdf:
     """The edit of the sample: only its `chosen` members, counted within `rows`."""
     attributes = {
-        name: replace(bases, full=bases.full[chosen], rest=bases.rest[:, chosen])
+        name: replace(
+            bases, end_offset=bases.end_offset[chosen], residual_basis=bases.residual_basis[:, chosen]
+        )
         for name, bases in gdf.field.attributes.items()
     }
     members = torch.from_numpy(np.searchsorted(rows, gdf.region.members[chosen].numpy()))

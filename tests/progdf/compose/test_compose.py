@@ -60,7 +60,7 @@ def test_one_layer_at_full_strength_is_the_recorded_end_exactly(
     scene: Gaussians, shirt: Gdf, blend: str
 ) -> None:
     edited = compose_layers(scene, [Layer(shirt, 1.0)], blend)
-    full = torch.cat([bases.full for bases in shirt.field.attributes.values()], dim=1)
+    full = torch.cat([bases.end_offset for bases in shirt.field.attributes.values()], dim=1)
     expected = scene.replace_rows(shirt.region.members, pack(scene)[shirt.region.members] + full)
     assert bits(edited) == bits(expected)
 

@@ -132,14 +132,14 @@ def test_error_falls_with_rank() -> None:
 
 def test_between_snapshots_the_course_is_straight() -> None:
     field = curved_field(30)
-    low, high = float(field.nodes[3]), float(field.nodes[4])
+    low, high = float(field.knots[3]), float(field.knots[4])
     middle = field.offsets(0.25 * low + 0.75 * high)
     assert torch.allclose(middle, 0.25 * field.offsets(low) + 0.75 * field.offsets(high), atol=1e-5)
 
 
 def test_beyond_the_end_the_last_stretch_goes_on() -> None:
     field = curved_field(30)
-    last = field.offsets(1.0) - field.offsets(float(field.nodes[-2]))
+    last = field.offsets(1.0) - field.offsets(float(field.knots[-2]))
     assert torch.allclose(field.offsets(1.125), field.offsets(1.0) + last, atol=1e-4)
 
 
@@ -170,12 +170,12 @@ def test_a_fit_is_the_same_every_time() -> None:
 def test_bases_that_do_not_fit_each_other_are_refused() -> None:
     bases = curved_field(5).attributes["means"]
     for broken in (
-        {"full": bases.full[:4]},
-        {"step": bases.step[:1]},
+        {"end_offset": bases.end_offset[:4]},
+        {"scale": bases.scale[:1]},
         {"coefficients": bases.coefficients[:, :1]},
         {"coefficients": bases.coefficients + 0.1},
-        {"full": bases.full.double()},
-        {"rest": bases.rest.int()},
+        {"end_offset": bases.end_offset.double()},
+        {"residual_basis": bases.residual_basis.int()},
     ):
         with pytest.raises(ValueError, match=r"expected|fit|coefficients"):
             replace(bases, **broken)
@@ -183,9 +183,9 @@ def test_bases_that_do_not_fit_each_other_are_refused() -> None:
 
 def test_nodes_must_run_upwards_from_zero_to_one() -> None:
     field = curved_field(5)
-    for nodes in (field.nodes * 2, field.nodes.flip(0), field.nodes.double(), field.nodes[:1]):
-        with pytest.raises(ValueError, match="nodes"):
-            replace(field, nodes=nodes)
+    for nodes in (field.knots * 2, field.knots.flip(0), field.knots.double(), field.knots[:1]):
+        with pytest.raises(ValueError, match="knots"):
+            replace(field, knots=nodes)
 
 
 def test_attributes_must_have_the_same_members() -> None:
@@ -213,8 +213,8 @@ def test_the_choice_spends_no_byte_on_what_no_picture_shows() -> None:
     field = choose_field(
         strengths, offsets, linear_pictures(60, 14), kind="separable", target=50.0
     ).best.field
-    assert field.attributes["quats"].rest.shape[0] == 0
-    assert field.attributes["sh0"].rest.shape[0] > 0
+    assert field.attributes["quats"].residual_basis.shape[0] == 0
+    assert field.attributes["sh0"].residual_basis.shape[0] > 0
 
 
 def test_a_straight_trajectory_needs_two_keyframes_only() -> None:

@@ -54,7 +54,7 @@ def test_a_dial_costs_no_byte_per_member_and_moves_the_ticks() -> None:
 def test_the_dial_that_changes_nothing_changes_nothing() -> None:
     field = bent()
     found = remap_slider(field, identity_remap())
-    assert torch.equal(found.nodes, field.nodes)
+    assert torch.equal(found.knots, field.knots)
     assert all(torch.equal(found.offsets(s), field.offsets(s)) for s in (0.1, 0.33, 0.9))
 
 
@@ -62,7 +62,7 @@ def test_nodes_that_a_steep_dial_pushes_together_still_ascend() -> None:
     knots = torch.tensor([0.0, 0.4, 0.6, 1.0], dtype=torch.float64)
     steep = torch.tensor([0.0, 0.5, 0.5 + 1e-9, 1.0], dtype=torch.float64)
     found = remap_slider(bent(65), SliderRemap(knots, steep))
-    assert bool((found.nodes.diff() > 0).all())
+    assert bool((found.knots.diff() > 0).all())
     assert torch.equal(found.offsets(1.0), bent(65).offsets(1.0))
 
 

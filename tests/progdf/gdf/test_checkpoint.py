@@ -71,7 +71,7 @@ def same(a: Gdf, b: Gdf) -> bool:
     tensors = [
         (a.region.members, b.region.members),
         (a.region.score, b.region.score),
-        (a.field.nodes, b.field.nodes),
+        (a.field.knots, b.field.knots),
     ]
     for name, bases in a.field.attributes.items():
         tensors += [(part, getattr(b.field.attributes[name], key)) for key, part in vars(bases).items()]
@@ -133,7 +133,7 @@ def test_numbers_that_json_does_not_know_become_null(shirt: Gdf, tmp_path: Path)
 
 def test_a_field_with_numbers_that_are_not_finite_is_not_saved(shirt: Gdf, tmp_path: Path) -> None:
     bases = shirt.field.attributes["means"]
-    broken = replace(bases, full=bases.full.index_fill(0, torch.tensor([0]), float("inf")))
+    broken = replace(bases, end_offset=bases.end_offset.index_fill(0, torch.tensor([0]), float("inf")))
     field = replace(shirt.field, attributes={**shirt.field.attributes, "means": broken})
     with pytest.raises(ValueError, match=r"means\.full of shirt"):
         save_gdf(tmp_path / "a.gdf", replace(shirt, field=field))
@@ -315,8 +315,10 @@ def test_an_edit_is_told_from_its_header_alone(saved: Path, shirt: Gdf, tmp_path
     assert (head.options, head.report) == (shirt.options, shirt.report)
     assert head.members == len(shirt.region)
     assert head.bytes_per_member == shirt.field.bytes_per_member
-    assert head.nodes == len(shirt.field.nodes)
-    assert head.bases() == {name: 1 + len(bases.rest) for name, bases in shirt.field.attributes.items()}
+    assert head.knots == len(shirt.field.knots)
+    assert head.bases() == {
+        name: 1 + len(bases.residual_basis) for name, bases in shirt.field.attributes.items()
+    }
     with pytest.raises(ProgdfError, match="is damaged"):
         load_gdf(path)
 

@@ -58,9 +58,11 @@ def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
     width = torch.zeros(len(gdf.region), 4)
     turning = replace(
         bases,
-        full=width + torch.tensor([0.0, 0.5, -0.2, 0.1]),
-        rest=torch.zeros(bases.rest.shape[0], len(gdf.region), 4, dtype=bases.rest.dtype),
-        step=torch.zeros(bases.step.shape[0], 4),
+        end_offset=width + torch.tensor([0.0, 0.5, -0.2, 0.1]),
+        residual_basis=torch.zeros(
+            bases.residual_basis.shape[0], len(gdf.region), 4, dtype=bases.residual_basis.dtype
+        ),
+        scale=torch.zeros(bases.scale.shape[0], 4),
     )
     gdf = replace(gdf, field=replace(gdf.field, attributes={"quats": turning}))
     other, order = shuffled(scene)

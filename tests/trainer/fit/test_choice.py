@@ -43,5 +43,5 @@ def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:
     evaluator = FieldEvaluator(strengths, offsets, far)
     seen = rendered_trajectories(offsets, torch.ones(40, 14), far)
     found = separable_within(seen, strengths, 65.0, evaluator)
-    ranks = {name: len(bases.rest) for name, bases in found.field.attributes.items()}
+    ranks = {name: len(bases.residual_basis) for name, bases in found.field.attributes.items()}
     assert found.worst >= evaluator.candidate(fit_separable(strengths, offsets, ranks), "").worst

@@ -107,7 +107,7 @@ def channels_of(scene: Gaussians) -> int:
 def gdf_of(scene: Gaussians, members: int, seed: int, **field: object) -> Gdf:
     made = curved_field(members, seed, channels_of(scene), **field)  # type: ignore[arg-type]
     for bases in made.attributes.values():
-        bases.full[::2] = -0.0
+        bases.end_offset[::2] = -0.0
     return edit_of(scene, some_rows(scene, members, seed), made, f"edit {seed}")
 
 
@@ -283,7 +283,7 @@ def test_huge_offsets_overflow_as_they_do_on_the_cpu(ctx: moderngl.Context) -> N
     scene.means[3], scene.sh0[4] = float("nan"), float("inf")
     field = curved_field(60, 1)
     big = {
-        name: replace(bases, full=bases.full * scale)
+        name: replace(bases, end_offset=bases.end_offset * scale)
         for (name, bases), scale in zip(
             field.attributes.items(), (1e30, 3e38, 1e-30, 1e18, -3e38), strict=True
         )
