@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -42,9 +42,14 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
     path = parsed(Options, argv, "progdf info").file
-    for line in _DESCRIBE[kind_of(path)](path):
+    for line in describe(path):
         say(line)
     return 0
+
+
+def describe(path: Path) -> Iterable[str]:
+    """What a file holds, line by line; see `kind_of`."""
+    return _DESCRIBE[kind_of(path)](path)
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:

@@ -114,10 +114,10 @@ def choose_field(
         tried += _keyframes(
             strengths, offsets, gram, target, limit, evaluator, recorded, curves=kind != "auto"
         )
-    return _chosen(tuple(tried), target, budget)
+    return pick_candidate(tuple(tried), target, budget)
 
 
-def _chosen(tried: tuple[Candidate, ...], target: float, budget: float | None) -> Choice:
+def pick_candidate(tried: tuple[Candidate, ...], target: float, budget: float | None) -> Choice:
     """The smallest that reaches the target, else the best; of those that the budget allows, if any."""
     looked = f"{len(tried)} fields"
     allowed = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]

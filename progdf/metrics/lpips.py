@@ -123,7 +123,7 @@ class Lpips:
             ProgdfError: the package is not installed, or its file is not the one expected.
         """
         backbone = BACKBONES[net]
-        layers = _read_weights(_weights_file(backbone))
+        layers = _read_weights(weights_file(backbone))
         kernels, biases, importance = [], [], []
         try:
             for i, layer in enumerate(backbone.convolutions):
@@ -175,7 +175,7 @@ class Lpips:
         return self.distance(self.features(image), self.features(target))
 
 
-def _weights_file(backbone: Backbone) -> Path:
+def weights_file(backbone: Backbone) -> Path:
     try:
         path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(backbone.weights)))
     except importlib.metadata.PackageNotFoundError:
@@ -185,7 +185,7 @@ def _weights_file(backbone: Backbone) -> Path:
     return path
 
 
-class _ArraysOnly(pickle.Unpickler):
+class ArraysOnlyUnpickler(pickle.Unpickler):
     """Rebuilds numpy arrays, refuses everything else that a pickle may call."""
 
     def find_class(self, module: str, name: str) -> Any:
@@ -207,7 +207,7 @@ def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray[
 def _read_weights(path: Path) -> Mapping[str, Any]:
     try:
         with path.open("rb") as file:
-            layers = _ArraysOnly(file).load()
+            layers = ArraysOnlyUnpickler(file).load()
     except (
         OSError,
         pickle.UnpicklingError,

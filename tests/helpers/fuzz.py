@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from progdf.cli.info import _DESCRIBE, kind_of
+from progdf.cli.info import describe
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory, save_trajectory
 from progdf.formats.ply import load_ply, save_ply
@@ -47,7 +47,7 @@ SECONDS, BYTES = 10, 1 << 30
 
 def read_info(path: Path) -> None:
     """All lines of `progdf info`."""
-    for line in _DESCRIBE[kind_of(path)](path):
+    for line in describe(path):
         assert isinstance(line, str)
 
 

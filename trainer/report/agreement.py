@@ -33,7 +33,7 @@ _REMEDIES = {
     "folder": "edit the views more alike, or say --kind geometry if parts move",
 }
 _ROUNDS = 6
-_DAMPING = 1e-3  # of the first round's curvature: members that hardly show keep their colour
+DAMPING = 1e-3  # of the first round's curvature: members that hardly show keep their colour
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Agreement:
 
 
 @dataclass(frozen=True)
-class _Sight:
+class ViewChange:
     """One view's box at a smaller size: what it can show, its change, and which pixels count."""
 
     scene: CropScene
@@ -116,38 +116,38 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
         train, held_out: their edited pictures, in their order. [H,W,3] each
     """
     members = len(setup.region.members)
-    seen = [_sight(setup, view, edited) for view, edited in zip(setup.train, train, strict=True)]
-    colors = _best_colors(seen, members)
+    seen = [view_change(setup, view, edited) for view, edited in zip(setup.train, train, strict=True)]
+    colors = fit_colors(seen, members)
     lost = change = count = 0.0
     with torch.no_grad():
         for view, edited in zip(setup.held_out, held_out, strict=True):
-            sight = _sight(setup, view, edited)
-            lost += float((sight.change - sight.shown(colors)).square().sum())
-            change += float(sight.change.square().sum())
-            count += 3 * float(sight.counts.sum())
+            one = view_change(setup, view, edited)
+            lost += float((one.change - one.shown(colors)).square().sum())
+            change += float(one.change.square().sum())
+            count += 3 * float(one.counts.sum())
     if lost <= 0 or count == 0:
         return Agreement(99.0, 0.0)
     return Agreement(min(99.0, -10 * math.log10(lost / count)), lost / max(change, 1e-12))
 
 
-def _best_colors(seen: Sequence[_Sight], members: int) -> Tensor:
+def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     """Least squares by conjugate gradients on the normal equations (CGLS, Björck 1996). -> [M,3]"""
 
     def gathered(pictures: Sequence[Tensor]) -> Tensor:
-        parts = [sight.gathered(p, members) for sight, p in zip(seen, pictures, strict=True)]
+        parts = [one.gathered(p, members) for one, p in zip(seen, pictures, strict=True)]
         return torch.stack(parts).sum(dim=0)
 
     colors = torch.zeros(members, 3)
-    left = [sight.change for sight in seen]
+    left = [one.change for one in seen]
     direction = slope = gathered(left)
     damping = None
     for _ in range(_ROUNDS):
         with torch.no_grad():
-            shown = [sight.shown(direction) for sight in seen]
+            shown = [one.shown(direction) for one in seen]
         length, curve = float(direction.square().sum()), sum(float(p.square().sum()) for p in shown)
         if curve <= 0:
             break
-        damping = _DAMPING * curve / length if damping is None else damping
+        damping = DAMPING * curve / length if damping is None else damping
         step = float(slope.square().sum()) / (curve + damping * length)
         colors = colors + step * direction
         left = [picture - step * p for picture, p in zip(left, shown, strict=True)]
@@ -156,7 +156,7 @@ def _best_colors(seen: Sequence[_Sight], members: int) -> Tensor:
     return colors
 
 
-def _sight(setup: TrainingSetup, view: View, edited: Tensor) -> _Sight:
+def view_change(setup: TrainingSetup, view: View, edited: Tensor) -> ViewChange:
     camera = view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2))
     x0, y0, x1, y1 = view.box
     box = (x0 // 2, y0 // 2, min(camera.width, -(-x1 // 2)), min(camera.height, -(-y1 // 2)))
@@ -170,4 +170,4 @@ def _sight(setup: TrainingSetup, view: View, edited: Tensor) -> _Sight:
     counts = (view.mask > 0.05) | (change.abs().amax(dim=2) > 2 / 255)
     counting = (small(counts.float()[..., None]) > 0.5).float()
     scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
-    return _Sight(scene, small(change) * counting, counting)
+    return ViewChange(scene, small(change) * counting, counting)

@@ -46,7 +46,7 @@ class Clip:
     def pictures(self, images: Sequence[Tensor]) -> Tensor:
         """Features of pictures [H,W,3] of range 0..1, of unit length. [n,D]"""
         shift, scale = torch.tensor(_MEAN)[:, None, None], torch.tensor(_SPREAD)[:, None, None]
-        inputs = torch.stack([(_square(image, self.size) - shift) / scale for image in images])
+        inputs = torch.stack([(square_picture(image, self.size) - shift) / scale for image in images])
         with torch.no_grad():
             return normalize(_features(self.network.get_image_features(pixel_values=inputs)), dim=-1)
 
@@ -112,7 +112,7 @@ def _features(found: Any) -> Tensor:
     return features.float()
 
 
-def _square(image: Tensor, size: int) -> Tensor:
+def square_picture(image: Tensor, size: int) -> Tensor:
     """The whole picture, on a white square, as large as CLIP takes it. [H,W,3] -> [3,size,size]
 
     CLIP's own way cuts the sides off a picture that is no square; a region near the edge would be lost.

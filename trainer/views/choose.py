@@ -83,9 +83,9 @@ def choose_views(
     Raises:
         ProgdfError: no camera sees the region.
     """
-    rows = _sampled(scene, region)
+    rows = sample_members(scene, region)
     places = scene.means[rows]
-    framed = torch.stack([_framed(places, camera) for camera in cameras])
+    framed = torch.stack([in_frame(places, camera) for camera in cameras])
     looked = framed.any(dim=1).nonzero()[:, 0].tolist()
     most = _MOST_LOOKED_THROUGH * count
     if len(looked) > most:
@@ -174,7 +174,7 @@ def _reach(count: int) -> float:
     return min(1.0, math.sqrt(2 * math.pi / count))
 
 
-def _sampled(scene: Gaussians, region: Region) -> Tensor:
+def sample_members(scene: Gaussians, region: Region) -> Tensor:
     """Rows that stand for the region, evenly by the area they can cover. -> [S] int64"""
     total = visible_area(scene[region.members]).cumsum(dim=0)
     ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
@@ -182,7 +182,7 @@ def _sampled(scene: Gaussians, region: Region) -> Tensor:
     return region.members[torch.unique_consecutive(picked)]
 
 
-def _framed(places: Tensor, camera: Camera) -> Tensor:
+def in_frame(places: Tensor, camera: Camera) -> Tensor:
     """Which places fall into the picture or near it, whatever stands before them. [S,3] -> [S] bool
 
     Near: within half the picture's size, as what is large reaches in.

@@ -85,7 +85,7 @@ class App:
             self.context, self.engine, document.facts(), state, window.ui_scale, pictures
         )
         self.file_actions = FileActions(self, session, memory)
-        self._left = False
+        self.is_closed = False
         self._title = ""
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
@@ -104,15 +104,15 @@ class App:
         self.window.new_frame()
         self.main_view.draw_splash(self.context.screen)
         self.window.present()
-        while not self._left:
+        while not self.is_closed:
             waits = [wait for wait in self._waits() if wait is not None]
             if not self.main_view.opening:  # else events wait in the window system, so that no letter is lost
                 self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
-            for path in self._take_dropped():
+            for path in self.take_dropped():
                 self.open(path)
-            if self.window.closing and not self._left:
+            if self.window.closing and not self.is_closed:
                 self.window.stay_open()
                 self.main_view.request("quit")
             self.draw()
@@ -153,7 +153,7 @@ class App:
         self.dropped += paths
         self.main_view.wake()
 
-    def _take_dropped(self) -> list[Path]:
+    def take_dropped(self) -> list[Path]:
         paths, self.dropped = self.dropped, []
         return paths
 
@@ -181,7 +181,7 @@ class App:
     def leave(self) -> None:
         """Close the window, without a question."""
         self.window.ask_to_close()
-        self._left = True
+        self.is_closed = True
 
 
 def _window_title(name: str, unsaved: bool = False) -> str:

@@ -19,7 +19,7 @@ from viewer.ui.widgets import icon_button, is_released, tip
 
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
 ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
-_SETTINGS_PX = 262.0
+SETTINGS_PX = 262.0
 _KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
@@ -52,7 +52,7 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
     actions: list[str] = []
     frame = min(player.frame, timeline.length)
     _buttons(timeline, player, frame, actions, ui)
-    settings = _SETTINGS_PX * ui.scale if roomy else 0.0
+    settings = SETTINGS_PX * ui.scale if roomy else 0.0
     wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
     _ruler(timeline, frame, wide, actions, ui)
     if roomy:

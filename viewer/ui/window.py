@@ -27,7 +27,7 @@ from .double_clicks import DoubleClicks
 
 LEAST = (640, 400)
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
-_NAMES = {
+KEY_NAMES = {
     **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
     **{
@@ -251,7 +251,7 @@ def interruptible() -> Iterator[None]:
 
 def key_name(key: int, scancode: int) -> str:
     """The name of a glfw key in `controls`: letters as the layout has them, others by their place."""
-    place = _NAMES.get(key, "")
+    place = KEY_NAMES.get(key, "")
     if len(place) == 1 and place.isalpha():
         label = glfw.get_key_name(key, scancode) or ""
         return label.upper() if label.isascii() and label.isalpha() else place

@@ -49,7 +49,7 @@ def _source_version() -> str:
     return digest.hexdigest()[:16]
 
 
-def _find_cache_folder() -> Path:
+def find_cache_folder() -> Path:
     """A folder that this user may write, for this version of the kernels; never in the source tree."""
     if "NUMBA_CACHE_DIR" in os.environ:
         root = Path(os.environ["NUMBA_CACHE_DIR"])
@@ -136,7 +136,7 @@ def _recorded(folder: Path) -> dict[str, int]:
 @once
 def kernel_cache() -> Path:
     """The folder of compiled kernels, made and checked when the first kernel is needed."""
-    folder = _find_cache_folder()
+    folder = find_cache_folder()
     if drop_damaged(folder):
         log.warning("kernels kept in %s were damaged and are compiled anew", folder)
     atexit.register(record_cache, folder)

@@ -252,14 +252,14 @@ def test_weights_that_would_call_something_are_refused(
 ) -> None:
     path = tmp_path_factory.mktemp("weights") / "alexnet.ckpt"
     path.write_bytes(content)
-    monkeypatch.setattr(lpips, "_weights_file", lambda backbone: path)
+    monkeypatch.setattr(lpips, "weights_file", lambda backbone: path)
     with pytest.raises(ProgdfError, match="is not what was expected"):
         Lpips.load()
 
 
 def test_only_arrays_are_rebuilt() -> None:
     with pytest.raises(pickle.UnpicklingError, match="has no business in weights"):
-        lpips._ArraysOnly(io.BytesIO(pickle.dumps(print))).load()
+        lpips.ArraysOnlyUnpickler(io.BytesIO(pickle.dumps(print))).load()
 
 
 # ---- the slider

@@ -114,8 +114,8 @@ def test_without_a_home_the_kernels_are_kept_among_temporary_files(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pathlib.Path.home", homeless)
-    assert temporary in jit._find_cache_folder().parents
-    assert jit._find_cache_folder() == jit._find_cache_folder(), "not a folder a process"
+    assert temporary in jit.find_cache_folder().parents
+    assert jit.find_cache_folder() == jit.find_cache_folder(), "not a folder a process"
     assert user_folders.state_folder() == temporary
 
 
@@ -126,9 +126,9 @@ def test_where_the_cache_cannot_be_written_all_processes_share_one_elsewhere(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "file"))
     monkeypatch.setattr("pathlib.Path.home", lambda: tmp_path / "file")
-    folder = jit._find_cache_folder()
+    folder = jit.find_cache_folder()
     assert temporary in folder.parents
-    assert folder == jit._find_cache_folder()
+    assert folder == jit.find_cache_folder()
 
 
 def test_a_temporary_folder_that_others_may_write_to_is_not_used(
@@ -137,6 +137,6 @@ def test_a_temporary_folder_that_others_may_write_to_is_not_used(
     monkeypatch.setattr("pathlib.Path.home", homeless)
     temporary.mkdir()
     temporary.chmod(0o777)
-    folder = jit._find_cache_folder()
+    folder = jit.find_cache_folder()
     assert temporary not in folder.parents
     assert os.stat(folder).st_mode & 0o077 == 0

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import Candidate, FieldEvaluator, choose_field, fit_separable
-from progdf.field.choose import _chosen, separable_within
+from progdf.field.choose import pick_candidate, separable_within
 from progdf.field.rendered import rendered_trajectories
 from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
 
@@ -14,7 +14,7 @@ from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
 def test_the_best_field_is_the_one_whose_worst_picture_is_best() -> None:
     steady = Candidate(curved_field(3), (30.0, 31.0), "steady")
     uneven = Candidate(curved_field(3), (20.0, 60.0), "good on the mean")
-    assert _chosen((uneven, steady), 99.0, None).best is steady
+    assert pick_candidate((uneven, steady), 99.0, None).best is steady
 
 
 def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another() -> None:

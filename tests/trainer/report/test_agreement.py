@@ -13,7 +13,7 @@ from torch import Tensor
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, small
 from trainer.editors import make_editor
-from trainer.report.agreement import Agreement, _best_colors, _sight, measure_agreement
+from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.view import crop, render_colors
 
@@ -138,16 +138,16 @@ class LinearSight:
 
 
 def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trainer.report.agreement._DAMPING", 0.2)
+    monkeypatch.setattr("trainer.report.agreement.DAMPING", 0.2)
     rng = torch.Generator().manual_seed(5)
-    sights = [
+    changes = [
         LinearSight(torch.randn(9, 5, generator=rng), torch.randn(9, 3, generator=rng)) for _ in range(2)
     ]
-    A, b = torch.cat([s.matrix for s in sights]), torch.cat([s.change for s in sights])
+    A, b = torch.cat([s.matrix for s in changes]), torch.cat([s.change for s in changes])
     slope = A.T @ b
     damping = 0.2 * (A @ slope).square().sum() / slope.square().sum()
     expected = torch.linalg.solve(A.T @ A + damping * torch.eye(5), slope)
-    found = _best_colors(sights, 5)  # type: ignore[arg-type]
+    found = fit_colors(changes, 5)  # type: ignore[arg-type]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -173,7 +173,7 @@ def test_a_box_at_half_size_holds_all_of_its_odd_pixels_in_their_place() -> None
     view = replace(body().views[0], box=(11, 20, 61, 75))
     x, y = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="xy")
     ramp = torch.stack([0.1 + x / 200, 0.1 + y / 200, torch.full_like(x, 0.2)], dim=2)
-    sight = _sight(setup(), view, view.image + ramp)
+    found = view_change(setup(), view, view.image + ramp)
     halved = torch.nn.functional.avg_pool2d(ramp.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)
-    torch.testing.assert_close(sight.change, halved[10:38, 5:31], atol=1e-5, rtol=0)
-    assert sight.scene.box == (5, 10, 31, 38)
+    torch.testing.assert_close(found.change, halved[10:38, 5:31], atol=1e-5, rtol=0)
+    assert found.scene.box == (5, 10, 31, 38)

@@ -25,7 +25,7 @@ from trainer.options import FitOptions, TrainOptions
 from trainer.pipeline.refit import refit
 from trainer.pipeline.run import train
 from trainer.plan import Texts, make_plan
-from trainer.report.clip import Clip, _square, direction, load_clip
+from trainer.report.clip import Clip, direction, load_clip, square_picture
 from trainer.report.measures import clip_course
 
 pytest.importorskip("transformers")
@@ -94,7 +94,7 @@ def test_what_older_transformers_return_is_taken_too() -> None:
 def test_a_wide_picture_is_seen_whole() -> None:
     image = torch.zeros(20, 60, 3)
     image[:, :4] = torch.tensor([1.0, 0.0, 0.0])
-    seen = _square(image, 30)
+    seen = square_picture(image, 30)
     assert seen.shape == (3, 30, 30)
     assert float(seen[0, 15, 0]) > 0.9
     assert float(seen[1, 15, 0]) < 0.1
@@ -106,7 +106,7 @@ def test_pictures_are_scaled_as_pillow_does_it_for_clip() -> None:
     image = 0.3 + 0.4 * torch.rand(50, 50, 3, generator=torch.Generator().manual_seed(0))
     scaled = to_picture(image).resize((32, 32), Image.Resampling.BICUBIC)
     expected = torch.from_numpy(np.asarray(scaled, dtype=np.float32) / 255)
-    assert (_square(image, 32).permute(1, 2, 0) - expected).abs().max() < 2.5 / 255
+    assert (square_picture(image, 32).permute(1, 2, 0) - expected).abs().max() < 2.5 / 255
 
 
 def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(

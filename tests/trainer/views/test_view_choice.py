@@ -22,7 +22,7 @@ from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainOptions
 from trainer.setup.training_setup import make_training_setup
-from trainer.views.choose import Choice, _framed, _sampled, choose_views, split_views
+from trainer.views.choose import Choice, choose_views, in_frame, sample_members, split_views
 
 
 def test_a_camera_that_looks_away_is_left_out() -> None:
@@ -233,7 +233,7 @@ def test_places_are_framed_as_far_as_half_a_picture_beside_it() -> None:
     rays = torch.linalg.solve(camera.K, torch.cat([pixels, torch.ones(6, 1)], dim=1).T).T * depth
     rays[5] *= -1  # behind
     places = rays @ camera.c2w[:3, :3].T + camera.position
-    assert _framed(places, camera).tolist() == [True, True, False, True, False, False]
+    assert in_frame(places, camera).tolist() == [True, True, False, True, False, False]
 
 
 def test_as_many_views_as_are_asked_for_even_where_all_show_the_same() -> None:
@@ -258,7 +258,7 @@ def test_a_wide_view_shows_what_a_narrow_one_does_and_not_the_other_way_round() 
 def test_members_are_sampled_all_over_the_region() -> None:
     scene = random_gaussians(2000, scale=0.01)
     scene = replace(scene, log_scales=torch.full((2000, 3), -4.0), logit_opacities=torch.zeros(2000))
-    rows = _sampled(scene, from_mask("half", torch.arange(2000) >= 1000))
+    rows = sample_members(scene, from_mask("half", torch.arange(2000) >= 1000))
     assert len(rows) == 256
     assert int(rows[0]) - 1000 <= 4
     assert 1999 - int(rows[-1]) <= 4

@@ -103,21 +103,21 @@ def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: P
 @pytest.mark.gl
 def test_quitting_asks_only_when_something_would_be_lost(window: application.App, folder: Path) -> None:
     press(window, "Ctrl+Q")
-    assert window._left
-    window._left = False
+    assert window.is_closed
+    window.is_closed = False
     press(window, "Shift+Left", "Ctrl+Q")
     assert question(window).kind == "leave"
     press(window, "Escape")
-    assert not window._left
+    assert not window.is_closed
     press(window, "Ctrl+Q", "S", "Enter")  # save, under the name that is offered
     assert (folder / "bear.session.json").is_file()
-    assert window._left
+    assert window.is_closed
 
 
 @pytest.mark.gl
 def test_discarding_leaves_and_writes_nothing(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left", "Ctrl+Q", "D")
-    assert window._left
+    assert window.is_closed
     assert not (folder / "bear.session.json").exists()
 
 
@@ -405,10 +405,10 @@ def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application
     assert "kept does not exist" in question(window).error
     assert question(window).text == str(folder / "kept" / "bear.session.json")
     press(window, "Enter")
-    assert not window._left
+    assert not window.is_closed
     (folder / "away").rename(folder / "kept")
     press(window, "Enter")
-    assert window._left
+    assert window.is_closed
     assert not window.file_actions.has_unsaved
 
 

@@ -110,9 +110,9 @@ def test_glfw_hands_dropped_files_to_the_next_turn_of_the_loop(
     names = (ctypes.c_char_p * 1)(str(tmp_path / "torn.ply").encode())
     drop(opened.window.handle, len(names), names)
     assert opened.main_view.next_frame_delay() == 0.0, "the loop wakes"
-    for path in opened._take_dropped():
+    for path in opened.take_dropped():
         opened.open(path)
     opened.draw()
     assert opened.main_view.work.message is not None
     assert "torn.ply" in opened.main_view.work.message.text
-    assert opened._take_dropped() == []
+    assert opened.take_dropped() == []

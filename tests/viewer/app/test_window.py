@@ -294,12 +294,12 @@ def test_without_a_display_view_says_so_in_one_line(tmp_path: Path) -> None:
 
 
 def test_chords_are_named_as_in_the_table_of_bindings() -> None:
-    from viewer.ui.window import _NAMES, chord, glfw
+    from viewer.ui.window import KEY_NAMES, chord, glfw
 
     assert chord("Z", glfw.MOD_CONTROL | glfw.MOD_SHIFT) == "Ctrl+Shift+Z"
     assert chord("F2", 0) == "F2"
     bound = {key.chord.rpartition("+")[2] for key in controls.KEYS} | {controls.HELD_ORIGINAL}
-    assert bound <= set(_NAMES.values()), "every bound key is known to the window"
+    assert bound <= set(KEY_NAMES.values()), "every bound key is known to the window"
 
 
 @pytest.mark.window

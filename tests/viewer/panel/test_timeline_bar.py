@@ -47,7 +47,7 @@ def hand(tmp_path: Path) -> Iterator[Rig]:
 def at(hand: Rig, frame: float) -> tuple[float, float]:
     """Where a frame of the ruler stands on the window."""
     left = 10.0 + 3 * 25.0 + 2 * 2.0 + 10.0
-    wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar._SETTINGS_PX
+    wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar.SETTINGS_PX
     shown = hand.main_view.work.view.timeline
     return timeline_bar.place(shown, frame, left + 8.0, wide - 16.0), WINDOW[1] - 24.0
 
@@ -140,7 +140,7 @@ def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
     hand.release()
     assert hand.main_view.work.player.playing
     hand.key("Space")
-    settings = WINDOW[0] - panel.WIDTH_PX - 10.0 - timeline_bar._SETTINGS_PX + 12.0
+    settings = WINDOW[0] - panel.WIDTH_PX - 10.0 - timeline_bar.SETTINGS_PX + 12.0
     hand.move(settings + 30.0, y)
     hand.press()
     hand.release()
