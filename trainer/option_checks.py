@@ -46,9 +46,7 @@ def resolve_options(options: TrainOptions) -> TrainOptions:
         ("--stages", options.stages, 0, 16),
         ("--group-steps", options.group_steps, 0, 10_000),
         ("--seed", options.seed, 0, LARGEST_SEED),
-        ("--edit-seed", options.edit_seed, 0, LARGEST_SEED),
         ("--threads", options.threads, 0, MOST_THREADS),
-        ("--perceptual-every", options.perceptual_every, 1, 1000),
         ("--guidance", options.guidance, 1, 100),
         ("--image-guidance", options.image_guidance, 1, 100),
         ("--edit-steps", options.edit_steps, 1, 1000),
@@ -62,13 +60,9 @@ def resolve_options(options: TrainOptions) -> TrainOptions:
         raise ProgdfError(
             f"--steps must be between {4 * stages} and {MOST_STEPS} for {stages} stages, got {options.steps}"
         )
-    for what, weight in (
-        ("--perceptual-weight", options.perceptual_weight),
-        ("--progressive-weight", options.progressive_weight),
-        ("--sharpness-weight", options.sharpness_weight),
-    ):
-        if weight is not None and not 0 <= weight < math.inf:
-            raise ProgdfError(f"{what} must be 0 or more, got {weight}")
+    weight = options.perceptual_weight
+    if weight is not None and not 0 <= weight < math.inf:
+        raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
     if not 0 <= options.save_every < math.inf:
         raise ProgdfError(f"--save-every must be 0 or more seconds, got {options.save_every}")
     _check_editor_options(options)
@@ -105,7 +99,7 @@ def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
 def _check_editor_options(options: TrainOptions) -> None:
     """No option is passed over in silence: one that the editor does not know is refused."""
     kind = options.editor.partition(":")[0]
-    of_instruct = ("model", "guidance", "image_guidance", "edit_steps", "edit_seed")
+    of_instruct = ("model", "guidance", "image_guidance", "edit_steps")
     of_painters = ("edit_size", "reedit_every")
     for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
         for name in names:

@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 import tyro
 
-from progdf.field.neural import Bins, Inputs, Size
-from progdf.metrics.lpips import Net
+from progdf.field.neural import Size
 from progdf.scene.up_axis import UpChoice
 
 Slider = Literal["auto", "even", "stages", "time"]
@@ -32,8 +31,6 @@ FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
 NETWORK_OPTIONS: Mapping[str, Any] = {
     "fit": "after",
     "size": "tiny",
-    "inputs": "own",
-    "bins": "smooth",
     "code": 8,
     "picture_loss": 0.0,
 }
@@ -97,8 +94,6 @@ class TrainOptions:
     """instruct: how closely the picture is followed, where the model knows it (paper: 1.5)."""
     edit_steps: int | None = None
     """instruct: denoising steps per picture; by default as the model was made for (paper: 20)."""
-    edit_seed: int = 0
-    """instruct: seed of the noise, which is the same in every view."""
     edit_size: int | None = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
     confine: Literal["auto", "yes", "no"] = "auto"
@@ -130,9 +125,6 @@ class TrainOptions:
     """geometry: first the connected parts of the region are moved as wholes, in so many steps per strength
     or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves far. By
     default 120 or 0, whichever a short trial finds better."""
-    follow: bool = True
-    """colour: members that no training view shows take on what their neighbours along the surface do, so that
-    they keep no old colour for whoever looks from elsewhere."""
     stages: int = 0
     """Strengths that an editor with a dial is asked for; 0: 8, or 4 for fewer than 320 steps, but 1 for a
     style, which is the paper's way, towards the end alone. instruct is asked for strengths, by rising
@@ -141,30 +133,15 @@ class TrainOptions:
     """Colours that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colours and the region's own
     hardly change with the view (auto)."""
-    rates: Rates = "kind"
-    """Learning rates: as the kind of edit needs, with short steps on the last stretch; or 3DGS's own, flat,
-    for all attributes (paper), which hardly move in 600 steps."""
-    perceptual: Net = "alex"
-    """style, geometry: LPIPS through AlexNet, or VGG16, with which a run takes more than twice as long and is
-    no better."""
     perceptual_weight: float | None = None
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
-    perceptual_every: int = 2
-    """style, geometry: LPIPS is paid for every so many steps (paper: 1)."""
     progressive: Progressive = "off"
     """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as the loss that it
     is, which lets go of the steps (decay) or tightens (growth). As a loss it freezes the edit."""
-    progressive_weight: float = 5.0
-    """Weight of the progressive constraint as a loss (paper: 5)."""
     sharpness: Literal["auto", "hinge", "paper", "off"] = "auto"
     """Sharpness of the renders: not less than the target's (hinge), or the printed term, which pulls at no
     pixel but the rim's (paper). auto: hinge for style, off for colour and geometry."""
-    sharpness_weight: float | None = None
-    """Weight of the sharpness; by default .1 for hinge, 1 for paper."""
-    recording: Literal["smooth", "raw"] = "smooth"
-    """Record a running mean of the parameters whenever the pictures have moved, and drop jitter; or the bare
-    iterates at even steps (paper), between which the slider's steps differ far more."""
     slider: Slider = "auto"
     """Slider values. even: equal steps look equally large, and an editor with a dial is asked for pictures
     that do; stages: s is the editor's own strength, even in between; time: the optimiser's. auto: even, but
@@ -177,11 +154,6 @@ class TrainOptions:
     then --inputs position."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
-    inputs: Inputs = NETWORK_OPTIONS["inputs"]
-    """neural: what the network sees, the position alone (paper), or also what the Gaussian looks like and
-    where it ends: 38 dB instead of 34 at no cost."""
-    bins: Bins = NETWORK_OPTIONS["bins"]
-    """neural: the slider's ten bins, interpolated, or hard (paper), between which the edit jumps."""
     code: int = NETWORK_OPTIONS["code"]
     """neural: a byte each for so many learned numbers per Gaussian, which tell what its place does not."""
     picture_loss: float = NETWORK_OPTIONS["picture_loss"]
@@ -221,11 +193,6 @@ class FitOptions:
     keeps every recording."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
-    inputs: Inputs = NETWORK_OPTIONS["inputs"]
-    """neural: what the network sees, the position alone (paper), or also what the Gaussian looks like and
-    where it ends: 38 dB instead of 34 at no cost."""
-    bins: Bins = NETWORK_OPTIONS["bins"]
-    """neural: the slider's ten bins, interpolated, or hard (paper), between which the edit jumps."""
     code: int = NETWORK_OPTIONS["code"]
     """neural: a byte each for so many learned numbers per Gaussian, which tell what its place does not."""
     picture_loss: float = NETWORK_OPTIONS["picture_loss"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from progdf.field.neural import Bins, Inputs, Size
 
 from .options import CLIP_MODEL, FieldKind, Slider, TrainOptions
+from .presets import CONSTANTS
 
 
 @dataclass(frozen=True)
@@ -15,8 +16,8 @@ class NetworkPlan:
 
     Args:
         joint: trained beside the optimization, not on the finished recording
-        size, bins, code: see `TrainOptions`
-        inputs: what it sees; a jointly trained one sees positions alone, as the end is not known yet
+        size, code: see `TrainOptions`
+        inputs, bins: see `Constants`; a jointly trained one sees positions alone, as the end is not known yet
         picture_loss: weight of L1 + LPIPS between pictures of field and recording, ≥ 0
         draft: a third of the steps
         seed: of its weights and draws
@@ -88,12 +89,12 @@ class Plan:
 
 def make_plan(options: TrainOptions) -> Plan:
     """The options, resolved. `options`: checked, see `resolve_options`"""
-    joint = options.fit == "joint"
+    joint, constants = options.fit == "joint", CONSTANTS[options.preset]
     network = NetworkPlan(
         joint,
         options.size,
-        "position" if joint else options.inputs,
-        options.bins,
+        "position" if joint else constants.inputs,
+        constants.bins,
         options.code,
         options.picture_loss,
         options.quick,

@@ -118,7 +118,7 @@ def _do(root: Path, variant: Variant, shared: AblationSetup, quiet: bool) -> Non
     folder.mkdir(exist_ok=True)
     options = replace(shared.options, **variant.changes)
     measure, _ = perceptual_loss()
-    perceptual = perceptual_loss(options.perceptual)[0]
+    perceptual = perceptual_loss()[0]
     objective = objective_line(options, shared.kind, perceptual.name)
     outcome = Outcome(variant.name, variant.what, objective=objective)
     log = RunLog(folder / "log.txt", quiet)

@@ -26,7 +26,7 @@ from .variants import Variant
 
 _T = TypeVar("_T")
 _LAID_OVER = ("slider",)  # options that the optimisation does not depend on
-_COMMAND = ("out", "scene", "threads", "resume", "save_every", "quick", "preset")  # nor anything else
+_COMMAND = ("out", "scene", "threads", "resume", "save_every", "quick")  # nor anything else
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,10 @@ from trainer.presets import PRESETS
 
 BASE, LINEAR = "base", "2-keyframes"
 
-_AS_PRINTED = {name: value for name, value in PRESETS["paper"].items() if name not in ("steps", "views")}
+_AS_PRINTED = {
+    "preset": "paper",
+    **{name: value for name, value in PRESETS["paper"].items() if name not in ("steps", "views")},
+}
 
 
 @dataclass(frozen=True)

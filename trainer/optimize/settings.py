@@ -12,7 +12,7 @@ from progdf.gaussians import BASE_CHANNELS
 from trainer.editors import GIVEN
 from trainer.editors.base import EditKind
 from trainer.options import MOST_STAGES, QUICK_STAGES, STAGE_STEPS, Slider, TrainOptions
-from trainer.presets import PRESETS
+from trainer.presets import CONSTANTS, PRESETS
 
 from .groups import GROWTH
 from .objective import LossWeights, Sharpness
@@ -21,6 +21,7 @@ from .pgs import PgsSettings, learning_rates
 PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"colour": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: dict[EditKind, Sharpness] = {"colour": "off", "style": "hinge", "geometry": "off"}
 SHARPNESS_WEIGHT: dict[Sharpness, float] = {"hinge": 0.1, "paper": 1.0, "off": 0.0}
+PROGRESSIVE_WEIGHT = 5.0  # λ2 of the paper
 GROUP_STEPS = 120
 STAGES: dict[EditKind, int] = {"colour": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
 
@@ -56,11 +57,11 @@ def solves_colors(options: TrainOptions, kind: EditKind) -> bool:
     only a descent view by view has."""
     return (
         kind == "colour"
-        and options.rates == "kind"
+        and CONSTANTS[options.preset].rates == "kind"
         and options.progressive == "off"
         and options.sharpness in ("auto", "off")
         and not options.perceptual_weight
-        and options.recording == "smooth"
+        and not CONSTANTS[options.preset].raw
         and options.fit == "after"
         and not options.reedit_every
     )
@@ -68,19 +69,8 @@ def solves_colors(options: TrainOptions, kind: EditKind) -> bool:
 
 def idle_options(options: TrainOptions, kind: EditKind) -> list[str]:
     """The options that were asked for and change nothing in a run of this kind, as one types them."""
-    solved, weights = solves_colors(options, kind), loss_weights(options, kind)
-    without_lpips = solved or weights.perceptual == 0
-    idle = {
-        "perceptual": without_lpips,
-        "perceptual_every": without_lpips,
-        "progressive_weight": weights.progressive not in ("decay", "growth"),
-        "sharpness_weight": weights.sharpness == "off",
-        "group_steps": kind != "geometry",
-        "follow": kind != "colour",
-    }
-    unasked = {name: PRESETS[options.preset].get(name, getattr(TrainOptions, name)) for name in idle}
-    asked = [name for name in idle if idle[name] and getattr(options, name) != unasked[name]]
-    return ["--no-follow" if name == "follow" else "--" + name.replace("_", "-") for name in asked]
+    unasked = PRESETS[options.preset].get("group_steps", TrainOptions.group_steps)
+    return ["--group-steps"] if kind != "geometry" and options.group_steps != unasked else []
 
 
 def objective_line(options: TrainOptions, kind: EditKind, perceptual: str) -> str:
@@ -95,11 +85,11 @@ def loss_weights(options: TrainOptions, kind: EditKind) -> LossWeights:
     sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness
     return LossWeights(
         PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight,
-        options.perceptual_every,
+        CONSTANTS[options.preset].perceptual_every,
         options.progressive,
-        options.progressive_weight,
+        PROGRESSIVE_WEIGHT,
         sharpness,
-        SHARPNESS_WEIGHT[sharpness] if options.sharpness_weight is None else options.sharpness_weight,
+        SHARPNESS_WEIGHT[sharpness],
     )
 
 
@@ -115,12 +105,13 @@ def pgs_settings(
         extent: size of what moves, world units
         stages: how many strengths there are to optimise towards
     """
-    rates = learning_rates(kind, channels, extent, options.rates)
+    constants = CONSTANTS[options.preset]
+    rates = learning_rates(kind, channels, extent, constants.rates)
     if options.sh == "off":
         rates[BASE_CHANNELS:] = 0.0
     warmup = options.progressive == "warmup"
-    smoothing, every = (0.9, 0) if options.recording == "smooth" else (0.0, max(1, options.steps // 32))
-    if options.rates == "3dgs":  # a plain descent: the target at once, the same steps throughout
+    smoothing, every = (0.0, max(1, options.steps // 32)) if constants.raw else (0.9, 0)
+    if constants.rates == "3dgs":  # a plain descent: the target at once, the same steps throughout
         return PgsSettings(
             rates,
             warmup,

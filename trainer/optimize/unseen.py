@@ -16,7 +16,6 @@ from torch import Tensor
 from progdf.gaussians import Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
 from trainer.editors.base import EditKind
-from trainer.options import TrainOptions
 from trainer.regions.surface import surface_likeness
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.view import View
@@ -58,9 +57,9 @@ class UnseenMembers:
         return led
 
 
-def unseen_members_of(options: TrainOptions, setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
+def unseen_members_of(setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
     """Those of a run: nobody but in an edit of colours that is to be followed (`--follow`)."""
-    if kind != "colour" or not options.follow:
+    if kind != "colour":
         nobody = torch.zeros(0, dtype=torch.int64)
         return UnseenMembers(nobody, nobody[:, None], torch.zeros(0, 1))
     return find_unseen_members(setup.scene, setup.region.members, setup.train)

@@ -199,9 +199,11 @@ def try_approaches(
             groups = group_stage(original, crops, [targets], steps, options.seed)
             end = groups.to_stages(original, crops, stages)[0].place(torch.zeros_like(original))
         else:
-            own = replace(options, steps=steps, group_steps=0, sh="on", recording="smooth")
+            own = replace(options, steps=steps, group_steps=0, sh="on")
             settings = pgs_settings(own, way.kind, original.shape[1], extent, 1)
-            *_, last = optimize(original, crops, [], stages, objective, replace(settings, snapshots=1))
+            *_, last = optimize(
+                original, crops, [], stages, objective, replace(settings, smoothing=0.9, every=0, snapshots=1)
+            )
             end = last.offsets
         psnrs[way] = _psnr(judges, original + end)
         if advance is not None:

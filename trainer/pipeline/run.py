@@ -32,6 +32,7 @@ from trainer.options import TrainOptions
 from trainer.pipeline.fit_and_report import load_result
 from trainer.pipeline.threads import use_threads, wanted_threads
 from trainer.plan import make_plan
+from trainer.presets import CONSTANTS
 from trainer.regions.from_pictures import region_kinds, region_settings
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.setup.training_setup import (
@@ -113,7 +114,7 @@ def _run_training(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> RunResult:
     """Everything; what the saved state says is done is not done again, or is repeated to the same bits."""
-    perceptual, warning = perceptual_loss(options.perceptual)
+    perceptual, warning = perceptual_loss()
     if warning:
         log.say(warning)
     with log.stage("views"):
@@ -140,9 +141,8 @@ def _run_training(
         log.say("the trajectory is recorded")
     trajectory, extra, about = load_trajectory(folder.trajectory)
     trajectory = undo_retiming(trajectory, extra)
-    measure = perceptual if options.perceptual == "alex" else perceptual_loss()[0]
     begun = folder.state.load(NETWORK)
-    return finish_run(folder, setup, trajectory, about, measure, log, make_plan(options), begun)
+    return finish_run(folder, setup, trajectory, about, perceptual, log, make_plan(options), begun)
 
 
 def _render_originals(
@@ -229,7 +229,7 @@ def _record(
         log.say(f"{', '.join(idle)}: without effect on this {kind} edit, whose loss is {objective}")
     with log.stage("optimise"):
         renewal = reedit(options, setup, kind, folder, log)
-        unseen_members = unseen_members_of(options, setup, kind)
+        unseen_members = unseen_members_of(setup, kind)
         trajectory, losses = optimize_members(
             replace(options, group_steps=approach.group_steps),
             setup,
@@ -248,7 +248,7 @@ def _record(
             trajectory, costs = without_idle_attributes(trajectory, evaluator)
         recorded = len(trajectory)
         way = ""
-        if options.recording == "smooth" and options.field != "neural" and len(edited) == 1:
+        if not CONSTANTS[options.preset].raw and options.field != "neural" and len(edited) == 1:
             editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
             if check_editor(options.editor)[0] not in GIVEN:
                 views = [*setup.train, *setup.held_out]

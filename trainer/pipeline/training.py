@@ -28,6 +28,7 @@ from trainer.optimize.view_dependence import NEEDED, view_dependence
 from trainer.options import TrainOptions
 from trainer.pipeline.recordings import Recordings
 from trainer.plan import make_plan
+from trainer.presets import CONSTANTS
 from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views
 from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
@@ -83,7 +84,8 @@ def optimize_members(
     scene, members = setup.scene, setup.region.members
     options = _decide_bands(options, setup, kind, log)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    still = not moving_attributes(learning_rates(kind, original.shape[1], 1.0, options.rates)[None], GEOMETRY)
+    rates = learning_rates(kind, original.shape[1], 1.0, CONSTANTS[options.preset].rates)
+    still = not moving_attributes(rates[None], GEOMETRY)
     crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
     steps = iterations(options.steps) if solves_colors(options, kind) else options.steps
     steps = max(steps, len(edited) + 1)  # each stage is to have one
@@ -194,7 +196,7 @@ def _decide_bands(options: TrainOptions, setup: TrainingSetup, kind: EditKind, l
     """`options.sh` as "on" or "off": a color edit trains the bands where the region's own show."""
     if options.sh != "auto" or setup.scene.sh_degree == 0:
         return options
-    if kind != "colour" or options.rates == "3dgs":
+    if kind != "colour" or CONSTANTS[options.preset].rates == "3dgs":
         return replace(options, sh="on")
     change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
     needed = change >= NEEDED
@@ -251,7 +253,7 @@ def retime_trajectory(
             images = render_all(small, rows + trajectory.node(i), moving)
             shown.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
-    if options.recording == "smooth":
+    if not CONSTANTS[options.preset].raw:
         kept = straight_recordings(trajectory, shown)
         trajectory, shown = select_recordings(trajectory, kept), [shown[i] for i in kept]
     slider = resolve_slider(options.slider, options.editor, trajectory.strengths)

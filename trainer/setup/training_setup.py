@@ -95,7 +95,7 @@ def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
         options.guidance,
         options.image_guidance,
         options.edit_steps,
-        options.edit_seed,
+        options.seed,
         options.edit_size,
         options.stages > 1,
         options.confine,

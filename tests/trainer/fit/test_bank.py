@@ -192,7 +192,7 @@ def _end(result: RunResult, folder: Path) -> Tensor:
         ({"fit": "joint", "field": "keyframes"}, "--fit does not apply to --field keyframes"),
         ({"picture_loss": 1.0, "field": "separable"}, "--picture-loss does not apply to --field separable"),
         ({"field": "neural", "code": 65}, "--code must be between 0 and 64, got 65"),
-        ({"field": "neural", "picture_loss": -1.0}, "--picture-loss is"),
+        ({"field": "neural", "picture_loss": -1.0}, "--picture-loss must be 0 or more"),
     ],
 )
 def test_network_options_that_mean_nothing_are_told(
@@ -203,5 +203,5 @@ def test_network_options_that_mean_nothing_are_told(
 
 
 def test_a_refit_knows_its_options_too(folder: Path) -> None:
-    with pytest.raises(ProgdfError, match="--bins does not apply"):
-        check_network_options(FitOptions(folder, bins="hard"))
+    with pytest.raises(ProgdfError, match="--size does not apply"):
+        check_network_options(FitOptions(folder, size="small"))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -14,7 +12,6 @@ from progdf.sh import rgb_to_sh0
 from trainer.editors.base import EditKind
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
-from trainer.options import TrainOptions
 from trainer.pipeline.training import no_worse
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
@@ -95,18 +92,12 @@ def test_where_all_is_seen_or_nothing_nobody_follows() -> None:
     assert find_unseen_members(scene, members, views).propagate(offsets) is offsets
 
 
-@pytest.mark.parametrize(
-    ("kind", "follow", "followed"),
-    [("colour", True, True), ("colour", False, False), ("geometry", True, False)],
-)
-def test_only_edits_of_colors_are_followed_and_only_if_asked(
-    tmp_path: Path, kind: EditKind, follow: bool, followed: bool
-) -> None:
+@pytest.mark.parametrize(("kind", "followed"), [("colour", True), ("geometry", False)])
+def test_only_edits_of_colors_are_propagated(kind: EditKind, followed: bool) -> None:
     scene = two_boards()
     region, views = half_seen(scene)
     setup = TrainingSetup(scene, region, views, [], WHITE)
-    options = TrainOptions(tmp_path / "s.ply", tmp_path, region="all", editor="night", follow=follow)
-    assert bool(len(unseen_members_of(options, setup, kind).places)) == followed
+    assert bool(len(unseen_members_of(setup, kind).places)) == followed
 
 
 def test_what_counts_as_unseen_follows_the_density() -> None:
