@@ -140,7 +140,9 @@ def test_a_demo_asked_for_numbers_that_cannot_be_writes_nothing(
 ) -> None:
     size = () if option == "--size" else ("--size", str(SIZE))
     assert main(["demo", *size, "--out", str(tmp_path / "demo"), option, number]) == 2
-    assert capsys.readouterr().err.startswith(f"progdf: {option} is {number}; ")
+    said = capsys.readouterr().err.strip()
+    assert said.startswith(f"progdf: {option} must be ")
+    assert said.endswith(f"got {number}")
     assert not (tmp_path / "demo").exists()
 
 
