@@ -7,7 +7,6 @@ beside its error. The first picture is that of `progdf view` on a virtual displa
 
 from __future__ import annotations
 
-import math
 import statistics
 import tempfile
 import time
@@ -18,10 +17,12 @@ from pathlib import Path
 
 import moderngl
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from benchmarks.table import Table
 from progdf.formats.ply import save_ply
+from progdf.metrics.image import psnr
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
@@ -329,5 +330,5 @@ def _at_rest(mouse: Mouse) -> int:
 
 
 def _psnr(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> float:
-    error = float(((image.astype(np.float64) - target) ** 2).mean()) / 255**2
-    return math.inf if error == 0.0 else -10.0 * math.log10(error)
+    seen, wanted = (torch.from_numpy(pixels).double() / 255.0 for pixels in (image, target))
+    return psnr(seen, wanted)

@@ -14,14 +14,17 @@ from pathlib import Path
 
 import moderngl
 import numpy as np
+import torch
 
 from benchmarks.table import Table
 from progdf.gaussians import Gaussians
+from progdf.metrics.image import psnr
 from progdf.rasterize import render
 from viewer.camera.view_camera import first_camera, to_camera
-from viewer.render.engine import Engine, FrameTimings
+from viewer.render.engine import Engine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
+from viewer.render.timings import FrameTimings
 from viewer.state.view_state import LayerState, ViewState
 
 from .mouse import SIZE, Mouse, slider_at
@@ -232,7 +235,6 @@ def _psnr(engine: Engine, view: ViewState, size: tuple[int, int]) -> float:
     for strength in (0.0, 0.5, 1.0):
         slid = replace(view, layers=(LayerState(0, "edit", strength),))
         image = engine.image(slid, size)
-        target = render(engine.gaussians(slid), to_camera(slid.camera, *size)).numpy()
-        error = float(((image.astype(np.float64) - target) ** 2).mean())
-        worst = min(worst, math.inf if error == 0.0 else -10.0 * math.log10(error))
+        target = render(engine.gaussians(slid), to_camera(slid.camera, *size))
+        worst = min(worst, psnr(torch.from_numpy(image), target))
     return worst

@@ -23,8 +23,9 @@ from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from viewer.camera.view_camera import bounds_of, first_camera
-from viewer.render.engine import Engine, FrameTimings
+from viewer.render.engine import Engine
 from viewer.render.headless import headless_context
+from viewer.render.timings import FrameTimings
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (160, 400)

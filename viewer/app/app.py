@@ -15,7 +15,7 @@ from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 from viewer.ui.window import Window, interruptible
 
-from .actions import FileActions
+from .file_actions import FileActions
 from .main_view import MainView
 
 SIZE = (1280, 800)

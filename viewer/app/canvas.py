@@ -10,8 +10,9 @@ from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_view import Comparer
 from viewer.pictures.thumbnails import Thumbnails
 from viewer.render import dynamic_resolution, highlight
-from viewer.render.engine import Engine, FrameTimings
+from viewer.render.engine import Engine
 from viewer.render.renderers import Image
+from viewer.render.timings import FrameTimings
 from viewer.state.recordings import RecordingFile
 from viewer.state.snapshots import SliderSnapshot, with_original
 from viewer.state.view_state import ViewState

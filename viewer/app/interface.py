@@ -12,6 +12,7 @@ from viewer.panel import brush, panel, timeline_bar
 from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_labels import Labels
 from viewer.state import workspace
+from viewer.state.actions import perform
 from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
@@ -106,5 +107,5 @@ def draw_dialog(
 
 def _perform(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
     for action in actions:
-        work = workspace.perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
+        work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
     return work

@@ -5,7 +5,6 @@ The window (app.py) and the tests feed imgui's io and call `frame`: a scripted m
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections import deque
 from dataclasses import replace
@@ -16,13 +15,14 @@ from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
 from viewer.camera import inputs
-from viewer.camera.inputs import NO_KEYS, Keys, Press
+from viewer.camera.inputs import NO_KEYS, Keys
 from viewer.files import exports as saved_files
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
-from viewer.render.engine import Engine, FrameTimings, drawn_size
+from viewer.render.engine import Engine, drawn_size
 from viewer.state import playback, workspace
+from viewer.state.actions import perform
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog, SceneFacts
@@ -33,10 +33,9 @@ from viewer.ui.frame_pacer import FramePacer
 from . import interface, mouse
 from .canvas import Canvas
 from .mouse import MouseTool, PointerContext
+from .pending_keys import PendingKeys
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
-OPENING_FRAMES = 4
-"""From the wish for a text field until imgui gives it the keyboard."""
 
 
 class MainView:
@@ -72,8 +71,7 @@ class MainView:
         self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
         self._clock = 0.0
-        self._waiting: tuple[Press, ...] = ()  # keys that imgui has not come to yet
-        self._asked_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
+        self._pending = PendingKeys()
         self._resting = False
         self._pace = FramePacer()
         self.wake = self._pace.wake
@@ -165,7 +163,7 @@ class MainView:
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
-        self._keys = self._reached_keys(keys)
+        self._keys = self._pending.take(keys)
         self._handle_input(seconds)
         if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.repeating(keys):
             self.work = workspace.record_undo(self.work)
@@ -179,26 +177,15 @@ class MainView:
         screen.use()
         imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
         self.frames += 1
-        if _strengths(self.work.view) != _strengths(before.view):
+        if [l.strength for l in self.work.view.layers] != [l.strength for l in before.view.layers]:
             self.context.finish()
             self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
         self._save_files(screen, size)
 
-    def _reached_keys(self, keys: Keys) -> Keys:
-        """The keys that imgui has come to by now; while a text field opens they wait for it."""
-        pressed = (*self._waiting, *keys.pressed)
-        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(inputs.has_reached_imgui, pressed))
-        opener = next((i for i, press in enumerate(pressed[:count]) if inputs.opens_text(press)), None)
-        if opener is not None:
-            count, self._asked_at = opener + 1, self.frames + 1
-        self._waiting = pressed[count:]
-        return replace(keys, pressed=pressed[:count])
-
     @property
     def opening(self) -> bool:
         """Whether a text field was asked for and has no keyboard yet: what is typed now would be lost."""
-        lately = self.frames - self._asked_at < OPENING_FRAMES and not self._resting
-        return lately and not imgui.get_io().want_text_input
+        return not self._resting and self._pending.opening
 
     def _area(self) -> overlay.Area:
         """The part of the window that shows the picture."""
@@ -235,7 +222,7 @@ class MainView:
 
     def _perform(self, action: str) -> None:
         area = self._area()
-        self.work = workspace.perform(self.work, action, self.facts, area.width / area.height)
+        self.work = perform(self.work, action, self.facts, area.width / area.height)
 
     def _pointer(self) -> PointerContext:
         """What lies under the hand."""
@@ -271,19 +258,9 @@ class MainView:
         return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels, edits)
 
     @property
-    def pictures_drawn(self) -> int:
-        """How many frames had a new picture of the splats."""
-        return self.canvas.pictures_drawn
-
-    @property
     def picture_size(self) -> tuple[int, int]:
         """Width and height in pixels of the picture on screen."""
         return self._pointer().size
-
-    @property
-    def timings(self) -> FrameTimings:
-        """Of the picture on screen."""
-        return self.canvas.timings
 
     def ask(self, dialog: Dialog) -> None:
         """Open a question over the picture."""
@@ -320,7 +297,3 @@ class MainView:
         image = self.canvas.image(view, self._pointer().size)
         pixels = draw_labels(image, view.compare, self.canvas.comparer.labels(view))
         return saved_files.picture(self.pictures, title, pixels)
-
-
-def _strengths(view: ViewState) -> list[float]:
-    return [layer.strength for layer in view.layers]

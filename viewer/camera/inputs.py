@@ -19,7 +19,7 @@ class Press:
     Args:
         chord: as in `controls.KEYS`
         again: it went down before and is held
-        event_id: the place of this key among imgui's input events (see `heard`); −1 is before all of them
+        event_id: its place among imgui's input events (see `has_reached_imgui`); −1 is before all
     """
 
     chord: str
@@ -116,7 +116,7 @@ def cancels_drag(keys: Keys, drag: str | None) -> bool:
     """Whether Escape or the right button takes back what the left button is dragging.
 
     Args:
-        drag: what is held on the picture, see `hand.Hand`; the camera stays where it was turned
+        drag: what is held on the picture, see `mouse.MouseTool`; the camera stays where it was turned
     """
     io, buttons = imgui.get_io(), imgui.MouseButton_
     holds = imgui.is_any_item_active() or (drag is not None and all(drag != d.does for d in controls.DRAGS))

@@ -22,7 +22,7 @@ from .images import free_path, save_picture
 CAMERAS = ".cameras.json"
 
 REQUESTS = ("picture", "window_picture", "timeline_file")
-"""Those of `workspace.REQUESTS` that end here."""
+"""Those of `actions.REQUESTS` that end here."""
 
 
 def picture(folder: Path, title: str, image: NDArray[np.uint8]) -> str:

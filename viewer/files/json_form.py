@@ -39,7 +39,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(kind: Any, value: Any, where: str = "") -> Any:
-    """The state of type `kind` that `plain` made `value` of.
+    """The state of type `kind` that `to_json` made `value` of.
 
     Args:
         kind: a dataclass, or what one declares: numbers, str, bool, tuples, dict, arrays, unions of these
@@ -47,7 +47,7 @@ def from_json(kind: Any, value: Any, where: str = "") -> Any:
         where: the value's name, for messages
 
     Raises:
-        NotPlainError: an unknown key, a missing one, or a value of another type; numbers must be finite.
+        JsonFormError: an unknown key, a missing one, or a value of another type; numbers must be finite.
     """
     origin, parts = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):

@@ -20,9 +20,8 @@ from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import RESOLUTION_MODES, LayerState, ViewState
 
 from . import document, timeline_file
-from . import json_form as plain
 from .document import Document
-from .json_form import JsonFormError
+from .json_form import JsonFormError, from_json, to_json
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ def save(path: Path, session: WindowSession) -> None:
     state = SessionFile(
         reference(scene, folder),
         tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
-        plain.to_json(session.view),
-        tuple(plain.to_json(snapshot) for snapshot in session.snapshots),
+        to_json(session.view),
+        tuple(to_json(snapshot) for snapshot in session.snapshots),
     )
     write_session(path, state)
 
@@ -113,10 +112,9 @@ def prune(session: WindowSession) -> WindowSession:
 def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
     """The state of a session, every value of it one that the window could have made."""
     try:
-        view = plain.from_json(ViewState, file.view, "view")
+        view = from_json(ViewState, file.view, "view")
         snapshots = tuple(
-            plain.from_json(SliderSnapshot, entry, f"snapshots[{i}]")
-            for i, entry in enumerate(file.snapshots)
+            from_json(SliderSnapshot, entry, f"snapshots[{i}]") for i, entry in enumerate(file.snapshots)
         )
         count = len(file.edits)
         _check_camera("view.camera", view.camera)

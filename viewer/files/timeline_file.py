@@ -30,8 +30,7 @@ from viewer.state import timeline
 from viewer.state.layers import OVERSHOOT
 from viewer.state.view_state import Keyframe, LayerState, Timeline
 
-from . import json_form as plain
-from .json_form import JsonFormError
+from .json_form import JsonFormError, from_json, to_json
 
 VERSION = 1
 _LARGEST = 16 << 20  # bytes
@@ -79,7 +78,7 @@ def save(path: Path, shown: Timeline, layers: Sequence[LayerState]) -> None:
     )
     file = TimelineFile(VERSION, keys, shown.length, shown.fps, shown.ping_pong)
     with atomic_write(path) as temporary_file:
-        temporary_file.write_text(json.dumps(plain.to_json(file), indent=2) + "\n", encoding="utf-8")
+        temporary_file.write_text(json.dumps(to_json(file), indent=2) + "\n", encoding="utf-8")
 
 
 def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
@@ -104,7 +103,7 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
     if value[MARK] != VERSION:
         raise ProgdfError(f"{path} is a timeline of version {value[MARK]!r}; this progdf reads {VERSION}")
     try:
-        file = plain.from_json(TimelineFile, value)
+        file = from_json(TimelineFile, value)
         found = _of_layers(file, layers)
         check(found, "keys")
     except JsonFormError as error:
@@ -116,7 +115,7 @@ def check(found: Timeline, where: str = "timeline.keys") -> None:
     """Whether every value is one that the window could have made.
 
     Raises:
-        NotPlainError: one is not; the message names it.
+        JsonFormError: one is not; the message names it.
     """
     if not 1 <= found.length <= timeline.LONGEST or not 1 <= found.fps <= timeline.FASTEST:
         raise JsonFormError(

@@ -11,66 +11,28 @@ from dataclasses import dataclass, replace
 from imgui_bundle import imgui
 
 from progdf.compose.reference import BLENDS
+from viewer.panel.layer_card import Cards, draw_card
 from viewer.state import layers as stack
-from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import ViewState
-from viewer.ui.context import PALETTE, Icon, Rgba, UiContext, u32
+from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.widgets import (
-    elide,
-    group_digits,
-    icon_button,
-    is_released,
-    menu,
     right_edge,
     section,
-    small,
-    small_toggle,
     tip,
-    typed_name,
 )
-
-from . import layer_details as layer_fold
-from . import strength_slider
 
 BLEND_HELP = {
     "normalised": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
     "over": "An edit covers those below it, where and as far as it changes something.",
 }
-TOGGLE_PX, GRIP_PX = 24.0, 4.0
-_MENU = "menu of a layer"
-_MENU_ITEMS = (
-    ("Rename…", "Enter", "rename"),
-    ("Duplicate", "Ctrl+D", "duplicate"),
-    ("Replace…", "", "replace"),
-    ("Delete", "Ctrl+Del", "remove"),
-)
-
-
-@dataclass(frozen=True)
-class Cards:
-    """What the cards show besides the state.
-
-    Args:
-        rows: one per .gdf, indexed by `LayerState.gdf`
-        focus: the focused layer, an index into `ViewState.layers`, or None
-        reveal: scroll to it
-        active_slider: which of `stack.SLIDERS` of it the arrow keys move
-        renaming: the layer whose name is being typed, or None
-    """
-
-    rows: Sequence[LayerRow]
-    focus: int | None = None
-    reveal: bool = False
-    active_slider: str = "strength"
-    renaming: int | None = None
 
 
 @dataclass(frozen=True)
 class CardsResult:
     """What became of the state: the focused layer, the one being renamed, the one asked about.
 
-    `actions`: those of the cards' menus, as in `workspace.perform`.
+    `actions`: those of the cards' menus, as in `actions.perform`.
     """
 
     state: ViewState
@@ -78,18 +40,6 @@ class CardsResult:
     renaming: int | None = None
     overlap: int | None = None
     actions: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Card:
-    """What one card made of the state: the layer touched, being renamed, dragged or dropped, asked about."""
-
-    state: ViewState
-    touched: bool = False
-    renaming: bool = False
-    drag: str = ""
-    overlap: bool = False
-    action: str = ""
 
 
 def heading(state: ViewState, ui: UiContext) -> ViewState:
@@ -147,7 +97,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> CardsResult:
     for at in range(len(state.layers)):
         i = stack.index_of(state, at)
         top = imgui.get_cursor_screen_pos().y
-        card = _card(state, i, cards, ui)
+        card = draw_card(state, i, cards, ui)
         state = card.state
         spans.append((top, imgui.get_item_rect_max().y))
         if cards.reveal and cards.focus == i:
@@ -192,191 +142,3 @@ def _show_place(dragged: int, to: int, spans: Sequence[tuple[float, float]], ui:
         imgui.set_scroll_y(max(imgui.get_scroll_y() - step, 0.0))
     elif mouse > imgui.get_window_pos().y + imgui.get_window_height() - margin:
         imgui.set_scroll_y(min(imgui.get_scroll_y() + step, imgui.get_scroll_max_y()))
-
-
-def _card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> _Card:
-    """One card: eye, swatch, name and value; the slider; count and toggles; unfolded, curve and gains."""
-    scale, p = ui.scale, PALETTE
-    layer, focused = state.layers[index], cards.focus == index
-    row, active = cards.rows[layer.gdf], layer in stack.visible_layers(state)
-    imgui.push_id(index)
-    canvas = imgui.get_window_draw_list()
-    clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
-    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*(p.card_focused if focused else p.card)))
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * scale, 8 * scale))
-    child = imgui.ChildFlags_
-    imgui.begin_child(
-        "card",
-        imgui.ImVec2(0.0, 0.0),
-        child.auto_resize_y.value | child.always_use_window_padding.value,
-        imgui.WindowFlags_.no_nav.value,
-    )
-    card = _head(_Card(state), index, row, cards.renaming == index, active, ui)
-    number_at, layer = imgui.get_item_rect_min(), card.state.layers[index]
-    imgui.begin_disabled(layer.locked)
-    strength = strength_slider.draw(
-        "##strength",
-        layer.strength,
-        row.recorded,
-        imgui.get_content_region_avail().x,
-        scale,
-        p.accent if focused else p.accent_dark,
-        active,
-        stack.largest_strength(state),
-    )
-    touched = imgui.is_item_active()
-    imgui.end_disabled()
-    _number(number_at, strength, active)
-    card = replace(
-        card, state=stack.change_layer(card.state, index, lambda old: replace(old, strength=strength))
-    )
-    card = _foot(card, index, row, ui)
-    if layer.gdf in card.state.unfolded:
-        active_slider = cards.active_slider if focused else None
-        unfolded = layer_fold.draw(
-            card.state.layers[index], row, active_slider, stack.largest_strength(state), ui
-        )
-        card = replace(card, state=stack.change_layer(card.state, index, lambda _: unfolded))
-    over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
-    pressed = over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value)
-    held = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button calls its drag off
-    if over and not held and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
-        pressed = True
-        imgui.open_popup(_MENU)
-    card = replace(card, action=_menu(index, ui))
-    if focused:
-        _focus_bar(clip, scale)
-    imgui.end_child()
-    imgui.pop_style_var()
-    imgui.pop_style_color()
-    imgui.pop_id()
-    return replace(card, touched=card.touched or touched or pressed)
-
-
-def _menu(index: int, ui: UiContext) -> str:
-    """What can be done with a layer as a whole; the action that was chosen, "" for none."""
-    chosen = ""
-    with menu(_MENU, ui) as is_open:
-        for name, keys, action in _MENU_ITEMS if is_open else ():
-            if name == "Delete":
-                imgui.separator()
-            if imgui.menu_item(name, keys, False)[0]:
-                chosen = f"{action}:{index}"
-    return chosen
-
-
-def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], scale: float) -> None:
-    """A stripe along the left edge of the card that is being drawn, in the panel's clip."""
-    canvas, corner = imgui.get_window_draw_list(), imgui.get_window_pos()
-    edge = imgui.ImVec2(corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
-    canvas.push_clip_rect(*clip, False)
-    canvas.add_rect_filled(corner, edge, u32(PALETTE.accent), 3 * scale)
-    canvas.pop_clip_rect()
-
-
-def _head(card: _Card, index: int, row: LayerRow, renaming: bool, active: bool, ui: UiContext) -> _Card:
-    """Eye, swatch, name, and last the place of the number, which is drawn when the slider has its value."""
-    scale, state, layer = ui.scale, card.state, card.state.layers[index]
-    right = right_edge()
-    if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
-        if imgui.get_io().key_alt:
-            state = stack.toggle_solo(state, index)
-        else:
-            state = stack.change_layer(state, index, lambda old: replace(old, enabled=not old.enabled))
-    tip("Show or hide (H). Alt+click: solo")
-    imgui.same_line()
-    _swatch(row.swatch, active, ui)
-    imgui.same_line()
-    number_width = imgui.calc_text_size(f"{layer.strength:.3f}").x
-    room = right - number_width - 10 * scale - imgui.get_cursor_pos_x()
-    card = _name(replace(card, state=state), index, room, renaming, active, ui)
-    imgui.same_line(right - number_width)
-    imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
-    if imgui.is_item_clicked() and not layer.locked:
-        strength_slider.start_typing("##strength")
-    tip("Locked (L)" if layer.locked else "Click to type a value")
-    return card
-
-
-def _number(corner: imgui.ImVec2, strength: float, active: bool) -> None:
-    """The strength in the card's upper right corner; every digit is equally wide."""
-    beyond = PALETTE.warning if strength > 1.0 else PALETTE.text
-    at = imgui.ImVec2(corner.x, corner.y + imgui.get_style().frame_padding.y)
-    imgui.get_window_draw_list().add_text(at, u32(beyond if active else PALETTE.dim), f"{strength:.3f}")
-
-
-def _name(card: _Card, index: int, room: float, renaming: bool, active: bool, ui: UiContext) -> _Card:
-    """The name: dragged it moves the card, double-clicked it becomes a text field."""
-    layer = card.state.layers[index]
-    if renaming:
-        text = typed_name(layer.name, room)
-        return replace(card, renaming=text is None, state=stack.rename_layer(card.state, index, text or ""))
-    x, y = imgui.get_cursor_screen_pos()
-    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
-    at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
-    colour = PALETTE.text if active else PALETTE.dim
-    imgui.get_window_draw_list().add_text(at, u32(colour), elide(layer.name, room))
-    tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename (Enter)")
-    if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
-        return replace(card, renaming=True, touched=True)
-    threshold = GRIP_PX * ui.scale
-    if imgui.is_item_active() and imgui.is_mouse_dragging(imgui.MouseButton_.left.value, threshold):
-        return replace(card, drag="dragged")
-    moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, threshold)
-    if is_released() and (moved.x or moved.y):
-        return replace(card, drag="dropped")
-    return card
-
-
-def _foot(card: _Card, index: int, row: LayerRow, ui: UiContext) -> _Card:
-    """Count, overlap and instruction; at the right alone, lock, the fold and the menu."""
-    state = card.state
-    layer, wide = state.layers[index], TOGGLE_PX * ui.scale
-    right, left = right_edge(), imgui.get_cursor_pos_x()
-    overlaps = [
-        (other.name, row.shared[other.gdf])
-        for i, other in enumerate(state.layers)
-        if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
-    ]
-    note = f"{group_digits(row.count)} splats"
-    if len(overlaps) == 1:
-        name, count = overlaps[0]
-        note += f"  ·  {'all' if count == row.count else group_digits(count)} in {name}"
-    elif overlaps:
-        note += f"  ·  overlaps {len(overlaps)} layers"
-    elif row.instruction:
-        note += f"  ·  {row.instruction}"
-    small(note, PALETTE.dim, right - left - 4 * wide - 6.0 * ui.scale)
-    asked = bool(overlaps) and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
-    shared = [f"{group_digits(count)} of its splats are also in {name}" for name, count in overlaps]
-    shared += ["Highlighted in pink"] if overlaps else []
-    tip("\n".join((f"{group_digits(row.count)} splats", *filter(None, [row.instruction]), *shared)))
-    imgui.same_line(right - 4 * wide)
-    if small_toggle("solo", "S", layer.solo, wide, ui):
-        state = stack.toggle_solo(state, index)
-    tip("Solo: show only soloed layers (Shift+H)")
-    imgui.same_line(right - 3 * wide)
-    if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
-        state = stack.change_layer(state, index, lambda old: replace(old, locked=not old.locked))
-    tip("Lock strength, gains and paint (L)")
-    imgui.same_line(right - 2 * wide)
-    if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
-        state = stack.toggle_details(state, index)
-    tip("Show gains and the curve of visible change (G)")
-    imgui.same_line(right - wide)
-    if small_toggle("menu", Icon.MENU, False, wide, ui):
-        imgui.open_popup(_MENU)
-    tip("Rename, duplicate, replace or delete (right-click)")
-    return replace(card, state=state, overlap=asked)
-
-
-def _swatch(colour: tuple[float, float, float], active: bool, ui: UiContext) -> None:
-    side = 12.0 * ui.scale
-    x, y = imgui.get_cursor_screen_pos()
-    top = y + (imgui.get_frame_height() - side) / 2
-    imgui.dummy(imgui.ImVec2(side, imgui.get_frame_height()))
-    rgba: Rgba = (*colour, 1.0 if active else 0.35)
-    canvas = imgui.get_window_draw_list()
-    corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
-    canvas.add_rect_filled(*corners, u32(rgba), 3 * ui.scale)
-    canvas.add_rect(*corners, u32(PALETTE.line), 3 * ui.scale)

@@ -27,7 +27,7 @@ from viewer.ui.widgets import (
     tip,
 )
 
-from . import brush, layer_cards, snapshot_cards
+from . import brush, layer_card, layer_cards, snapshot_cards
 from .snapshot_cards import SnapshotCard
 
 WIDTH_PX = 300.0  # at 1×
@@ -111,7 +111,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     _begin_body(footer)
     state = layer_cards.heading(state, ui)
-    cards = layer_cards.Cards(shown.rows, shown.focus, shown.reveal, shown.active_slider, shown.renaming)
+    cards = layer_card.Cards(shown.rows, shown.focus, shown.reveal, shown.active_slider, shown.renaming)
     drawn = layer_cards.draw(state, cards, ui)
     state, focus = drawn.state, drawn.focus
     actions += drawn.actions

@@ -13,13 +13,16 @@ from dataclasses import replace
 
 import moderngl
 import numpy as np
+import torch
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
+from progdf.metrics.image import psnr
 from viewer.gl.present import Presenter
-from viewer.render.engine import Engine, FrameTimings, drawn_size
+from viewer.render.engine import Engine, drawn_size
 from viewer.render.renderers import Image
+from viewer.render.timings import FrameTimings
 from viewer.state import recordings
 from viewer.state.recordings import RecordingFile
 from viewer.state.view_state import ViewState
@@ -185,10 +188,9 @@ def difference(other: Image, edited: Image, amplify: float) -> Image:
 
 
 def _psnr(other: Image, edited: Image) -> float:
-    """As `progdf.metrics.image.psnr`, of what is seen, dB; without copies in float64: a hand waits for it."""
-    apart = difference(other, edited, 1.0).ravel()
-    error = float(np.square(apart, out=apart).mean(dtype=np.float64)) if apart.size else 0.0
-    return math.inf if error == 0.0 else -10.0 * math.log10(error)
+    """Of what is seen (0..1) of two pictures, dB."""
+    seen = (torch.from_numpy(np.clip(image, 0.0, 1.0)) for image in (edited, other))
+    return psnr(*seen)
 
 
 def _together(edited: FrameTimings, original: FrameTimings) -> FrameTimings:

@@ -20,7 +20,7 @@ def dirty_rectangles(cells: NDArray[np.bool_], size: tuple[int, int], worth: int
         worth: pixels that a further box has to save
 
     Returns:
-        x0, y0, x1, y1 in pixels, one past the last; at most `MOST_BOXES`
+        x0, y0, x1, y1 in pixels, one past the last; at most `MOST_RECTANGLES`
     """
     least = worth / CELL**2
     found = _trim(cells, (0, 0, cells.shape[1], cells.shape[0]))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .engine import FrameTimings
+    from viewer.render.timings import FrameTimings
 
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""

@@ -31,7 +31,7 @@ class Highlight:
 
     Args:
         gdf: the edit, as `LayerState.gdf` counts
-        paint: its weights, as `paint.encoded` writes them
+        paint: its weights, as `paint.encode` writes them
         others: edits of which to show, in place of weights, the members that they share with this one
     """
 
@@ -80,7 +80,7 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf]) -> Bytes:
         gdfs: the edits that `highlight` counts
 
     Raises:
-        ProgdfError: see `paint.decoded`.
+        ProgdfError: see `paint.decode`.
     """
     members = gdfs[highlight.gdf].region.members
     shares = np.full(len(members), round(255 * SHARE), np.uint8)

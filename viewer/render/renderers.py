@@ -44,7 +44,7 @@ class Renderer(Protocol):
         """Make the picture and wait until it is done.
 
         Args:
-            order: farthest first, from `sort.back_to_front`
+            order: farthest first, from `depth_sort.back_to_front`
 
         Returns:
             The share of its pixels that had to be drawn, 0..1.

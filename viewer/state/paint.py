@@ -110,7 +110,7 @@ def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
     """The layer that the composer takes, with the painted weights.
 
     Raises:
-        ProgdfError: see `decoded`.
+        ProgdfError: see `decode`.
     """
     return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region)))
 
@@ -172,7 +172,7 @@ def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
 
     Args:
         stroke: under way
-        brush, density: as for `drawn_to`; smoothing reaches as far as half the brush
+        brush, density: as for `extend_stroke`; smoothing reaches as far as half the brush
     """
     goal = np.full_like(stroke.before, 1.0 if stroke.mode == "add" else 0.0)
     if stroke.mode == "smooth":
@@ -191,7 +191,7 @@ def feather(paint: str, points: Floats, width: float) -> str:
         width: see `near_mean`, world units, > 0
 
     Raises:
-        ProgdfError: see `decoded`.
+        ProgdfError: see `decode`.
     """
     weights = decode(paint, len(points))
     if weights is None:

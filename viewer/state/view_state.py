@@ -21,7 +21,7 @@ class LayerState:
         gains: how much of each kind of change comes through, 0..1
         solo: only soloed layers are shown while there are any
         locked: strength, gains and paint stay as they are
-        paint: a weight per member, as `paint.encoded` writes it; empty is 1 everywhere
+        paint: a weight per member, as `paint.encode` writes it; empty is 1 everywhere
     """
 
     gdf: int
@@ -57,7 +57,7 @@ class Brush:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the edited picture is set against, and how (see compare.py).
+    """What the edited picture is set against, and how (see comparison.py).
 
     Args:
         mode: "off", "split" or "difference"

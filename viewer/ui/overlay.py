@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from imgui_bundle import imgui
 
-from viewer.render.engine import EditsBy, FrameTimings
+from viewer.render.timings import EditsBy, FrameTimings
 from viewer.state.workspace import Message
 
 from .context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32

@@ -54,25 +54,25 @@ def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand:
     for strength in (0.6, 0.7, 0.9):
         hand.io.add_mouse_pos_event(*hand.slider(0, strength))
     hand.io.add_mouse_button_event(0, False)
-    drawn = hand.main_view.pictures_drawn
+    drawn = hand.main_view.canvas.pictures_drawn
     hand.frame(4)
     assert hand.strengths[0] == pytest.approx(0.9, abs=0.005)
-    assert hand.main_view.pictures_drawn <= drawn + 2, "values on the way are not drawn one by one"
+    assert hand.main_view.canvas.pictures_drawn <= drawn + 2, "values on the way are not drawn one by one"
     assert len(hand.main_view.work.past.past) == 1
 
 
 def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
     hand.rest()  # the frames that tooltips get
-    drawn, frames = hand.main_view.pictures_drawn, hand.main_view.frames
+    drawn, frames = hand.main_view.canvas.pictures_drawn, hand.main_view.frames
     assert hand.main_view.next_frame_delay() is None
-    assert (hand.main_view.pictures_drawn, hand.main_view.frames) == (drawn, frames)
+    assert (hand.main_view.canvas.pictures_drawn, hand.main_view.frames) == (drawn, frames)
 
 
 def test_moving_the_mouse_draws_the_interface_but_no_splats(hand: Rig) -> None:
-    drawn = hand.main_view.pictures_drawn
+    drawn = hand.main_view.canvas.pictures_drawn
     for x in range(20, 600, 40):
         hand.move(x, 100.0)
-    assert hand.main_view.pictures_drawn == drawn == 1
+    assert hand.main_view.canvas.pictures_drawn == drawn == 1
 
 
 def test_the_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
@@ -119,7 +119,7 @@ def test_messages_leave_by_themselves(hand: Rig) -> None:
 def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
     hand.key("F10")
     assert hand.main_view.work.view.overlay
-    assert hand.main_view.pictures_drawn == 1, "showing figures draws no splats"
+    assert hand.main_view.canvas.pictures_drawn == 1, "showing figures draws no splats"
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
     names = [name.strip() for name, _ in hand.main_view.figures()]
     assert {"frame", "sort", "draw", "slider p50 / p95", "splats"} <= set(names)
@@ -144,10 +144,10 @@ def test_f10_tells_the_error_of_the_gpus_edit_pass_or_why_the_cpu_does_its_work(
 
 
 def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> None:
-    drawn = hand.main_view.pictures_drawn
+    drawn = hand.main_view.canvas.pictures_drawn
     hand.main_view.draw_splash(hand.screen)
     image = hand.image()
-    assert hand.main_view.pictures_drawn == drawn
+    assert hand.main_view.canvas.pictures_drawn == drawn
     assert len(np.unique(image[:60].reshape(-1, 3), axis=0)) > 10, "a word"
     assert len(np.unique(image[60:].reshape(-1, 3), axis=0)) == 1, "on the background alone"
 

@@ -14,8 +14,8 @@ from progdf.errors import ProgdfError
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys
 from viewer.panel import panel
-from viewer.render.engine import FrameTimings
 from viewer.render.headless import headless_context, is_software
+from viewer.render.timings import FrameTimings
 from viewer.state.view_state import Brush, LayerState, ViewState
 from viewer.state.workspace import Dialog
 

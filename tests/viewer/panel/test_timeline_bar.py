@@ -105,18 +105,18 @@ def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(ha
     assert 0.0 < waits <= 1 / 24, "it sleeps until the next frame of the film, not less"
     assert len(hand.main_view.latencies_ms) == 0, "a film is no slider"
     hand.key("Space")
-    paused, drawn = hand.main_view.work.player.frame, hand.main_view.pictures_drawn
+    paused, drawn = hand.main_view.work.player.frame, hand.main_view.canvas.pictures_drawn
     hand.frame(60)
-    assert (hand.main_view.work.player.frame, hand.main_view.pictures_drawn) == (paused, drawn)
+    assert (hand.main_view.work.player.frame, hand.main_view.canvas.pictures_drawn) == (paused, drawn)
     assert hand.main_view.next_frame_delay() is None
     assert hand.main_view.work.past.past == ()
 
 
 def test_a_frame_between_two_of_the_film_draws_no_splats(hand: Rig) -> None:
     hand.key("Space")
-    drawn, frame = hand.main_view.pictures_drawn, hand.main_view.work.player.frame
+    drawn, frame = hand.main_view.canvas.pictures_drawn, hand.main_view.work.player.frame
     hand.frame(60)
-    assert hand.main_view.pictures_drawn - drawn <= (hand.main_view.work.player.frame - frame) % 41 + 1
+    assert hand.main_view.canvas.pictures_drawn - drawn <= (hand.main_view.work.player.frame - frame) % 41 + 1
 
 
 def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) -> None:

@@ -53,10 +53,10 @@ def test_y_shows_the_original_left_and_the_edited_right_of_the_divider(draw: str
 @pytest.mark.gl
 def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
     hand.key("Y")
-    before, drawn = hand.main_view.work.view.camera, hand.main_view.pictures_drawn
+    before, drawn = hand.main_view.work.view.camera, hand.main_view.canvas.pictures_drawn
     hand.drag((170.0, 300.0), (100.0, 310.0))
     assert hand.main_view.work.view.compare.divider == pytest.approx(100 / 340)
-    assert (hand.main_view.work.view.camera, hand.main_view.pictures_drawn) == (before, drawn)
+    assert (hand.main_view.work.view.camera, hand.main_view.canvas.pictures_drawn) == (before, drawn)
     left, right = beside_line(hand.picture(), 100)
     assert np.array_equal(left, beside_line(whole(0.0, 0.0), 100)[0])
     assert np.array_equal(right, beside_line(whole(1.0, 1.0), 100)[1])
@@ -134,10 +134,10 @@ def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
     for chord in ("Y", "Shift+Y"):
         hand.key(chord)
         hand.frame(60)  # a tooltip may wait for a second of rest
-        drawn = hand.main_view.pictures_drawn
+        drawn = hand.main_view.canvas.pictures_drawn
         hand.frame(3)
         assert hand.main_view.next_frame_delay() is None
-        assert hand.main_view.pictures_drawn == drawn
+        assert hand.main_view.canvas.pictures_drawn == drawn
 
 
 @pytest.mark.gl

@@ -12,7 +12,7 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys, Press
 from viewer.render import dynamic_resolution as draft
 from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution
-from viewer.render.engine import FrameTimings
+from viewer.render.timings import FrameTimings
 
 SLOW = FrameTimings(draw_ms=SLOW_MS + 1.0, share=1.0)
 QUICK = FrameTimings(draw_ms=SLOW_MS - 1.0, share=1.0)
@@ -137,10 +137,10 @@ def test_a_rested_picture_draws_nothing_more(hand: Rig) -> None:
     hold_and_orbit(hand)
     hand.release()
     wait(hand, REST_S)
-    drawn = hand.main_view.pictures_drawn
+    drawn = hand.main_view.canvas.pictures_drawn
     hand.event()
     wait(hand, 1.0)
-    assert hand.main_view.pictures_drawn == drawn
+    assert hand.main_view.canvas.pictures_drawn == drawn
     assert hand.main_view.next_frame_delay() in (0.0, None) or hand.main_view.next_frame_delay() > REST_S
 
 

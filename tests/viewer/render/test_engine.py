@@ -23,8 +23,9 @@ from viewer.gl import edit_pass
 from viewer.gl.screen import read_rgb
 from viewer.render import engine as engine_module
 from viewer.render.attribute_updates import GpuEditing
-from viewer.render.engine import Engine, FrameTimings
+from viewer.render.engine import Engine
 from viewer.render.headless import headless_context, is_software
+from viewer.render.timings import FrameTimings
 from viewer.state.paint import encode
 from viewer.state.view_state import LayerState, ViewState
 

@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from viewer.camera import controls
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, to_camera
 from viewer.files import timeline_file
-from viewer.state import history, playback, timeline, tween, workspace
+from viewer.state import actions, history, playback, timeline, tween, workspace
 from viewer.state.layer_facts import LayerRow
 from viewer.state.playback import Player
 from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
@@ -39,7 +39,7 @@ def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
 
 def act(work: Workspace, *actions: str) -> Workspace:
     for action in actions:
-        work = workspace.record_undo(workspace.perform(work, action, FACTS))
+        work = workspace.record_undo(actions.perform(work, action, FACTS))
     return work
 
 
@@ -216,7 +216,7 @@ def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves
     entries = len(work.past.past)
     left = work
     for action in leaves:  # of one drag: nothing is settled in between
-        left = workspace.perform(left, action, FACTS)
+        left = actions.perform(left, action, FACTS)
     left = workspace.record_undo(workspace.advance(left, 0.1))
     assert left.view.layers != work.view.layers
     assert len(left.past.past) == entries + 1, "one drag is one entry"
@@ -289,7 +289,7 @@ def test_history_restores_the_timeline_with_the_rest() -> None:
 def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
     named = {key.action.partition(":")[0] for key in controls.KEYS}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
-    assert set(playback.ACTIONS) <= set(workspace.ACTIONS)
+    assert set(playback.ACTIONS) <= set(actions.ACTIONS)
 
 
 def test_a_timeline_in_a_file_comes_back_whole_under_its_edits_names(tmp_path: Path) -> None:

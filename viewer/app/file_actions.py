@@ -8,44 +8,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from progdf.gdf.file import Gdf, load_gdf
-from progdf.io.cameras import load_cameras
 from viewer.camera.up_axis import up_of
-from viewer.camera.view_camera import first_camera, from_camera, to_camera
+from viewer.camera.view_camera import first_camera
 from viewer.files import autosave as autosaves
 from viewer.files import document as documents
-from viewer.files import exports as saved_files
-from viewer.files import recent, session, timeline_file
+from viewer.files import recent, session
 from viewer.files.autosave import SessionAutosave
-from viewer.files.document import Document
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path, session_file
-from viewer.render.threads import all_threads
-from viewer.state import layers as stack
 from viewer.state import workspace
-from viewer.state.playback import Player
-from viewer.state.view_state import Timeline, ViewState
+from viewer.state.view_state import Timeline
 from viewer.state.workspace import Dialog
 
 from . import native_dialogs as native
-from .main_view import MainView
-
-
-class Application(Protocol):
-    """What the file actions needs of the application."""
-
-    document: Document
-    main_view: MainView
-
-    def show(self, document: Document) -> None:
-        """Draw another document from now on."""
-
-    def leave(self) -> None:
-        """Close the window, without a question."""
+from . import view_actions
+from .application import Application, failure_line
+from .edit_actions import EditActions
 
 
 class FileActions:
@@ -62,12 +43,13 @@ class FileActions:
         self._autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
         self._browser = native.Browser()
+        self._edits = EditActions(app)
         opened = app.document
         files = (*opened.gdf_paths, *((opened.path,) if opened.path else ()), *((path,) if path else ()))
         app.main_view.recent = self._remember(*files)
 
     def handle(self, request: str) -> None:
-        """One request of `workspace.REQUESTS` that is about files, or "quit"."""
+        """One request of `actions.REQUESTS` that is about files, or "quit"."""
         name, _, argument = request.partition(":")
         if name in ("save", "save_as"):
             self._save_where(argument, ask=name == "save_as")
@@ -84,7 +66,7 @@ class FileActions:
         elif name == "open_file":
             self._report_errors(lambda: self.open(parse_path(argument)))
         elif name == "camera":
-            self._report_errors(self._keep_camera)
+            self._report_errors(lambda: view_actions.keep_camera(self._app, self.path))
         elif name == "discard":
             self._report_errors(self._discard)
         elif name == "restore_autosave":
@@ -92,12 +74,12 @@ class FileActions:
         elif name == "discard_autosave":
             self._report_errors(lambda: self._discard_autosave(Path(argument)))
         elif name == "duplicate":
-            self._report_errors(lambda: self._duplicate(self._layer(argument)))
+            self._report_errors(lambda: self._edits.duplicate(self._edits.layer(argument)))
         elif name == "replace":
             self._app.main_view.ask(Dialog("replace", then=argument))
         elif name == "replace_by":
             index, _, path = argument.partition(":")
-            self._report_errors(lambda: self._replace(self._layer(index), parse_path(path)))
+            self._report_errors(lambda: self._replace_edit(index, parse_path(path)))
         elif name == "quit":
             self._leave()
 
@@ -172,13 +154,13 @@ class FileActions:
 
     def _open(self, path: Path, kind: str) -> None:
         if kind == "cameras":
-            self._look_through(path)
+            view_actions.look_through(self._app.main_view, path)
             return
         if kind == "timeline":
-            self._take_timeline(path)
+            view_actions.open_timeline(self._app.main_view, path)
             return
         if kind == "gdf":
-            self._add_edit(path)
+            self._edits.add(path)
         elif self.has_unsaved:
             self._app.main_view.ask(self._leaving(f"open_file:{path}"))
             return
@@ -187,14 +169,6 @@ class FileActions:
         else:
             self._open_scene(path)
         self._app.main_view.recent = self._remember(path)
-
-    def _take_timeline(self, path: Path) -> None:
-        """Its keys take the place of those there are; undo brings them back."""
-        main_view = self._app.main_view
-        view = main_view.work.view
-        main_view.change(replace(view, timeline=timeline_file.load(path, view.layers)))
-        main_view.work = replace(main_view.work, player=Player(shown=True))
-        main_view.show_message(f"Opened {path.name}; press Space to play it")
 
     def _open_session(self, path: Path) -> None:
         opened = session.open_session(path)
@@ -249,72 +223,9 @@ class FileActions:
         main_view.restart(replace(main_view.work.view, camera=camera, layers=(), timeline=Timeline()))
         self.offer_autosave()
 
-    def _add_edit(self, path: Path) -> None:
-        """On top, at full strength, so that one sees what came; undo takes it off again."""
-        gdf = self._load_edit(path)
-        view = self._app.main_view.work.view
-        view = stack.add_layer(view, self._with_edit(gdf, path), gdf.name)
-        self._apply(view, len(view.layers) - 1)
-
-    def _duplicate(self, index: int) -> None:
-        """A copy of a layer above it, with an edit of its own: the timeline and undo tell edits apart."""
-        opened, view = self._app.document, self._app.main_view.work.view
-        gdf = view.layers[index].gdf
-        path = opened.gdf_paths[gdf] if gdf < len(opened.gdf_paths) else None
-        self._apply(stack.duplicate_layer(view, index, self._with_edit(opened.gdfs[gdf], path)), index + 1)
-
-    def _replace(self, index: int, path: Path) -> None:
-        """Another edit in a layer's place; undo brings the first one back."""
-        gdf = self._load_edit(path)
-        view = self._app.main_view.work.view
-        self._apply(stack.replace_edit(view, index, self._with_edit(gdf, path), gdf.name), index)
+    def _replace_edit(self, index: str, path: Path) -> None:
+        self._edits.replace(self._edits.layer(index), path)
         self._app.main_view.recent = self._remember(path)
-
-    def _load_edit(self, path: Path) -> Gdf:
-        with all_threads():
-            return load_gdf(path, self._app.document.scene)
-
-    def _with_edit(self, gdf: Gdf, path: Path | None) -> int:
-        """Have one more edit open; its index."""
-        opened = self._app.document
-        own = replace(gdf, name=opened.free_name(gdf.name))
-        known = path is not None and len(opened.gdf_paths) == len(opened.gdfs)
-        paths = (*opened.gdf_paths, path) if known and path is not None else ()
-        self._app.show(replace(opened, gdfs=(*opened.gdfs, own), gdf_paths=paths))
-        return len(opened.gdfs)
-
-    def _apply(self, view: ViewState, focus: int) -> None:
-        """A change of the stack, which undo takes back, and the layer that it is about."""
-        main_view = self._app.main_view
-        main_view.change(view)
-        main_view.work = replace(main_view.work, focus=focus)
-
-    def _layer(self, index: str) -> int:
-        """The layer that a request is about: the focused one where none is named."""
-        work = self._app.main_view.work
-        found = int(index) if index else work.focus
-        if found is None or not 0 <= found < len(work.view.layers):
-            raise ProgdfError("no layer is selected; click one first")
-        return found
-
-    def _look_through(self, path: Path) -> None:
-        main_view = self._app.main_view
-        main_view.work = workspace.with_camera(
-            main_view.work,
-            from_camera(main_view.work.view.camera, load_cameras(path)[0], main_view.facts.bounds),
-        )
-        main_view.show_message(f"Looking through the first camera of {path.name}")
-
-    def _keep_camera(self) -> None:
-        """Add the view on screen to the cameras kept beside the session or the scene."""
-        main_view = self._app.main_view
-        place = self.path or self._app.document.path or main_view.pictures / self._app.document.title
-        path, count = saved_files.camera(
-            place, to_camera(main_view.work.view.camera, *main_view.picture_size)
-        )
-        main_view.show_message(
-            f"Saved as camera {count} in {path.resolve()}; use it with progdf train … --cameras {path.name}"
-        )
 
     def _write(self, path: Path) -> None:
         session.save(path, self._session())
@@ -346,7 +257,7 @@ class FileActions:
             if then:
                 main_view.request(then)
 
-        if error := _failure(save):
+        if error := failure_line(save):
             main_view.ask(Dialog("save", path, then, error=error))
 
     def _browse(self) -> None:
@@ -367,7 +278,7 @@ class FileActions:
 
     def _report_errors(self, act: Callable[[], None]) -> None:
         """Do it; what goes wrong is a line in the window."""
-        if error := _failure(act):
+        if error := failure_line(act):
             self._app.main_view.show_message(error, error=True)
 
     def _session_name(self) -> Path:
@@ -382,14 +293,3 @@ class FileActions:
         if not paths:
             return recent.read(self._memory)
         return recent.remember(paths, self._memory)
-
-
-def _failure(act: Callable[[], None]) -> str:
-    """Do it; what went wrong, in one line, "" for nothing."""
-    try:
-        act()
-    except ProgdfError as error:
-        return " ".join(str(error).split())
-    except OSError as error:
-        return f"{error.filename or 'the file'} cannot be read or written: {error.strerror}"
-    return ""

@@ -1,0 +1,54 @@
+"""Cameras and timelines as files: opened into the view on screen, or kept from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from progdf.io.cameras import load_cameras
+from viewer.camera.view_camera import from_camera, to_camera
+from viewer.files import exports, timeline_file
+from viewer.state.playback import Player
+from viewer.state.workspace import with_camera
+
+from .application import Application
+from .main_view import MainView
+
+
+def look_through(main_view: MainView, path: Path) -> None:
+    """Take the first camera of a file.
+
+    Raises:
+        ProgdfError: it holds none.
+    """
+    work = main_view.work
+    camera = from_camera(work.view.camera, load_cameras(path)[0], main_view.facts.bounds)
+    main_view.work = with_camera(work, camera)
+    main_view.show_message(f"Looking through the first camera of {path.name}")
+
+
+def keep_camera(app: Application, session: Path | None) -> None:
+    """Add the view on screen to the cameras kept beside the session, or the scene.
+
+    Raises:
+        ProgdfError: see `exports.camera`.
+    """
+    main_view = app.main_view
+    place = session or app.document.path or main_view.pictures / app.document.title
+    camera = to_camera(main_view.work.view.camera, *main_view.picture_size)
+    path, count = exports.camera(place, camera)
+    main_view.show_message(
+        f"Saved as camera {count} in {path.resolve()}; use it with progdf train … --cameras {path.name}"
+    )
+
+
+def open_timeline(main_view: MainView, path: Path) -> None:
+    """The keys of a file take the place of those there are; undo brings them back.
+
+    Raises:
+        ProgdfError: see `timeline_file.load`.
+    """
+    view = main_view.work.view
+    main_view.change(replace(view, timeline=timeline_file.load(path, view.layers)))
+    main_view.work = replace(main_view.work, player=Player(shown=True))
+    main_view.show_message(f"Opened {path.name}; press Space to play it")
