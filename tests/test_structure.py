@@ -28,7 +28,7 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 ORDER = {
     "progdf": """gaussians lens sh terminal errors region camera color metrics demo_scenes io rasterize
         field formats gdf scene compose cli __init__ __main__""",
-    "trainer": """__init__ options option_checks plan store views presets editors segmenters setup regions
+    "trainer": """__init__ options option_checks presets plan store views editors segmenters setup regions
         optimize fit report pipeline cli""",
     "viewer": "__init__ camera gl state render files pictures ui panel app commands",
     "benchmarks": """__init__ courses joint_svd table position_floor ablation field_forms rasterizer

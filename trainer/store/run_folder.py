@@ -3,7 +3,7 @@
 RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
 RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
 RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
-RUN/views/painted/…                              what a learned editor painted, see editors/kept.py
+RUN/views/painted/…                              what a learned editor painted, see editors/cache.py
 RUN/segmented/PROMPT/VIEW.png                    where text:"…" found it; a folder for masks:DIR
 RUN/state/…                                      what a stopped run needs to go on, see state.py
 """
