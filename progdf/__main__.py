@@ -94,7 +94,7 @@ def _run(arguments: Sequence[str]) -> int:
         print(f"progdf {__version__}")
         return 0
     if arguments[0] not in COMMANDS:
-        raise ProgdfError(f"there is no command '{arguments[0]}'; try one of {', '.join(COMMANDS)}")
+        raise ProgdfError(f"unknown command '{arguments[0]}'; use one of {', '.join(COMMANDS)}")
     module, function = COMMANDS[arguments[0]][0].split(":")
     return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
 

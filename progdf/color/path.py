@@ -67,7 +67,7 @@ def path_of(name: str) -> ColorPath:
     for path in get_args(ColorPath):
         if path == name:
             return path  # type: ignore[no-any-return]
-    raise ProgdfError(f"there is no path '{name}'; use one of {', '.join(get_args(ColorPath))}")
+    raise ProgdfError(f"unknown color path '{name}'; use one of {', '.join(get_args(ColorPath))}")
 
 
 def between(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:

@@ -82,7 +82,7 @@ def check_layers(layers: Sequence[Layer], blend: str) -> None:
 def check_numbers(layers: Sequence[Layer], blend: str) -> None:
     """`check_layers` without a look at the weights, which takes no time."""
     if blend not in BLENDS:
-        raise ProgdfError(f"there is no blend rule '{blend}'; use one of {', '.join(BLENDS)}")
+        raise ProgdfError(f"unknown blend rule '{blend}'; use one of {', '.join(BLENDS)}")
     for layer in layers:
         if not math.isfinite(layer.strength):
             raise ProgdfError(f"the strength of {layer.gdf.name} is {layer.strength}; use a number, 0 to 1")

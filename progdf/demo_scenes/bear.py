@@ -26,7 +26,7 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
         ProgdfError: fewer than `SMALLEST` Gaussians.
     """
     if size < SMALLEST:
-        raise ProgdfError(f"{size} Gaussians are too few for a bear; at least {SMALLEST} would be right")
+        raise ProgdfError(f"{size} Gaussians are too few for a bear; use at least {SMALLEST}")
     gaussians, labels = assemble(bear_parts(), LABELS, paint, size, seed)
     return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), _SKY)
 

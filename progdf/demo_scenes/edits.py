@@ -44,7 +44,7 @@ class AnalyticEdit:
             ProgdfError: the strength is not within 0..1.
         """
         if not 0 <= strength <= 1:
-            raise ProgdfError(f"the strength is {strength:g}; 0 to 1 would be right")
+            raise ProgdfError(f"the strength must be between 0 and 1, got {strength:g}")
         if strength == 0:
             return scene
         edited = self.change(scene[members], strength)

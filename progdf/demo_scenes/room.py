@@ -31,7 +31,7 @@ def room(size: int = 40_000, seed: int = 0) -> DemoScene:
         ProgdfError: fewer than `SMALLEST_ROOM` Gaussians.
     """
     if size < SMALLEST_ROOM:
-        raise ProgdfError(f"{size} Gaussians are too few for a room; at least {SMALLEST_ROOM} would be right")
+        raise ProgdfError(f"{size} Gaussians are too few for a room; use at least {SMALLEST_ROOM}")
     gaussians, labels = assemble(room_parts(), LABELS, paint, size, seed, Daylight(_sun, fill=1.9))
     return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), (0.05, 0.05, 0.06))
 

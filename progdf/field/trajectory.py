@@ -149,7 +149,7 @@ def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dic
     try:
         tensors, header = read_tensors(path, names)
         if header.get("format") != _FORMAT:
-            raise ProgdfError(f"{path} is no recorded trajectory; give a run folder of progdf train")
+            raise ProgdfError(f"{path} is not a recorded trajectory; give a run folder of progdf train")
         if not names and (missing := _NEEDED - set(tensors)):
             raise _damaged(path, f"it has no {min(missing)}")
         return tensors, typed(decode_json(header["about"]), dict[str, Any])

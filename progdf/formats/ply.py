@@ -143,7 +143,7 @@ def _vertex(name: str, header: PlyHeader) -> Element:
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
         packed = any(element.name == "chunk" for element in header.elements)
-        raise ProgdfError(f"{name} has no element 'vertex'" + ("" if packed else "; it is no 3DGS .ply"))
+        raise ProgdfError(f"{name} has no element 'vertex'" + ("" if packed else "; it is not a 3DGS .ply"))
     return vertex
 
 
@@ -158,7 +158,7 @@ def _check_properties(name: str, header: PlyHeader, vertex: Element) -> int:
     if rest not in _SH_REST or absent:
         raise ProgdfError(
             f"{name} has {rest} f_rest properties{f' without {absent}' if absent else ''}; "
-            f"0, 9, 24, 45 or 72 would be right: export it again"
+            f"expected 0, 9, 24, 45 or 72: export it again"
         )
     if not vertex.count:
         raise ProgdfError(f"{name} holds 0 Gaussians; a scene needs at least one: export it again")

@@ -178,7 +178,7 @@ def _read_ascii(name: str, file: BinaryIO, element: Element, wanted: tuple[str, 
             table = np.array([[line[p] for p in places] for line in words]).astype(np.float64)
         except ValueError:
             raise ProgdfError(
-                f"{name} has something that is no number between rows {first} and {first + rows - 1}; "
+                f"{name} has something that is not a number between rows {first} and {first + rows - 1}; "
                 f"it is damaged: copy or export it again"
             ) from None
         with np.errstate(over="ignore"):

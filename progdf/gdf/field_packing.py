@@ -60,7 +60,7 @@ def unpacked_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[Ba
     recorded = tuple(table.recorded)
     for name in table.attributes:
         if name not in ATTRIBUTES:
-            raise ValueError(f"there is no attribute {name}")
+            raise ValueError(f"unknown attribute {name}")
     if table.network is None:
         attributes = {
             name: AttributeBases(**{part: tensors[f"{name}.{key}"] for part, key in _PARTS.items()})

@@ -276,10 +276,10 @@ def head_checksum(text: str, tensors: Mapping[str, tuple[tuple[int, ...], str]])
 
 def damaged(name: str) -> ProgdfError:
     """The line for a file that is not what was saved."""
-    return ProgdfError(f"{name} is damaged: its checksum does not fit; copy it again or make it again")
+    return ProgdfError(f"{name} is damaged: its checksum does not match; copy it again or make it again")
 
 
 def contradiction(name: str, error: Exception) -> ProgdfError:
     """The line for a file whose parts do not fit each other."""
     reason = " ".join(str(error).split()) or type(error).__name__
-    return ProgdfError(f"{name} does not hold together ({reason}); make it again with progdf train")
+    return ProgdfError(f"{name} is inconsistent ({reason}); make it again with progdf train")

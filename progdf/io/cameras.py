@@ -64,7 +64,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """
     cameras = _from_folder(Path(path)) if Path(path).is_dir() else _from_file(path)
     if not cameras:
-        raise ProgdfError(f"{os.fspath(path)} holds 0 cameras; at least one would be right")
+        raise ProgdfError(f"{os.fspath(path)} holds no cameras; it needs at least one")
     if bent := sum(camera.lens is not None for camera in cameras):
         _log.info(
             "%s: %d of %d cameras have a lens that bends photographs; what is drawn is straight",
@@ -217,7 +217,7 @@ def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object,
             if key in table
         ]
         if not angles:
-            raise ProgdfError(f"{where} has no focal length; fl_x, fl_y or camera_angle_x would be right")
+            raise ProgdfError(f"{where} has no focal length; expected fl_x, fl_y or camera_angle_x")
         focal_x, focal_y = angles[0], angles[-1]
     cx = number_at(where, table, "cx") if "cx" in table else 0.5 * width
     cy = number_at(where, table, "cy") if "cy" in table else 0.5 * height
@@ -254,9 +254,9 @@ def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, 
                 return picture_size(picture)
             except ProgdfError:
                 raise ProgdfError(
-                    f"{picture}, which {where} names, is no image; repair or replace it"
+                    f"{picture}, which {where} names, is not an image; repair or replace it"
                 ) from None
-    raise ProgdfError(f"{where} has no image size; w and h would be right")
+    raise ProgdfError(f"{where} has no image size; expected w and h")
 
 
 def _world_to_camera(where: str, c2w: Tensor) -> Tensor:
@@ -271,7 +271,7 @@ def _rigid(where: str, matrix: Tensor) -> Tensor:
     last = matrix[3].tolist() == [0, 0, 0, 1]
     if not last or not error < _NOT_A_ROTATION or float(torch.det(rotation)) < 0:
         raise ProgdfError(
-            f"{where} has a matrix that is no rotation and translation; export the cameras again"
+            f"{where} has a matrix that is not a rotation and a translation; export the cameras again"
         )
     return matrix
 

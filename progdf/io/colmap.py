@@ -93,7 +93,7 @@ def load_model(model: Path) -> list[Camera]:
             f"{model} is a broken COLMAP model; export cameras{suffix} and images{suffix} again"
         )
     if not images:
-        raise ProgdfError(f"{model} has no registered image; at least one would be right")
+        raise ProgdfError(f"{model} has no registered image; it needs at least one")
     return [_camera(model, image) for image in sorted(images, key=lambda image: image.name)]
 
 
@@ -130,7 +130,7 @@ def _camera(model: Path, image: _Image) -> Camera:
         raise ProgdfError(f"{where} is broken: {error}") from None
     rotation = viewmat[:3, :3]
     if not float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-3:
-        raise ProgdfError(f"{where} has a rotation that is none; export the model again")
+        raise ProgdfError(f"{where} has an invalid rotation; export the model again")
     return replace(camera, lens=lens)
 
 

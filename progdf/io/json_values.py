@@ -59,7 +59,7 @@ def typed(value: object, kind: type[_T]) -> _T:
 def _finite(digits: str) -> float:
     number = float(digits)
     if not math.isfinite(number):
-        raise ValueError(f"{digits[:12]}{'…' * (len(digits) > 12)} is no number that can be used")
+        raise ValueError(f"{digits[:12]}{'…' * (len(digits) > 12)} is not a usable number")
     return number
 
 
@@ -87,7 +87,7 @@ def _check(value: object, depth: int) -> None:
 def table_at(where: str, entry: object) -> Mapping[str, Any]:
     """The entry, which must be a JSON object."""
     if not isinstance(entry, dict):
-        raise ProgdfError(f"{where} is no JSON object; export the cameras again")
+        raise ProgdfError(f"{where} is not a JSON object; export the cameras again")
     return entry
 
 
@@ -95,7 +95,7 @@ def number_at(where: str, table: Mapping[str, Any], key: str) -> float:
     """A number that is finite in float32."""
     value = table.get(key)
     if not _is_number(value):
-        raise ProgdfError(f"{where} has {key} = {_shown(value)}; a number would be right")
+        raise ProgdfError(f"{where} has {key} = {_shown(value)}; expected a number")
     return float(table[key])
 
 
@@ -103,7 +103,7 @@ def angle_at(where: str, table: Mapping[str, Any], key: str) -> float:
     """A field of view in radians, between 0 and pi."""
     angle = number_at(where, table, key)
     if not 0 < angle < math.pi:
-        raise ProgdfError(f"{where} has {key} = {angle:g}; an angle between 0 and pi would be right")
+        raise ProgdfError(f"{where} has {key} = {angle:g}; expected an angle between 0 and pi")
     return angle
 
 
@@ -111,7 +111,7 @@ def pixels_at(where: str, table: Mapping[str, Any], key: str) -> int:
     """A whole number of pixels, from 1 to a million."""
     number = number_at(where, table, key)
     if number != round(number) or not 1 <= number <= 1_000_000:
-        raise ProgdfError(f"{where} has {key} = {number:g}; a whole number of pixels would be right")
+        raise ProgdfError(f"{where} has {key} = {number:g}; expected a whole number of pixels")
     return int(number)
 
 
@@ -126,7 +126,7 @@ def matrix_at(where: str, table: Mapping[str, Any], key: str, rows: tuple[int, .
     )
     if not good:
         shape = " or ".join(f"{count}x{columns}" for count in rows)
-        raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers would be right")
+        raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers expected")
     return torch.tensor(value, dtype=torch.float64)
 
 

@@ -52,7 +52,7 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if not self.file or "\0" in self.file:
-            raise ValueError("the name of a file is none")
+            raise ValueError("a file has no name")
 
     def path(self, folder: Path) -> Path:
         """Where it is, for a session in `folder`."""
@@ -145,7 +145,7 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
     except ValueError as error:
         raise ProgdfError(f"{name} is not valid JSON ({error}); save the session anew") from None
     if not isinstance(table, dict) or MARK not in table:
-        raise ProgdfError(f"{name} is no session; give a file that progdf view saved with Ctrl+S")
+        raise ProgdfError(f"{name} is not a session; give a file that progdf view saved with Ctrl+S")
     version = table.pop(MARK)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise ProgdfError(f"{name} is a damaged session: its version is {version!r}; save it anew")

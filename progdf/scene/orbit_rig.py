@@ -55,7 +55,7 @@ def orbit_rig(
     """
     lowest, highest = elevations
     if count < 1:
-        raise ProgdfError(f"the rig was asked for {count} cameras; at least 1 would be right")
+        raise ProgdfError(f"the rig needs at least 1 camera, got {count}")
     if not -89 <= lowest <= highest <= 89:
         raise ProgdfError(
             f"the rig's elevations {lowest:g} to {highest:g} are no band within -89 to 89 degrees"

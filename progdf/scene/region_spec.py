@@ -121,9 +121,7 @@ def read_labels(path: str, count: int) -> Tensor:
     labels = _open_labels(path)
     if labels.shape not in ((count,), (count, 1)):
         shape = "x".join(str(side) for side in labels.shape) or "1"
-        raise ProgdfError(
-            f"{path} holds {shape} labels, the scene {count} Gaussians; one each would be right"
-        )
+        raise ProgdfError(f"{path} holds {shape} labels, the scene {count} Gaussians; expected one each")
     return torch.from_numpy(labels.reshape(-1).astype(np.int64))
 
 
@@ -172,7 +170,7 @@ def _file(rest: str, scene: Gaussians) -> Region:
 def _open_labels(path: str) -> NDArray[Any]:
     labels = open_npy(path, "labels, which are integers")
     if labels.dtype.kind not in "iub":
-        raise ProgdfError(f"{path} holds {labels.dtype} numbers; integer labels would be right")
+        raise ProgdfError(f"{path} holds {labels.dtype} numbers; expected integer labels")
     return labels
 
 
@@ -189,7 +187,7 @@ def _labels_wanted(rest: str) -> tuple[str, list[int]]:
         return path, [int(word) for word in ids.split(",")]
     except ValueError:
         raise ProgdfError(
-            f"'{ids}' in region 'labels:{rest}' is no list of integers; write labels:FILE.npy:ID[,ID…]"
+            f"'{ids}' in region 'labels:{rest}' is not a list of integers; write labels:FILE.npy:ID[,ID…]"
         ) from None
 
 

@@ -209,5 +209,5 @@ def test_recolouring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
 
 @pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
 def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
-    with pytest.raises(ProgdfError, match="0 to 1 would be right"):
+    with pytest.raises(ProgdfError, match="between 0 and 1"):
         scenes.darkened().apply(bear.gaussians, torch.arange(3), strength)

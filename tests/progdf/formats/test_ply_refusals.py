@@ -139,7 +139,7 @@ def test_words_between_the_numbers_are_refused(tmp_path: Path) -> None:
     lines = path.read_bytes().split(b"\n")
     lines[-3] = lines[-3].replace(b" ", b" ?", 1)
     path.write_bytes(b"\n".join(lines))
-    assert "no number" in refusal(load_ply, path)
+    assert "not a number" in refusal(load_ply, path)
 
 
 def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:

@@ -276,7 +276,7 @@ def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Pat
 def test_a_file_that_contradicts_itself_is_refused(
     saved: Path, tmp_path: Path, changes: dict[str, object]
 ) -> None:
-    assert "does not hold together" in refusal(rewritten(saved, tmp_path, **changes))
+    assert "is inconsistent" in refusal(rewritten(saved, tmp_path, **changes))
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -153,7 +153,7 @@ LAYOUT = {
 def test_a_network_that_contradicts_itself_is_refused(
     saved: Path, tmp_path: Path, network: dict[str, object], tensors: dict[str, Tensor | None]
 ) -> None:
-    with pytest.raises(ProgdfError, match="does not hold together") as refused:
+    with pytest.raises(ProgdfError, match="is inconsistent") as refused:
         load_gdf(rewritten(saved, tmp_path, network, tensors), scene())
     assert "\n" not in str(refused.value)
 

@@ -55,7 +55,7 @@ BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what m
     "words": (lambda t: t.update(fl_x="wide"), "fl_x"),
     "endless integer": (lambda t: t.update(fl_x=10**400), "100000000000…"),
     "no matrix": (lambda t: t["frames"][3].pop("transform_matrix"), "frame 3"),
-    "a row gone": (lambda t: t["frames"][3]["transform_matrix"].pop(0), "no rotation"),
+    "a row gone": (lambda t: t["frames"][3]["transform_matrix"].pop(0), "not a rotation"),
     "ragged matrix": (lambda t: t["frames"][3]["transform_matrix"][1].pop(), "transform_matrix"),
     "stretched": (
         lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(slice(0, 3), [9, 0, 0]),
@@ -65,15 +65,15 @@ BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what m
         lambda t: t["frames"][1]["transform_matrix"].insert(0, t["frames"][1]["transform_matrix"].pop(1)),
         "rotation",
     ),
-    "NaN": (lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(0, math.nan), "NaN is no number"),
+    "NaN": (lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(0, math.nan), "NaN is not a usable"),
     "frame is a number": (lambda t: t["frames"].append(7), "frame 4"),
-    "no frames": (lambda t: t["frames"].clear(), "0 cameras"),
+    "no frames": (lambda t: t["frames"].clear(), "no cameras"),
     "a row too many": (lambda t: t["frames"][3]["transform_matrix"].append([0, 0, 0, 1]), "3x4 or 4x4"),
     "a little stretched": (
         lambda t: t["frames"][1].update(
             transform_matrix=[[1.02 * x for x in row] for row in t["frames"][1]["transform_matrix"][:3]]
         ),
-        "no rotation",
+        "not a rotation",
     ),
     "no angle": (lambda t: angle_instead(t, 0.0), "camera_angle_x = 0;"),
     "an angle in degrees": (lambda t: angle_instead(t, 50.0), "camera_angle_x = 50;"),
@@ -112,7 +112,7 @@ def test_a_saved_camera_that_does_more_than_turn_and_move_is_refused(
 ) -> None:
     viewmat = torch.diag(torch.tensor(diagonal)).tolist()
     entry = {"width": 4, "height": 4, "K": torch.eye(3).tolist(), "viewmat": viewmat}
-    assert "no rotation" in refusal(load_cameras, written(tmp_path / "one.json", entry))
+    assert "not a rotation" in refusal(load_cameras, written(tmp_path / "one.json", entry))
 
 
 def test_a_missing_camera_file_is_one_line(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ FAULTS = {
     "an empty sentence": ({"--editor": "instruct:"}, "says nothing"),
     "no such kind of region": ({"--region": "cube:1"}, "is of no known kind"),
     "no file of labels": ({"--region": "all-labels:nowhere.npy:1"}, "nowhere.npy"),
-    "labels that are none": ({"--region": "labels:labels.npy:one"}, "is no list of integers"),
+    "labels that are none": ({"--region": "labels:labels.npy:one"}, "is not a list of integers"),
     "labels that are fractions": ({"--region": "labels:fractions.npy:1"}, "integer labels"),
     "a box of two numbers": ({"--region": "box:1,2"}, "is not 6 numbers"),
     "a ball turned inside out": ({"--region": "sphere:0,0,0,-1"}, "must be positive"),

@@ -264,7 +264,7 @@ def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) 
         ("scarf", "NAME=WEIGHTS.npy"),
         (f"hat={tmp_path / 'scene.npy'}", "no edit of that name"),
         (f"scarf={tmp_path / 'none.npy'}", "none.npy does not exist"),
-        (f"scarf={tmp_path / 'long.npy'}", "would be right"),
+        (f"scarf={tmp_path / 'long.npy'}", "expected"),
         (f"scarf={tmp_path / 'large.npy'}", "outside 0 to 1"),
     ):
         with pytest.raises(ProgdfError, match=told):
