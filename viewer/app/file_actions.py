@@ -22,8 +22,8 @@ from viewer.files.typed_paths import parse_path, session_file
 from viewer.state import workspace
 from viewer.state.view_state import Timeline
 from viewer.state.workspace import Dialog
+from viewer.ui import native_dialogs as native
 
-from . import native_dialogs as native
 from . import view_actions
 from .application import Application, failure_line
 from .edit_actions import EditActions

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+from viewer.camera import tween
 from viewer.camera.view_camera import ViewCamera
 
-from . import tween
 from .view_state import Keyframe, Timeline, ViewState
 
 EASINGS = tween.EASINGS

@@ -26,7 +26,8 @@ from viewer.files.document import Document
 from viewer.render.engine import Engine
 from viewer.render.headless import headless_context
 from viewer.render.renderers import Image
-from viewer.state import actions, workspace
+from viewer.state import workspace
+from viewer.state.actions import perform
 from viewer.state.view_state import ViewState
 
 pytestmark = pytest.mark.gl
@@ -185,7 +186,7 @@ def test_f_without_a_layer_fills_any_window_with_what_the_scene_is_about(
     scene = scaled(the_bear(), factor)
     for azimuth, elevation in ((20.0, 15.0), (110.0, 40.0)):
         view = ViewState(camera=ViewCamera(azimuth=azimuth, elevation=elevation))
-        work = actions.perform(workspace.new_workspace(view), "frame", Document("x", scene).facts(), aspect)
+        work = perform(workspace.new_workspace(view), "frame", Document("x", scene).facts(), aspect)
         assert is_filled(work.view.camera, scene[subject_rows(scene, UP)], aspect)
         assert axes(work.view.camera) == axes(view.camera)
 
@@ -197,7 +198,7 @@ def test_f_fills_the_window_with_the_members_of_the_focused_layer(aspect: float,
     view = first_view(stack, 0.5, 0.5)
     work = replace(workspace.new_workspace(view), focus=layer)
     facts = Document("x", stack.scene, stack.gdfs).facts()
-    camera = actions.perform(work, "frame", facts, aspect).view.camera
+    camera = perform(work, "frame", facts, aspect).view.camera
     assert is_filled(camera, stack.scene[stack.gdfs[layer].region.members], aspect)
     assert axes(camera) == axes(view.camera)
 
@@ -205,9 +206,9 @@ def test_f_fills_the_window_with_the_members_of_the_focused_layer(aspect: float,
 def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
     scene = room(4000).gaussians
     inside = workspace.new_workspace(ViewState(camera=first_camera(scene)))
-    outside = actions.perform(inside, "frame", Document("x", scene).facts()).view.camera
+    outside = perform(inside, "frame", Document("x", scene).facts()).view.camera
     assert filled(outside, scene, 1.0).max() < 1.0
-    nothing = actions.perform(inside, "frame", Document("x", scene[:0]).facts()).view.camera
+    nothing = perform(inside, "frame", Document("x", scene[:0]).facts()).view.camera
     assert nothing == turntable.frame(inside.view.camera, Bounds())
 
 

@@ -13,10 +13,10 @@ import pytest
 
 from tests.helpers.null_app import null_app, press
 from tests.helpers.ui_rig import bear, first_view, rig
-from viewer.app import native_dialogs as native
 from viewer.app.app import App
 from viewer.files import document, session
 from viewer.state.workspace import Dialog
+from viewer.ui import native_dialogs as native
 
 pytestmark = [
     pytest.mark.gl,

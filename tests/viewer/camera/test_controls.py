@@ -17,7 +17,8 @@ from viewer.camera import controls
 from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, eye, to_camera
-from viewer.state import actions, workspace
+from viewer.state import workspace
+from viewer.state.actions import perform
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts
@@ -227,7 +228,7 @@ def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
     for layers in ((), (LayerState(0, "scarf", 0.5),)):
         work = workspace.new_workspace(ViewState(layers=layers))
         for key in controls.KEYS:
-            after = actions.perform(work, key.action, facts)
+            after = perform(work, key.action, facts)
             assert usable(after.view.camera)
             assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)
 

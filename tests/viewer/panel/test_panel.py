@@ -12,7 +12,8 @@ from viewer.camera import view_camera as turntable
 from viewer.camera.view_camera import Bounds, ViewCamera
 from viewer.panel import panel
 from viewer.panel.strength_slider import parse_strength
-from viewer.state import actions, workspace
+from viewer.state import workspace
+from viewer.state.actions import perform
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts, Workspace
@@ -122,9 +123,9 @@ def test_a_drag_moves_the_slider_and_makes_exactly_one_undo_entry(hand: Hand) ->
     hand.button(False)
     assert hand.strengths == pytest.approx([0.75, 0.0], abs=0.01)
     assert len(hand.work.past.past) == 1
-    undone = actions.perform(hand.work, "undo", FACTS)
+    undone = perform(hand.work, "undo", FACTS)
     assert undone.view == STACK
-    assert actions.perform(undone, "redo", FACTS).view == hand.work.view
+    assert perform(undone, "redo", FACTS).view == hand.work.view
 
 
 def test_a_drag_back_to_where_it_began_leaves_no_entry(hand: Hand) -> None:
@@ -248,7 +249,7 @@ def test_the_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) ->
     hand.click(SIZE[0] - 60, 70)
     hand.click(SIZE[0] - 80, 70 + 28 * 2 - 2)
     assert hand.work.view.blend == "sum"
-    assert actions.perform(hand.work, "undo", FACTS).view == STACK
+    assert perform(hand.work, "undo", FACTS).view == STACK
 
 
 def test_buttons_ask_for_the_actions_that_keys_have(hand: Hand) -> None:

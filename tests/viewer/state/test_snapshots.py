@@ -10,7 +10,8 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app import app as application
-from viewer.state import actions, snapshots, workspace
+from viewer.state import snapshots, workspace
+from viewer.state.actions import perform
 
 
 def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
@@ -18,7 +19,7 @@ def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original(
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
 
     def act(work: workspace.Workspace, action: str) -> workspace.Workspace:
-        return workspace.record_undo(actions.perform(work, action, facts))
+        return workspace.record_undo(perform(work, action, facts))
 
     work = act(work, "snapshot")
     assert act(work, "snapshot").snapshots == work.snapshots, "the same twice is once"

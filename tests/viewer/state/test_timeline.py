@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from viewer.camera import controls
+from viewer.camera import controls, tween
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, to_camera
 from viewer.files import timeline_file
-from viewer.state import actions, history, playback, timeline, tween, workspace
+from viewer.state import history, playback, timeline, workspace
+from viewer.state.actions import ACTIONS, perform
 from viewer.state.layer_facts import LayerRow
 from viewer.state.playback import Player
 from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
@@ -39,7 +40,7 @@ def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
 
 def act(work: Workspace, *actions: str) -> Workspace:
     for action in actions:
-        work = workspace.record_undo(actions.perform(work, action, FACTS))
+        work = workspace.record_undo(perform(work, action, FACTS))
     return work
 
 
@@ -216,7 +217,7 @@ def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves
     entries = len(work.past.past)
     left = work
     for action in leaves:  # of one drag: nothing is settled in between
-        left = actions.perform(left, action, FACTS)
+        left = perform(left, action, FACTS)
     left = workspace.record_undo(workspace.advance(left, 0.1))
     assert left.view.layers != work.view.layers
     assert len(left.past.past) == entries + 1, "one drag is one entry"
@@ -289,7 +290,7 @@ def test_history_restores_the_timeline_with_the_rest() -> None:
 def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
     named = {key.action.partition(":")[0] for key in controls.KEYS}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
-    assert set(playback.ACTIONS) <= set(actions.ACTIONS)
+    assert set(playback.ACTIONS) <= set(ACTIONS)
 
 
 def test_a_timeline_in_a_file_comes_back_whole_under_its_edits_names(tmp_path: Path) -> None:
