@@ -110,12 +110,12 @@ def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
         raise ProgdfError(f"--orbit {text} is not two or three numbers; {right}")
     if not -90 <= numbers[1] <= 90:
         raise ProgdfError(
-            f"--orbit {text}: the elevation is {numbers[1]:g}; -90 to 90 degrees would be right"
+            f"--orbit {text}: the elevation must be between -90 and 90 degrees, got {numbers[1]:g}"
         )
     distance = numbers[2] if len(numbers) == 3 else framed.distance
     if not 0 < distance <= FARTHEST:
         raise ProgdfError(
-            f"--orbit {text}: the distance is {distance:g}; above 0 and up to {FARTHEST:g} would be right"
+            f"--orbit {text}: the distance must be above 0 and at most {FARTHEST:g}, got {distance:g}"
         )
     return replace(framed, azimuth=numbers[0], elevation=numbers[1], distance=distance)
 

@@ -70,7 +70,7 @@ def _weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
     members, count = gdf.region.members.numpy(), gdf.scene.count
     if found.shape not in ((len(members),), (count,)):
         raise ProgdfError(
-            f"--paint: {path} has the shape {list(found.shape)}; [{len(members)}] or [{count}] would be right"
+            f"--paint: {path} has shape {list(found.shape)}, expected [{len(members)}] or [{count}]"
         )
     if not ((found >= 0) & (found <= 1)).all():
         raise ProgdfError(f"--paint: {path} has a number outside 0 to 1")

@@ -43,9 +43,9 @@ def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
     assert len(made) == len(straight)
     for one, other in zip(made, straight, strict=True):
         assert torch.equal(one.offsets, other.offsets)
-        assert (one.step, one.main_view, one.ends_stage, one.means) == (
+        assert (one.step, one.stage, one.ends_stage, one.means) == (
             other.step,
-            other.main_view,
+            other.stage,
             other.ends_stage,
             other.means,
         )
