@@ -101,14 +101,14 @@ def test_a_frame_in_the_order_of_the_last_one_is_found(
 ) -> None:
     path = tmp_path / "bear.ply"
     save_ply(path, bear(600).gaussians)
-    draw = Engine._bring
+    draw = Engine._update_picture
 
     def stale(engine: Engine, view: ViewState, camera: Camera, *others: Any) -> FrameTimings:
         if engine._ordered_for is not None:
             engine._ordered_for = camera.viewmat.numpy().tobytes()
         return draw(engine, view, camera, *others)
 
-    monkeypatch.setattr(Engine, "_bring", stale)
+    monkeypatch.setattr(Engine, "_update_picture", stale)
     ctx = headless_context()
     turnings = bench_frames.turned(ctx, path, steps=2, size=SIZE)
     ctx.release()

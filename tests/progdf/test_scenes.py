@@ -54,7 +54,7 @@ def test_a_room_has_its_size_and_all_its_things_and_is_seeded() -> None:
     assert len(scene.gaussians) == 2503
     assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
     assert _same(scene.gaussians, scenes.room(2503).gaussians)
-    with pytest.raises(ProgdfError, match="too few for a room; at least"):
+    with pytest.raises(ProgdfError, match="too few for a room; use at least"):
         scenes.room(scenes.SMALLEST_ROOM - 1)
 
 
@@ -78,7 +78,7 @@ def test_a_part_that_lies_inside_another_is_reported_not_searched_for() -> None:
 
 
 def test_too_few_gaussians_for_a_bear_are_refused() -> None:
-    with pytest.raises(ProgdfError, match="too few for a bear; at least"):
+    with pytest.raises(ProgdfError, match="too few for a bear; use at least"):
         scenes.bear(scenes.SMALLEST - 1)
 
 

@@ -215,9 +215,9 @@ def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
 @pytest.mark.parametrize("points", [(400, 900), (1600, 400)])
 def test_narrow_and_wide_windows_can_be_worked_in(points: tuple[int, int]) -> None:
     with rig(points=points) as hand:
-        before = hand.stage.work.view.camera
+        before = hand.main_view.work.view.camera
         hand.drag((30.0, 100.0), (60.0, 120.0))
-        assert hand.stage.work.view.camera != before
+        assert hand.main_view.work.view.camera != before
         hand.key("F")
         hand.key("T")
-        assert np.isfinite(hand.stage.engine.image(hand.stage.work.view, (20, 80))).all()
+        assert np.isfinite(hand.main_view.engine.image(hand.main_view.work.view, (20, 80))).all()

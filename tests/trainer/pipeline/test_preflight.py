@@ -19,10 +19,10 @@ GOOD = {"--region": "all", "--editor": "recolor:#3060d0"}
 FAULTS = {
     "no scene": ({"scene": "nowhere.ply"}, "nowhere.ply"),
     "a colour that is none": ({"--editor": "recolor:blue"}, "'blue' is not a colour"),
-    "a path that is none": ({"--editor": "stripes:#fff,path=green"}, "no path 'green'"),
+    "a path that is none": ({"--editor": "stripes:#fff,path=green"}, "unknown color path 'green'"),
     "an option that is none": ({"--editor": "tint:#fff,way=hue"}, "'way=hue' is no option"),
     "no share of the light": ({"--editor": "darken:2"}, "no share of the light"),
-    "no such editor": ({"--editor": "paint:#fff"}, "no editor 'paint'"),
+    "no such editor": ({"--editor": "paint:#fff"}, "unknown editor 'paint'"),
     "no folder of edited views": ({"--editor": "folder:nowhere"}, "nowhere is not a folder"),
     "no folder of photographs": ({"--editor": "photographs:nowhere"}, "nowhere is not a folder"),
     "no such style": ({"--editor": "style:99"}, "style:99 is no style"),

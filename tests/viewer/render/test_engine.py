@@ -246,7 +246,7 @@ def test_a_camera_move_composes_nothing(
 ) -> None:
     view = view_of(stack, 0.5)
     engine.image(view, SIZE)
-    composed = Count(monkeypatch, engine._editing, "bring")
+    composed = Count(monkeypatch, engine._editing, "update")
     uploaded = Count(monkeypatch, engine._renderer, "update")
     engine.image(replace(view, camera=replace(view.camera, azimuth=50.0)), SIZE)
     assert (composed.calls, uploaded.calls) == (0, 0)
