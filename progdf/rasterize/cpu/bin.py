@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .jit import kernel
-from .parallel import run_chunks, threads
 from .project import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE, Pinhole, Splats
 
 Array = NDArray[Any]
 
 TILE_W, TILE_H = 64, 8
 """Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorise over."""
-
-_WORTH_A_THREAD = 8192  # splats below which sharing them out takes longer than binning them
 
 
 class TileLists(NamedTuple):
@@ -110,7 +107,7 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
 
 
 def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_slots: bool) -> TileLists:
-    """List the splats of each tile.
+    """List the splats of each tile. On one thread: shared by two it takes as long.
 
     Args:
         order: rows of the splats, nearest first. [V] int32
@@ -118,35 +115,19 @@ def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_
         tile_count: of the window
         with_slots: whether `TileLists.slots` is wanted
     """
-    parts = 1 if len(order) < _WORTH_A_THREAD else threads()
-    cuts = [len(order) * part // parts for part in range(parts + 1)]
     offsets = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=offsets[1:])
-    places = np.zeros((parts, tile_count), np.int64)
-    run_chunks(lambda p: _count(order[cuts[p] : cuts[p + 1]], tiles, offsets, places[p]), parts)
     starts = np.zeros(tile_count + 1, np.int64)
-    np.cumsum(places.sum(axis=0), out=starts[1:])
-    # where each part of the splats writes in each tile
-    places[:] = starts[:-1] + places.cumsum(axis=0) - places
+    np.cumsum(np.bincount(tiles, minlength=tile_count), out=starts[1:])
     members = np.empty(len(tiles), np.int32)
     slots = np.empty(len(tiles) if with_slots else 0, np.int32)
-    run_chunks(
-        lambda p: _fill(order[cuts[p] : cuts[p + 1]], tiles, offsets, places[p], members, slots), parts
-    )
+    _fill(order, tiles, offsets, starts[:-1].copy(), members, slots)
     return TileLists(starts, members, slots, offsets)
 
 
 @kernel(cache=True)
-def _count(order: Array, tiles: Array, offsets: Array, counts: Array) -> None:
-    """How many of some splats each tile has. counts: out, zero on entry. [tiles] int64"""
-    for i in order:
-        for slot in range(offsets[i], offsets[i + 1]):
-            counts[tiles[slot]] += 1
-
-
-@kernel(cache=True)
 def _fill(order: Array, tiles: Array, offsets: Array, places: Array, members: Array, slots: Array) -> None:
-    """Put some splats into the lists of their tiles. places: where the next of each tile goes; used up."""
+    """Put the splats into the lists of their tiles. places: where the next of each tile goes; used up."""
     for i in order:
         for slot in range(offsets[i], offsets[i + 1]):
             at = places[tiles[slot]]

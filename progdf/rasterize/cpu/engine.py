@@ -108,7 +108,7 @@ def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
     """Run `kernel(first, step, scratch, *arguments)` so that every tile is one kernel's."""
     tiles = camera.grid[2] * camera.grid[3]
     # odd, so that one kernel's tiles are not those of one column
-    chunks = 1 if threads() == 1 else min(-(-tiles // _LEAST_TILES), 8 * threads() + 1)
+    chunks = 1 if threads() == 1 else min(-(-tiles // _LEAST_TILES), 4 * threads() + 1)
     run_chunks(lambda chunk: kernel(chunk, chunks, new_scratch(), *arguments), chunks)
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from filelock import FileLock
 from numba import config
 
 from progdf.errors import ProgdfError
@@ -217,7 +218,7 @@ def compilation(stage: str, seconds: int) -> AbstractContextManager[None]:
 @contextmanager
 def _first_run(stage: str, seconds: int) -> Iterator[None]:
     marker = kernel_cache() / f"{stage}.ready"
-    with _compiling_lock:
+    with _compiling_lock, nullcontext() if marker.exists() else compile_lock():
         cold = not marker.exists()
         if cold:
             log.warning(
@@ -229,3 +230,9 @@ def _first_run(stage: str, seconds: int) -> Iterator[None]:
             with suppress(OSError):
                 marker.touch()
         _ready.add(stage)
+
+
+@once
+def compile_lock() -> FileLock:
+    """Between processes: two that compile the same kernel would replace each other's files."""
+    return FileLock(kernel_cache() / "compiling.lock")

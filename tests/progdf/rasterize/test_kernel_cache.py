@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from progdf.io import user_folders
 from progdf.rasterize.cpu import jit
@@ -140,3 +142,25 @@ def test_a_temporary_folder_that_others_may_write_to_is_not_used(
     folder = jit.find_cache_folder()
     assert temporary not in folder.parents
     assert os.stat(folder).st_mode & 0o077 == 0
+
+
+def test_a_second_process_waits_for_the_kernels_that_another_compiles(
+    cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Both would write the same files, and the checksums of one would be wrong for those of the other."""
+    jit.compile_lock.cache_clear()
+    entered = threading.Event()
+
+    def draw() -> None:
+        with jit.compilation("made up", 1):
+            entered.set()
+
+    with FileLock(cache / "compiling.lock"):
+        drawing = threading.Thread(target=draw)
+        drawing.start()
+        assert not entered.wait(0.3)
+        (cache / "made up.ready").touch()
+    drawing.join(10.0)
+    assert entered.is_set()
+    assert not caplog.messages, "the second finds all that it needs"
+    jit.compile_lock.cache_clear()

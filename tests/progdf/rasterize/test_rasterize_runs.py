@@ -25,12 +25,11 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_tiles(
     room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from progdf.rasterize.cpu import bin, engine
+    from progdf.rasterize.cpu import engine
 
     scene, camera = random_gaussians(4000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
     monkeypatch.setattr(engine, "_ROOM", room)
-    monkeypatch.setattr(bin, "_WORTH_A_THREAD", 1)
     for threads in (1, 1, 2, 3, 7):
         set_threads(threads)
         again = draw(scene, camera, "cpu")
