@@ -18,6 +18,7 @@ from progdf.demo_scenes import bear
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.rasterize import render
+from progdf.rasterize.depth import depth_of, paint_depth, render_depth
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import front_camera, hard_cases, one_gaussian, orbit_camera, random_gaussians
 from viewer.gl.layout import SPLATS_PER_ROW
@@ -82,6 +83,19 @@ def test_hard_cases_look_the_same(draw: Draw, name: str) -> None:
     # float32 against float64: 120 dB and more is usual, 0.5/255 of one pixel where a rim is at stake
     assert psnr(image, expected) >= 100.0
     assert float(np.abs(image - expected).max(initial=0.0)) <= 1.0 / 255.0
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.usefixtures("without_early_stop")
+def test_opengl_draws_the_depth_of_hard_cases_like_the_reference(renderer: SplatRenderer, name: str) -> None:
+    scene, camera = CASES[name].gaussians, CASES[name].camera
+    renderer.upload(paint_depth(scene, camera))
+    renderer.set_order(back_to_front(scene.means.numpy(), camera))
+    found = depth_of(torch.from_numpy(read(renderer.draw(camera, (0.0, 0.0, 0.0))).copy()))
+    expected = render_depth(scene, camera, engine="reference")
+    torch.testing.assert_close(found.alpha, expected.alpha, rtol=0, atol=1e-4)
+    both = (found.alpha > 0) & (expected.alpha > 0)  # a rim may be at stake
+    torch.testing.assert_close(found.depth[both], expected.depth[both], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.usefixtures("without_early_stop")

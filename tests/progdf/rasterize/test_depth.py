@@ -1,0 +1,80 @@
+"""Rendered depth: what it is, that it has the picture's own weights, and that both engines agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.rasterize import ENGINES, rasterize
+from progdf.rasterize.depth import render_depth
+from tests.helpers.drawn import CASES
+from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+
+def _wall(z: float, opacity: float) -> Gaussians:
+    """A Gaussian so broad that it covers the whole picture evenly."""
+    return one_gaussian(
+        mean=(0.0, 0.0, z), scales=(1e3, 1e3, 1e-3), quat=(1.0, 0.0, 0.0, 0.0), opacity=opacity
+    )
+
+
+def _transmittance(scene: Gaussians, camera: Camera, engine: str) -> torch.Tensor:
+    return rasterize(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, camera.viewmat, camera.K,
+        camera.width, camera.height, sh_degree=scene.sh_degree, antialiased=scene.antialiased, engine=engine,
+    )[1]  # fmt: skip
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_depth_is_the_mean_of_what_a_pixel_shows_by_what_each_contributes(engine: str) -> None:
+    camera = front_camera()
+    found = render_depth(concatenate(_wall(5.0, 0.8), _wall(2.0, 0.5)), camera, engine)
+    near, far = 0.5, 0.5 * 0.8
+    expected = (near * 2.0 + far * 5.0) / (near + far)
+    torch.testing.assert_close(found.depth, torch.full_like(found.depth, expected), rtol=1e-5, atol=0)
+    torch.testing.assert_close(found.alpha, torch.full_like(found.alpha, near + far), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_both_engines_draw_the_same_depth_of_each_hard_case(name: str) -> None:
+    case = CASES[name]
+    found, expected = (render_depth(case.gaussians, case.camera, engine) for engine in ("cpu", "reference"))
+    assert bool(found.depth.isfinite().all())
+    torch.testing.assert_close(found.depth, expected.depth, rtol=2e-5, atol=1e-6)
+    torch.testing.assert_close(found.alpha, expected.alpha, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_depth_is_drawn_exactly_where_the_picture_is(name: str) -> None:
+    case = CASES[name]
+    if case.gaussians.sh_degree > 3:
+        pytest.skip("the picture takes three bands")
+    alpha = 1.0 - _transmittance(case.gaussians, case.camera, "cpu")
+    torch.testing.assert_close(render_depth(case.gaussians, case.camera).alpha, alpha, rtol=0, atol=1e-5)
+
+
+def test_the_depth_of_a_crop_is_that_of_the_picture() -> None:
+    scene, camera = random_gaussians(300, seed=4, sh_degree=1), orbit_camera(90, 60)
+    whole, part = render_depth(scene, camera), render_depth(scene, camera, crop=(20, 10, 71, 43))
+    assert torch.equal(part.depth, whole.depth[10:43, 20:71])
+    assert torch.equal(part.alpha, whole.alpha[10:43, 20:71])
+
+
+def test_a_scene_that_moves_away_gets_deeper_by_as_much_and_its_gradient_says_so() -> None:
+    camera = front_camera()
+    scene = one_gaussian()
+    means = scene.means.clone().requires_grad_()
+    found = render_depth(replace(scene, means=means), camera)
+    inside = found.alpha > 0
+    assert bool(inside.any())
+    assert not bool(inside.all())
+    torch.testing.assert_close(found.depth[inside], torch.full_like(found.depth[inside], 2.0))
+    assert not bool(found.depth[~inside].any())
+    (by_means,) = torch.autograd.grad(found.depth[inside].mean(), means)
+    assert float(by_means[0, 2]) == pytest.approx(1.0, rel=1e-4)
