@@ -129,13 +129,13 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
 
 
 def peek_trajectory(path: Path) -> tuple[Tensor, Tensor]:
-    """Slider values [S] and members [M] of a file, without its recordings: enough to tell whose they are.
+    """The end [M,C] and the members [M] of a file, without its recordings: enough to tell whose they are.
 
     Raises:
         ProgdfError: see `load_trajectory`.
     """
-    tensors, _ = _read(path, ("s", "members"))
-    return tensors["s"], tensors["members"]
+    tensors, _ = _read(path, ("end", "members"))
+    return tensors["end"], tensors["members"]
 
 
 def recorded_field(trajectory: Trajectory) -> BakedField:

@@ -22,7 +22,6 @@ from progdf.field.trajectory import load_trajectory
 from tests.helpers.paths import ROOT
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.trained import write_bear
-from trainer.optimize.retime import undo_retiming
 from trainer.pipeline.run import train
 from trainer.store.run_folder import RunFolder
 from trainer.store.state import PeriodicSave
@@ -99,10 +98,8 @@ def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
 
 
 def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a trajectory, without the slider that a finished run laid over it."""
-    trajectory, extra, about = load_trajectory(path)
-    made = undo_retiming(trajectory, extra)
-    extra.pop("s_before_fit", None)
+    """Tensors and header of a trajectory."""
+    made, extra, about = load_trajectory(path)
     return {**extra, "s": made.s, "offsets": made.offsets, "end": made.end, "steps": made.steps}, about
 
 

@@ -6,19 +6,17 @@ equally, over the whole slider or between two stages that are pinned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from progdf.field.remap import SliderRemap, interpolate
-from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
+from progdf.field.remap import interpolate
+from progdf.field.trajectory import Trajectory
 from trainer.options import Slider
 
-_BEFORE = "s_before_fit"
 _LEAST_GAP = 1e-4  # slider values of neighbouring recordings stay apart by this
 
 
@@ -142,31 +140,6 @@ def select_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory
         steps=trajectory.steps[rows],
         stage_ends=tuple(kept.index(end) for end in trajectory.stage_ends),
     )
-
-
-def undo_retiming(trajectory: Trajectory, extra: Mapping[str, Tensor]) -> Trajectory:
-    """A trajectory read from its file, as it was before `retime_recording` moved it.
-
-    Raises:
-        ValueError: that slider does not fit the recordings.
-    """
-    s = extra.get(_BEFORE, trajectory.s)
-    fits = s.shape == trajectory.s.shape and s.dtype == trajectory.s.dtype
-    if not fits or (float(s[0]), float(s[-1])) != (0.0, 1.0) or not bool((s.diff() > 0).all()):
-        raise ValueError(f"{_BEFORE} does not fit its recordings")
-    return replace(trajectory, s=s)
-
-
-def retime_recording(path: Path, remap: SliderRemap) -> Trajectory:
-    """Move the recordings in a trajectory's file to where the fitted field shows them, so that one can be
-    held against the other; and keep where they were, from which the next field is fitted.
-    """
-    trajectory, extra, about = load_trajectory(path)
-    before = undo_retiming(trajectory, extra)
-    moved = replace(before, s=remap(before.s).float())
-    if not torch.equal(moved.s, trajectory.s):
-        save_trajectory(path, moved, {**extra, _BEFORE: before.s}, about)
-    return moved
 
 
 def _chords(pictures: Sequence[Tensor]) -> Tensor:

@@ -23,7 +23,6 @@ from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibilit
 from trainer.fit.network import fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
-from trainer.optimize.retime import retime_recording
 from trainer.optimize.settings import resolve_slider
 from trainer.options import TrainOptions
 from trainer.plan import Plan
@@ -48,7 +47,7 @@ class RunResult:
         folder: the run's folder
         gdf: path of the .gdf file
         report: what report.json holds
-        trajectory: the recorded trajectory
+        trajectory: what was recorded, at the slider values where the field shows it
     """
 
     folder: RunFolder
@@ -72,7 +71,7 @@ def finish_run(
     Args:
         folder: of the run
         setup: scene, region, views
-        trajectory: what was recorded, as it was before a fit
+        trajectory: what was recorded
         about: what the trajectory's file says of the run; the report repeats it
         perceptual: distance of pictures
         log: of the run
@@ -109,7 +108,7 @@ def finish_run(
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, setup, log)
-        laid = retime_recording(folder.trajectory, remap)
+        shown = replace(trajectory, s=remap(trajectory.s).float())
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
@@ -139,9 +138,9 @@ def finish_run(
         "trajectory": {
             "recordings": len(trajectory),
             "slider": slider,
-            "s": [round(float(s), 4) for s in laid.s],
+            "s": [round(float(s), 4) for s in shown.s],
             "stages": list(trajectory.strengths),
-            "stages_at": [round(s, 4) for s, _ in laid.asked],
+            "stages_at": [round(s, 4) for s, _ in shown.asked],
             "attribute_worth_db": about["attribute_worth_db"],
         },
         "objective": about["objective"],
@@ -173,7 +172,7 @@ def finish_run(
         )
     )
     log.say(f"wrote {folder.gdf(plan.name)}")
-    return RunResult(folder, folder.gdf(plan.name), report, laid)
+    return RunResult(folder, folder.gdf(plan.name), report, shown)
 
 
 def load_evaluator(
@@ -221,11 +220,11 @@ def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
 def load_result(folder: RunFolder, options: TrainOptions, scene: Gaussians, log: RunLog) -> RunResult:
     """The result of a run that is finished."""
     path = folder.gdf(options.name)
-    load_gdf(path, scene)
+    gdf = load_gdf(path, scene)
     trajectory, _, _ = load_trajectory(folder.trajectory)
     log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
     try:
         report = typed(decode_json(folder.report.read_bytes()), dict[str, Any])
     except ValueError as error:
         raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
-    return RunResult(folder, path, report, trajectory)
+    return RunResult(folder, path, report, replace(trajectory, s=torch.tensor(gdf.field.recorded)))

@@ -19,7 +19,6 @@ from progdf.io.cameras import load_cameras
 from progdf.io.json_values import typed
 from progdf.region import Region
 from trainer.editors.base import EditKind
-from trainer.optimize.retime import undo_retiming
 from trainer.option_checks import checked_name
 from trainer.options import TrainOptions
 from trainer.setup.training_setup import TrainingSetup
@@ -35,7 +34,7 @@ class FinishedRun:
         folder: its folder
         scene: the original
         region: what was edited
-        trajectory: what was recorded, on its own slider
+        trajectory: what was recorded
         about: what the trajectory's file tells of the run: options, losses, …
     """
 
@@ -97,7 +96,6 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
                 f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
                 "give that one with --scene"
             )
-        trajectory = undo_retiming(trajectory, extra)
         region = Region(name, members, score)
         if len(region) != trajectory.end.shape[0]:
             raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")

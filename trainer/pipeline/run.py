@@ -24,7 +24,6 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.own_path import choose_path
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.retime import undo_retiming
 from trainer.optimize.settings import idle_options, objective_line, resolve_slider, stage_count
 from trainer.optimize.unseen import unseen_members_of
 from trainer.option_checks import plain_options, resolve_options
@@ -139,8 +138,7 @@ def _run_training(
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
-    trajectory, extra, about = load_trajectory(folder.trajectory)
-    trajectory = undo_retiming(trajectory, extra)
+    trajectory, _, about = load_trajectory(folder.trajectory)
     begun = folder.state.load(NETWORK)
     return finish_run(folder, setup, trajectory, about, perceptual, log, make_plan(options), begun)
 

@@ -41,27 +41,29 @@ def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
     if not beside.is_file():
         return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
     try:
-        s, members = peek_trajectory(beside)
+        end, members = peek_trajectory(beside)
     except ProgdfError as error:
         return RecordingFile(reason=str(error))
-    same_way = torch.equal(s, torch.tensor(gdf.field.recorded, dtype=s.dtype))
-    if not same_way or not torch.equal(members, gdf.region.members):
+    field = gdf.field
+    same_end = torch.equal(end, field.offsets(1.0)) if field.attributes else not bool(end.any())
+    if not same_end or not torch.equal(members, gdf.region.members):
         return RecordingFile(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
     return RecordingFile(beside)
 
 
 def load_recorded(gdf: Gdf, recording: RecordingFile) -> Gdf:
-    """The edit with its recording as the field; as it is where there is none.
+    """The edit with its recording, where the field shows it, as the field; as it is where there is none.
 
     Raises:
         ProgdfError: the file is gone or damaged.
     """
     if recording.path is None:
         return gdf
-    field = recorded_field(load_trajectory(recording.path)[0])
-    if field.attributes and field.members != len(gdf.region):
+    trajectory, s = load_trajectory(recording.path)[0], torch.tensor(gdf.field.recorded, dtype=torch.float32)
+    ascends = len(s) > 1 and float(s[0]) == 0.0 and float(s[-1]) == 1.0 and bool((s.diff() > 0).all())
+    if trajectory.end.shape[0] != len(gdf.region) or len(trajectory) != len(s) or not ascends:
         raise ProgdfError(f"{recording.path} belongs to another edit; train again")
-    return replace(gdf, field=field)
+    return replace(gdf, field=recorded_field(replace(trajectory, s=s)))
 
 
 def obstacle(recordings: Sequence[RecordingFile]) -> str:

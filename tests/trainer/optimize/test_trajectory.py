@@ -162,8 +162,8 @@ def test_whose_recording_it_is_can_be_told_without_reading_the_recordings(tmp_pa
     trajectory = along([0.3, 1.0])
     extra = {"members": torch.tensor([3, 5, 8])}
     save_trajectory(tmp_path / "trajectory.safetensors", trajectory, extra, {})
-    s, members = peek_trajectory(tmp_path / "trajectory.safetensors")
-    assert torch.equal(s, trajectory.s)
+    end, members = peek_trajectory(tmp_path / "trajectory.safetensors")
+    assert torch.equal(end, trajectory.end)
     assert torch.equal(members, extra["members"])
 
 

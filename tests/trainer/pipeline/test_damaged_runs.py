@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from torch import Tensor
 
 from progdf.field.trajectory import load_trajectory, save_trajectory
@@ -30,10 +29,6 @@ CHANGES: dict[str, Change] = {
     "no editor": lambda about, _: about["options"].pop("editor"),
     "an option of another type": lambda about, _: about["options"].update(target_psnr=[1]),
     "an unknown kind": lambda about, _: about.update(kind="else"),
-    "an earlier slider of one number": lambda _, extra: extra.update(s_before_fit=torch.zeros(())),
-    "an earlier slider that stands": lambda _, extra: extra.update(
-        s_before_fit=torch.zeros_like(extra["s_before_fit"])
-    ),
 }
 
 
@@ -55,7 +50,6 @@ def test_what_a_trajectory_tells_is_checked_before_it_is_used(
     path = tmp_path / "run" / "trajectory.safetensors"
     trajectory, extra, about = load_trajectory(path)
     about = json.loads(json.dumps(about))
-    extra.setdefault("s_before_fit", trajectory.s)
     save_trajectory(path, trajectory, extra, about)
     reopen_run(tmp_path / "run")
     change(about, extra)

@@ -254,7 +254,25 @@ def test_a_recording_that_does_not_fit_its_edit_is_one_line(runs: list[Path]) ->
     extra = {"members": scarf.region.members}
     save_trajectory(runs[1].with_name(FILE_NAME), recording_of(ears), extra, {})
     with pytest.raises(ProgdfError, match="belongs to another edit"):
-        recordings.load_recorded(scarf, recordings.find_recording(scarf, runs[1]))
+        recordings.load_recorded(scarf, RecordingFile(runs[1].with_name(FILE_NAME)))
+
+
+def test_another_recording_of_the_same_members_is_not_taken_for_this_ones(runs: list[Path]) -> None:
+    scarf = bear().gdfs[0]
+    other = recording_of(scarf)
+    extra = {"members": scarf.region.members}
+    save_trajectory(runs[1].with_name(FILE_NAME), replace(other, end=other.end + 1e-6), extra, {})
+    assert "belongs to another edit" in recordings.find_recording(scarf, runs[1]).reason
+
+
+def test_a_recording_is_shown_where_the_field_shows_it(runs: list[Path]) -> None:
+    scarf = bear().gdfs[0]
+    recorded = recording_of(scarf)
+    extra = {"members": scarf.region.members, "score": scarf.region.score}
+    early = replace(recorded, s=recorded.s.square())
+    save_trajectory(runs[1].with_name(FILE_NAME), early, extra, {})
+    found = recordings.load_recorded(scarf, recordings.find_recording(scarf, runs[1]))
+    assert found.field.knots.tolist() == recorded.s.tolist()
 
 
 def test_against_the_recording_goes_on_with_a_split_and_back_to_the_original() -> None:
