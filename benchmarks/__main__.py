@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from progdf.__main__ import guarded
-from progdf.cli.options import parsed
+from progdf.__main__ import run_guarded
+from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the named benchmarks, or the ablation. Raises ProgdfError for a name that does not exist."""
     if list(argv[:1]) == ["ablate"]:
         return ablate(argv[1:])
-    options = parsed(Options, argv, COMMAND)
+    options = parse_options(Options, argv, COMMAND)
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate'))}")
@@ -123,10 +123,10 @@ def ablate(argv: Sequence[str]) -> int:
     from .ablation.options import AblateOptions
     from .ablation.table import print_table
 
-    done = run(parsed(AblateOptions, argv, f"{COMMAND} ablate"))
+    done = run(parse_options(AblateOptions, argv, f"{COMMAND} ablate"))
     print_table(done.outcomes, done.title, done.perceptual)
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(guarded(main, sys.argv[1:]))
+    raise SystemExit(run_guarded(main, sys.argv[1:]))

@@ -49,7 +49,7 @@ def tables(recorded: Sequence[KnownCourse] = (), plot: Path | None = None) -> li
     """
     scene = bear(BEAR)
     edits = bear_edits(scene)
-    cameras = [camera.resized(SIDE, SIDE) for camera in scene.cameras]
+    cameras = [camera.resize(SIDE, SIDE) for camera in scene.cameras]
     known = [known_course(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS) for name in EDITS]
     courses = [*known, *recorded]
     forms = [form for course in courses for form in (*baked_forms(course), *network_forms(course))]

@@ -11,7 +11,7 @@ import torch
 from progdf.field import BakedField, choose_field, fit_keyframes
 from progdf.field.choose import separable_within
 from progdf.field.keyframes import bending_snapshots
-from progdf.field.rendered import picture_gram, rendered_trajectories
+from progdf.field.rendered import picture_gram, render_trajectories
 from progdf.field.separable import channel_weights
 
 from .courses import KnownCourse, edit_of, step_ms
@@ -90,7 +90,7 @@ def baked_forms(course: KnownCourse) -> list[Form]:
             looked,
         )  # fmt: skip
     begin = time.perf_counter()
-    courses = rendered_trajectories(offsets, channel_weights(weights, *offsets.shape[1:]), course.look)
+    courses = render_trajectories(offsets, channel_weights(weights, *offsets.shape[1:]), course.look)
     straightened = time.perf_counter() - begin
     for count in COUNTS:
         for between in ("linear", "cubic"):

@@ -38,7 +38,7 @@ def network_forms(course: KnownCourse) -> list[Form]:
         settings = replace(given, steps=STEPS)
         network = fit_neural(course.strengths, course.offsets, before, settings, course.weights, course.look)
         seconds = time.perf_counter() - begin
-        bound = network.bound(before)
+        bound = network.bind(before)
         curve = course.judge.curve(bound)
         at = course.worst_at_snapshots(bound)
         found.append(_form(course, network, label, curve, at, seconds))
@@ -55,7 +55,7 @@ def _form(
     at: float | None,
     seconds: float | None,
 ) -> Form:
-    bound = network.bound(pack(course.scene[course.members]))
+    bound = network.bind(pack(course.scene[course.members]))
     before = torch.get_num_threads()
     asked = []
     try:

@@ -14,7 +14,7 @@ from progdf.field.separable import (
     fit_amplitude,
     moving_attributes,
     principal_modes,
-    stored_bases,
+    quantize_bases,
 )
 
 
@@ -57,7 +57,7 @@ def fit_joint(
     attributes = {}
     for name, course in courses.items():
         exact = (mix.T.float() @ course.residual.flatten(1)).reshape(-1, *course.offsets.shape[1:])
-        rest, step = stored_bases(exact, torch.int8)
+        rest, step = quantize_bases(exact, torch.int8)
         coefficients = torch.cat([course.amplitude[:, None], table.float()], dim=1)
         coefficients[[0, -1]] = 0.0
         coefficients[-1, 0] = 1.0

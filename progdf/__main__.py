@@ -21,7 +21,7 @@ from progdf.io.atomic import atomic_write, disk_full
 from progdf.io.user_folders import state_folder
 
 from .errors import ProgdfError
-from .terminal import PrintableFormatter, printable
+from .terminal import PrintableFormatter, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.pipeline.demo:main", "make a scene, train its edits, write previews, open the window"),
@@ -45,11 +45,11 @@ def _usage() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status, see `guarded`."""
-    return guarded(_run, list(sys.argv[1:] if argv is None else argv))
+    """Run one command and return its exit status, see `run_guarded`."""
+    return run_guarded(_run, list(sys.argv[1:] if argv is None else argv))
 
 
-def guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> int:
+def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> int:
     """Run a command line with what goes wrong told in one line.
 
     Returns:
@@ -59,29 +59,29 @@ def guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> in
     if logging.lastResort is not None:  # prints warnings where no program has said otherwise
         logging.lastResort.setFormatter(PrintableFormatter())
     try:
-        with _signals_end(list(arguments[:1]) != ["view"]):
+        with _raise_on_signals(list(arguments[:1]) != ["view"]):
             status = run(arguments)
             if sys.stdout is not None:
                 sys.stdout.flush()  # here, where a full disk or a closed pipe can still be told
             return status
     except ProgdfError as error:
-        return _failed(str(error))
+        return _report_failure(str(error))
     except BrokenPipeError:  # `progdf info … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         right = "; the disk takes no more, free some space" if disk_full(error) else ""
-        return _failed(f"{where}{error.strerror or error}{right}")
+        return _report_failure(f"{where}{error.strerror or error}{right}")
     except KeyboardInterrupt as interrupt:
-        return _failed(f"interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", 130)
+        return _report_failure(f"interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", 130)
     except Exception as error:
-        if _out_of_memory(error):
-            return _failed(
+        if _is_out_of_memory(error):
+            return _report_failure(
                 "this takes more memory than there is; close other programs, or take a smaller scene"
             )
         told = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        return _failed(f"a mistake in progdf itself ({told[:200]}); {_kept_details()}", 70)
+        return _report_failure(f"a mistake in progdf itself ({told[:200]}); {_save_traceback()}", 70)
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -99,18 +99,18 @@ def _run(arguments: Sequence[str]) -> int:
     return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
 
 
-def _failed(line: str, status: int = 2) -> int:
-    print(f"progdf: {printable(' '.join(line.split()))}", file=sys.stderr)
+def _report_failure(line: str, status: int = 2) -> int:
+    print(f"progdf: {escape_text(' '.join(line.split()))}", file=sys.stderr)
     return status
 
 
-def _out_of_memory(error: Exception) -> bool:
+def _is_out_of_memory(error: Exception) -> bool:
     """torch raises a RuntimeError of its allocator's."""
     told = str(error) if isinstance(error, RuntimeError) else ""
     return isinstance(error, MemoryError) or "allocate memory" in told or "not enough memory" in told
 
 
-def _kept_details() -> str:
+def _save_traceback() -> str:
     """Where the traceback of the present exception was written."""
     details = f"progdf {' '.join(map(repr, sys.argv[1:]))}\n\n{traceback.format_exc()}"
     for folder in (state_folder(), Path(tempfile.gettempdir())):
@@ -126,7 +126,7 @@ def _kept_details() -> str:
 
 
 @contextmanager
-def _signals_end(wanted: bool) -> Iterator[None]:
+def _raise_on_signals(wanted: bool) -> Iterator[None]:
     """SIGTERM and a closed terminal end a command as Ctrl-C does: temporary files go, a run tells the way on.
 
     Args:

@@ -61,7 +61,7 @@ class Camera:
         """The camera's centre in world units. [3]"""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resize(self, width: int, height: int) -> Camera:
         """The same view in another image size; the intrinsics scale with each axis."""
         scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=self.K.dtype)
         return replace(self, K=self.K * scale, width=width, height=height)

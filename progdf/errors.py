@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .terminal import printable
+from .terminal import escape_text
 
 
 class ProgdfError(ValueError):
@@ -13,4 +13,4 @@ class ProgdfError(ValueError):
     """
 
     def __str__(self) -> str:
-        return printable(" ".join(super().__str__().split()))
+        return escape_text(" ".join(super().__str__().split()))

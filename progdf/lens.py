@@ -43,7 +43,7 @@ class Lens:
         """Whether it bends anything."""
         return any(astuple(self))
 
-    def distorted(self, rays: Tensor) -> Tensor:
+    def distort(self, rays: Tensor) -> Tensor:
         """Where rays through (x, y) at z = 1 meet the sensor, in the same units. [...,2] -> [...,2]"""
         x, y = rays[..., 0], rays[..., 1]
         square = x * x + y * y
@@ -64,7 +64,7 @@ class Lens:
         return math.inf if not len(folded) else float(r[max(0, int(folded[0]) - 1)])
 
 
-def straightened(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
+def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
     """A photograph as a pinhole with the same intrinsics would have taken it, sampled bilinearly.
 
     Args:
@@ -85,7 +85,7 @@ def straightened(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Ten
         indexing="ij",
     )
     rays = (torch.stack([columns, rows], dim=-1) - middle) / focal
-    pixels = lens.distorted(rays) * focal + middle
+    pixels = lens.distort(rays) * focal + middle
     size = torch.tensor([width, height], dtype=torch.float64)
     shown = ((pixels >= 0) & (pixels <= size)).all(dim=-1) & (rays.norm(dim=-1) < lens.valid_radius())
     grid = (2 * pixels / size - 1).float()

@@ -49,7 +49,7 @@ def from_mask(name: str, mask: Tensor) -> Region:
     return Region(name, mask.nonzero()[:, 0], mask.float())
 
 
-def everything(scene: Gaussians) -> Region:
+def whole_scene(scene: Gaussians) -> Region:
     """All Gaussians of the scene."""
     return from_mask("all", torch.ones(len(scene), dtype=torch.bool))
 
@@ -77,7 +77,7 @@ def union(a: Region, b: Region, name: str = "") -> Region:
     return Region(name or f"{a.name}+{b.name}", members, torch.maximum(a.score, b.score))
 
 
-def without(a: Region, b: Region, name: str = "") -> Region:
+def difference(a: Region, b: Region, name: str = "") -> Region:
     """Members of `a` that are not members of `b`; the score of `a`, at most what `b` leaves."""
     _same_scene(a, b)
     members = a.members[~torch.isin(a.members, b.members)]

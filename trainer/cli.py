@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from progdf.cli.options import parsed
+from progdf.cli.options import parse_options
 from trainer.regions.options import RegionOptions, ViewsOptions, join_negative_values
 
 from .options import FitOptions, TrainOptions
@@ -22,7 +22,7 @@ def train(argv: Sequence[str]) -> int:
 
 def fit(argv: Sequence[str]) -> int:
     """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
-    options = parsed(FitOptions, argv, "progdf fit")
+    options = parse_options(FitOptions, argv, "progdf fit")
     from trainer.pipeline.refit import refit
 
     refit(options)
@@ -31,15 +31,15 @@ def fit(argv: Sequence[str]) -> int:
 
 def train_options(argv: Sequence[str]) -> TrainOptions:
     """What a command line asks for: what it says itself, then its preset, then the defaults."""
-    options = parsed(TrainOptions, argv, "progdf train")
+    options = parse_options(TrainOptions, argv, "progdf train")
     if options.preset == "default":
         return options
-    return parsed(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
+    return parse_options(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
 
 
 def region(argv: Sequence[str]) -> int:
     """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
-    options = parsed(RegionOptions, join_negative_values(argv), "progdf region")
+    options = parse_options(RegionOptions, join_negative_values(argv), "progdf region")
     from trainer.regions.command import show
 
     print(show(options))
@@ -48,7 +48,7 @@ def region(argv: Sequence[str]) -> int:
 
 def views(argv: Sequence[str]) -> int:
     """Run `progdf views`; 0 when they are written. Raises ProgdfError for what the user can mend."""
-    options = parsed(ViewsOptions, argv, "progdf views")
+    options = parse_options(ViewsOptions, argv, "progdf views")
     from trainer.regions.originals import write
 
     print(write(options))

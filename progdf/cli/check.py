@@ -13,9 +13,9 @@ from progdf.formats.scene_file import load_scene_with_report
 from progdf.io.cameras import load_cameras
 from progdf.scene.stats import survey
 from progdf.scene.up_axis import UpChoice, find_up
-from progdf.terminal import say
+from progdf.terminal import print_line
 
-from .options import parsed
+from .options import parse_options
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
-    options = parsed(Options, argv, "progdf check")
+    options = parse_options(Options, argv, "progdf check")
     scene, report = load_scene_with_report(options.scene)
     cameras = [] if options.cameras is None else load_cameras(options.cameras)
     up = find_up(scene, cameras, options.up)
     for line in report.lines() + survey(scene, up).lines():
-        say(line)
+        print_line(line)
     return 0

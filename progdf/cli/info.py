@@ -12,17 +12,17 @@ import msgspec
 import tyro
 
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import counted, file_size, grouped
+from progdf.formats.load_report import file_size, format_count, group_digits
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gdf.header import GdfHead, read_head
 from progdf.io import session as session_file
-from progdf.io.atomic import check_regular, open_failure
+from progdf.io.atomic import check_regular, open_error
 from progdf.io.cameras import load_cameras
-from progdf.io.json_values import decode_json, typed
+from progdf.io.json_values import convert_json, decode_json
 from progdf.scene.stats import survey
-from progdf.terminal import say
+from progdf.terminal import print_line
 
-from .options import parsed
+from .options import parse_options
 
 TIMELINE_MARK = "progdf_timeline"
 """The first key of every timeline file of the window, by which its kind is told."""
@@ -41,9 +41,9 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
-    path = parsed(Options, argv, "progdf info").file
+    path = parse_options(Options, argv, "progdf info").file
     for line in describe(path):
-        say(line)
+        print_line(line)
     return 0
 
 
@@ -64,7 +64,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         with path.open("rb") as file:
             start = file.read(64)
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "gdf"
     if scene_format(path) is not None:
@@ -92,14 +92,14 @@ def _edit_lines(path: Path) -> Iterator[str]:
     yield f"{path.name}: the edit '{gdf.name}', {file_size(gdf.size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
-    yield f"scene: {counted(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-    yield f"region: {gdf.region}, {counted(members)} ({members / max(1, count):.1%})"
-    yield f"field: {gdf.field.kind}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_form(gdf)}"
+    yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
+    yield f"region: {gdf.region}, {format_count(members)} ({members / max(1, count):.1%})"
+    yield f"field: {gdf.field.kind}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_describe_field(gdf)}"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
         given = {name: value for name, value in content.items() if head == "report" or value is not None}
-        for name, value in _flat(given):
+        for name, value in _flatten(given):
             yield f"{head}: {name} {value}"
 
 
@@ -115,17 +115,18 @@ def _session_lines(path: Path) -> Iterator[str]:
     for layer in layers if isinstance(layers, list) else ():
         if isinstance(layer, dict):
             hidden = "" if layer.get("enabled", True) else ", hidden"
-            yield f"layer: {_shown(layer.get('name'))} at {_shown(layer.get('strength', 0.0))}{hidden}"
+            strength = _short_text(layer.get("strength", 0.0))
+            yield f"layer: {_short_text(layer.get('name'))} at {strength}{hidden}"
     yield f"snapshots: {len(session.snapshots)}"
 
 
 def _timeline_lines(path: Path) -> Iterator[str]:
     try:
-        keys = [key.frame for key in typed(decode_json(path.read_bytes()), _Timeline).keys]
+        keys = [key.frame for key in convert_json(decode_json(path.read_bytes()), _Timeline).keys]
     except ValueError:
         raise ProgdfError(f"{path} is a damaged timeline; save it anew with Ctrl+K in the window") from None
-    yield f"{path.name}: a timeline of the window, {counted(len(keys), 'key')}"
-    yield f"keys at frames: {_shown(keys)}"
+    yield f"{path.name}: a timeline of the window, {format_count(len(keys), 'key')}"
+    yield f"keys at frames: {_short_text(keys)}"
 
 
 class _Key(msgspec.Struct):
@@ -136,7 +137,7 @@ class _Timeline(msgspec.Struct):
     keys: list[_Key] = []
 
 
-def _form(gdf: GdfHead) -> str:
+def _describe_field(gdf: GdfHead) -> str:
     """What a field is made of."""
     # the first is the offset at strength 1 as it was recorded, see `AttributeBases.end_offset`
     bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
@@ -145,14 +146,14 @@ def _form(gdf: GdfHead) -> str:
         return f"{gdf.knots} knots; bases: {bases or 'none, nothing moves'}"
     error = ", ".join(f"{name} {value:.4g}" for name, value in network.bake_error.items())
     return (
-        f"{grouped(gdf.parameters)} numbers in {network.shape.layers} layers of "
+        f"{group_digits(gdf.parameters)} numbers in {network.shape.layers} layers of "
         f"{network.shape.width}; baked at {gdf.knots} knots with bases: {bases}; baking costs: {error}"
     )
 
 
 def _camera_lines(path: Path) -> Iterator[str]:
     cameras = load_cameras(path)
-    yield f"{path.name}: {counted(len(cameras), 'camera')}"
+    yield f"{path.name}: {format_count(len(cameras), 'camera')}"
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""
     yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
@@ -167,18 +168,18 @@ _DESCRIBE = {
 }
 
 
-def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+def _flatten(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
     """("field.psnr_worst", "46.9") … of a nested JSON table; long lists are counted, not shown."""
     for name, value in table.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{above}{name}.")
+            yield from _flatten(value, f"{above}{name}.")
         elif isinstance(value, list) and len(value) > 8:
-            yield f"{above}{name}", f"{grouped(len(value))} values"
+            yield f"{above}{name}", f"{group_digits(len(value))} values"
         else:
-            yield f"{above}{name}", _shown(value)
+            yield f"{above}{name}", _short_text(value)
 
 
-def _shown(value: object) -> str:
+def _short_text(value: object) -> str:
     if value is None:
         return "not measured"
     if isinstance(value, bool):
@@ -186,5 +187,5 @@ def _shown(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):
-        return ", ".join(_shown(entry) for entry in value) or "none"
+        return ", ".join(_short_text(entry) for entry in value) or "none"
     return " ".join(str(value).split())

@@ -15,7 +15,7 @@ from progdf.errors import ProgdfError
 _Options = TypeVar("_Options")
 
 
-def parsed(
+def parse_options(
     kind: type[_Options], argv: Sequence[str], command: str, default: _Options | None = None
 ) -> _Options:
     """Options from the command line; `--help` prints and exits.
@@ -30,7 +30,7 @@ def parsed(
         ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
     """
     said = io.StringIO()
-    argv = _with_axes_joined(argv)
+    argv = _join_axes(argv)
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
@@ -39,10 +39,10 @@ def parsed(
     except SystemExit as leaving:
         if not leaving.code:
             raise
-        raise ProgdfError(f"{_first_words(said.getvalue())}; see {command} --help") from None
+        raise ProgdfError(f"{_short_message(said.getvalue())}; see {command} --help") from None
 
 
-def _with_axes_joined(argv: Sequence[str]) -> list[str]:
+def _join_axes(argv: Sequence[str]) -> list[str]:
     """`--up -y` as `--up=-y`: what begins with a minus would be taken for an option."""
     found: list[str] = []
     for argument in argv:
@@ -53,7 +53,7 @@ def _with_axes_joined(argv: Sequence[str]) -> list[str]:
     return found
 
 
-def _first_words(box: str) -> str:
+def _short_message(box: str) -> str:
     """What tyro's framed message says, without the frame and the advice below the rule."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", box)
     lines = [line.strip("│ \t").strip() for line in text.splitlines()]

@@ -19,14 +19,14 @@ from scipy.spatial import cKDTree
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, BakedField
-from progdf.formats.scene_file import load_scene, scene_name, turned_about_x
+from progdf.formats.scene_file import load_scene, rotate_about_x, scene_name
 from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
-from progdf.terminal import say
+from progdf.terminal import print_line
 
-from .options import parsed
+from .options import parse_options
 
 _CANDIDATES = 8
 _LEAST_MATCHED = 0.9
@@ -75,26 +75,26 @@ class Match:
 
 def main(argv: Sequence[str]) -> int:
     """Write the edit for the other file. Raises ProgdfError where the two scenes are not the same."""
-    options = parsed(Options, argv, "progdf rebind")
+    options = parse_options(Options, argv, "progdf rebind")
     if options.out.suffix.lower() != ".gdf":
         raise ProgdfError(f"{options.out} is not a .gdf file; give the edit a name that ends in .gdf")
     a, b = load_scene(options.source), load_scene(options.target)
     gdf = load_gdf(options.edit, a, scene_name(options.source))
     match = match_scenes(a, b)
-    say(
+    print_line(
         f"matched: {match.matched:.1%} of {scene_name(options.target)}, {match.once:.1%} one to one; "
         f"distance {match.median:.3g} (95 %: {match.p95:.3g}) of the median Gaussian's size"
     )
     if match.matched < _LEAST_MATCHED:
-        turned = match_scenes(a, turned_about_x(b)).matched >= _LEAST_MATCHED
+        turned = match_scenes(a, rotate_about_x(b)).matched >= _LEAST_MATCHED
         why = "is that scene after half a turn about x" if turned else "is another scene"
         raise ProgdfError(
             f"{options.target} {why}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
             f"{_LEAST_MATCHED:.0%} are needed; give the same scene"
         )
-    found = rebound(gdf, a, b, match)
+    found = rebind_edit(gdf, a, b, match)
     save_gdf(options.out, found)
-    say(f"wrote {options.out}: {len(found.region)} members, {len(gdf.region)} in the original")
+    print_line(f"wrote {options.out}: {len(found.region)} members, {len(gdf.region)} in the original")
     return 0
 
 
@@ -110,7 +110,7 @@ def match_scenes(a: Gaussians, b: Gaussians) -> Match:
     shape = np.abs(log_scales[0][candidates] - log_scales[1][:, None]).mean(axis=2)
     opacity = np.abs(a.opacities.numpy()[candidates] - b.opacities.numpy()[:, None])
     costs = (distances / typical) ** 2 + (color / _COLOR) ** 2 + shape**2 + (opacity / _COLOR) ** 2
-    chosen = _one_to_one(candidates, costs, len(a))
+    chosen = _assign_rows(candidates, costs, len(a))
     rows = np.take_along_axis(candidates, chosen[:, None], 1)[:, 0]
     apart = np.take_along_axis(distances, chosen[:, None], 1)[:, 0]
     near = apart <= np.maximum(sizes[rows], typical)
@@ -125,7 +125,7 @@ def match_scenes(a: Gaussians, b: Gaussians) -> Match:
     )
 
 
-def rebound(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
+def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     """The edit of A's members on the Gaussians of B that they are; a network is kept as it was baked."""
     members = gdf.region.members.numpy()
     if not len(members):
@@ -145,7 +145,7 @@ def rebound(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
             full = torch.where(flipped[:, None], -full, full)
             rest = torch.where(flipped[None, :, None], -rest, rest)
         elif name == "shN":
-            full, rest, step = (_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, rest, step))
+            full, rest, step = (_fit_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, rest, step))
         if full.shape[1]:
             attributes[name] = AttributeBases(full, rest, step, bases.coefficients)
     field = BakedField(
@@ -165,7 +165,7 @@ def rebound(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     )
 
 
-def _one_to_one(candidates: Rows, costs: NDArray[np.float64], count: int) -> Rows:
+def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Rows:
     """Which candidate each row of B takes: the cheapest that no other has more cheaply; where none is left,
     the cheapest. [N,k] -> [N]"""
     chosen = np.full(len(candidates), -1)
@@ -192,6 +192,6 @@ def _colors(scene: Gaussians) -> NDArray[np.float32]:
     return rgb
 
 
-def _bands(tensor: torch.Tensor, width: int) -> torch.Tensor:
+def _fit_bands(tensor: torch.Tensor, width: int) -> torch.Tensor:
     """Offsets of higher SH bands, cut or filled up with 0 to the other scene's. [...,c] -> [...,width]"""
     return torch.nn.functional.pad(tensor[..., :width], (0, max(0, width - tensor.shape[-1])))

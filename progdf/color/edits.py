@@ -14,7 +14,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 
 from .oklab import fit_gamut, hue_of, oklab_to_srgb, srgb_to_oklab
-from .path import STRAIGHT, ColorPath, Strength, bend_of, between
+from .path import STRAIGHT, ColorPath, Strength, bend_of, interpolate_colors
 
 _LEAST_CHROMA = 0.015  # of a target that has a hue
 _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
@@ -50,7 +50,7 @@ def recolor(
     reference: Tensor | None = None,
     path: ColorPath = "bowed",
 ) -> Tensor:
-    """Give a thing another colour and keep its shading: `recolored`, and `between` on the way there.
+    """Give a thing another colour and keep its shading: all of `recolor_fully`, or a part of the way there.
 
     Args:
         rgb: sRGB colours, 0..1; what lies outside (SH colours may) fades with the strength. [...,3]
@@ -59,19 +59,21 @@ def recolor(
         reference: the region's own colour, `typical_color` of `rgb` by default. [3]
         path: see `bend_of`
     """
-    own = _like(typical_color(rgb) if reference is None else reference, rgb)
-    return between(rgb, recolored(rgb, target, own), strength, bend_of(own, _like(target, rgb), path))
+    own = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
+    return interpolate_colors(
+        rgb, recolor_fully(rgb, target, own), strength, bend_of(own, _as_tensor(target, rgb), path)
+    )
 
 
-def recolored(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
+def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     """The finished `recolor`. [...,3] -> [...,3] 0..1
 
     Lightness is scaled so that `reference` becomes `target`; chroma follows the lightness; the hue is the
     target's, or stays where the target is too grey to have one. A dark source is lifted.
     """
-    lab, (new_l, new_a, new_b) = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_like(target, rgb))
+    lab, (new_l, new_a, new_b) = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
     new_c = torch.hypot(new_a, new_b)
-    ref_l = srgb_to_oklab(_like(reference, rgb))[0]
+    ref_l = srgb_to_oklab(_as_tensor(reference, rgb))[0]
     lightness = _relight(lab[..., 0], ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))
     # chroma in proportion to lightness is the same surface in less light; towards white the gamut narrows it
     chroma = new_c * (lightness / new_l.clamp_min(0.02)).clamp(0, 1)
@@ -91,13 +93,15 @@ def tint(
 
     See `recolor` for the arguments; here `reference` decides nothing but the bend.
     """
-    own = _like(typical_color(rgb) if reference is None else reference, rgb)
-    return between(rgb, tinted(rgb, target, share), strength, bend_of(own, _like(target, rgb), path))
+    own = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
+    return interpolate_colors(
+        rgb, tint_fully(rgb, target, share), strength, bend_of(own, _as_tensor(target, rgb), path)
+    )
 
 
-def tinted(rgb: Tensor, target: Tensor, share: float) -> Tensor:
+def tint_fully(rgb: Tensor, target: Tensor, share: float) -> Tensor:
     """The finished `tint`. [...,3] -> [...,3] 0..1"""
-    lab, goal = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_like(target, rgb))
+    lab, goal = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
     lightness = lab[..., :1]
     fade = torch.minimum(
         lightness / goal[0].clamp_min(0.02), (1 - lightness) / (1 - goal[0]).clamp_min(0.02)
@@ -116,8 +120,8 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
 
 def night(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
     """Moonlight: `darken`, with colours fading to a cool blue as they do in scarce light. [...,3]"""
-    blue = tinted(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75)
-    return darken(between(rgb, blue, strength, STRAIGHT), strength, stops)
+    blue = tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75)
+    return darken(interpolate_colors(rgb, blue, strength, STRAIGHT), strength, stops)
 
 
 def stripe_pattern(
@@ -164,7 +168,7 @@ def stripes(
     return recolor(rgb, target, torch.as_tensor(strength).to(pattern) * pattern, reference, path)
 
 
-def _like(color: Tensor, rgb: Tensor) -> Tensor:
+def _as_tensor(color: Tensor, rgb: Tensor) -> Tensor:
     return color.to(rgb).clamp(0, 1)
 
 

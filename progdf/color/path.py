@@ -70,7 +70,7 @@ def path_of(name: str) -> ColorPath:
     raise ProgdfError(f"unknown color path '{name}'; use one of {', '.join(get_args(ColorPath))}")
 
 
-def between(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:
+def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:
     """Colours on their way to others: straight in OKLab, bowed towards the hue circle.
 
     The bow grows with what both colours have of chroma: a grey's hue is noise, and turned it would shine in
@@ -90,11 +90,11 @@ def between(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:
     own = _rise(turn + math.pi, bend.whole, bend.none)
     chroma = torch.lerp(chroma_a, chroma_b, s)
 
-    def turned(angle: Tensor) -> Tensor:
+    def rotate(angle: Tensor) -> Tensor:
         hue = hue_of(a) + bend.direction * s * angle
         return torch.stack([chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1)
 
-    around = torch.lerp(turned(turn + 2 * math.pi), turned(turn), own[..., None])
+    around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), own[..., None])
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
     lab = torch.lerp(a, b, s[..., None])
     lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])

@@ -25,7 +25,7 @@ from progdf.rasterize.cpu.parallel import threads
 from .effects import Effects, changed_edits, changed_gains, effects_of
 from .kernel import compose_rows
 from .layers import KINDS, Layer, check_numbers, check_weights
-from .plan import Plan, between, flat_edits, flat_scene, plan_rows
+from .plan import RowPlan, find_segment, flatten_edits, flatten_scene, plan_rows
 
 WORTH_A_THREAD = 16_384
 """Rows below which a second thread costs more than it saves."""
@@ -71,8 +71,8 @@ class Composer:
         self._edited_rows = np.unique(np.concatenate([np.zeros(0, np.int64), *self._members]))
         self._names = tuple(n for n in ATTRIBUTES if any(n in gdf.field.attributes for gdf in gdfs))
         self._moving = [frozenset(gdf.field.attributes) for gdf in gdfs]
-        self._edits = flat_edits(scene, gdfs, self._names)
-        self._base, self._out, self._columns = flat_scene(scene, self._names, self._edited_rows)
+        self._edits = flatten_edits(scene, gdfs, self._names)
+        self._base, self._out, self._columns = flatten_scene(scene, self._names, self._edited_rows)
         tensors: dict[str, Any] = {}
         for name, (_, _, at) in zip(self._names, self._columns[:, :3].tolist(), strict=True):
             shape = getattr(scene, name).shape
@@ -80,7 +80,7 @@ class Composer:
         self.gaussians = replace(scene, **tensors)
         """The scene under the layers of the last update; its tensors are written in place by the next."""
         self._effects = Effects()
-        self._plans: dict[frozenset[int], Plan] = {}
+        self._plans: dict[frozenset[int], RowPlan] = {}
         self._choices: dict[tuple[int, ...], NDArray[np.int64]] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._weights: tuple[list[Tensor], list[int], NDArray[np.float32]] = ([], [], np.zeros(0, np.float32))
@@ -102,7 +102,7 @@ class Composer:
         """
         check_numbers(layers, blend)
         stack = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
-        weights_at = self._flat_weights(stack)
+        weights_at = self._weight_offsets(stack)
         before, self._effects = self._effects, effects_of(stack, blend)
         changed = changed_edits(before, self._effects)
         if not changed:
@@ -123,7 +123,7 @@ class Composer:
 
     def _rewrite(
         self,
-        plan: Plan,
+        plan: RowPlan,
         stack: Sequence[tuple[int, Layer]],
         weights_at: Sequence[int],
         chosen: tuple[int, ...],
@@ -131,10 +131,10 @@ class Composer:
     ) -> float:
         """Write these attributes of the plan's rows; the largest squared step of a centre."""
         edits = self._edits
-        layers, numbers, bounds = plan.stacked(tuple(edit for edit, _ in stack))
+        layers, numbers, bounds = plan.stack_edits(tuple(edit for edit, _ in stack))
         strengths = 0.0
         for i, (edit, layer) in enumerate(stack):
-            node, on_node, share = between(edits.nodes[edit], layer.strength)
+            node, on_node, share = find_segment(edits.nodes[edit], layer.strength)
             layers[i, 3:] = weights_at[i], node, on_node
             gains = layer.gains
             numbers[i] = share, layer.clamped_strength, gains.geometry, gains.opacity, gains.colour
@@ -144,7 +144,7 @@ class Composer:
         blocks = plan.blocks
         arguments = (
             self._base, self._out, plan.rows.view(np.uint64), plan.base_index, self._columns,
-            self._chosen(chosen), layers, numbers, bounds, plan.members, plan.row_index, edits.edits,
+            self._index_array(chosen), layers, numbers, bounds, plan.members, plan.row_index, edits.edits,
             edits.parts, edits.floats, edits.bytes_, edits.tables, self._weights[2], blend == "over",
             normalize,
         )  # fmt: skip
@@ -159,20 +159,20 @@ class Composer:
         mine = float(compose_rows(*arguments, cuts[0], cuts[1]))
         return max([mine, *(float(other.result()) for other in others)])
 
-    def _plan(self, changed: frozenset[int]) -> Plan:
+    def _plan(self, changed: frozenset[int]) -> RowPlan:
         if changed not in self._plans:
             if len(self._plans) >= 32:  # a handful is in use while one drags
                 self._plans.clear()
             self._plans[changed] = plan_rows(self._members, changed, self._edited_rows)
         return self._plans[changed]
 
-    def _chosen(self, chosen: tuple[int, ...]) -> NDArray[np.int64]:
+    def _index_array(self, chosen: tuple[int, ...]) -> NDArray[np.int64]:
         """These numbers as an array, made once."""
         if chosen not in self._choices:
             self._choices[chosen] = np.array(chosen, np.int64)
         return self._choices[chosen]
 
-    def _flat_weights(self, stack: Sequence[tuple[int, Layer]]) -> list[int]:
+    def _weight_offsets(self, stack: Sequence[tuple[int, Layer]]) -> list[int]:
         """Where each layer's weights begin among those of all, laid back to back; −1 for a layer without."""
         given = [layer.weights for _, layer in stack if layer.weights is not None]
         versions = [tensor._version for tensor in given]

@@ -20,12 +20,12 @@ from .coverage import coverage
 from .kernel import BLOCK, COLUMN, EDIT, LAYER, NUMBER, PART
 from .layers import KINDS
 
-Stacked = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]
+StackedEdits = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]
 """[L,6] and [L,5], see `compose_kernel.LAYER` and `NUMBER`, written to at every step; bounds, [L,B+1]."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class RowPlan:
     """How to rewrite the members of some edits, with all others that share rows with them.
 
     Args:
@@ -36,7 +36,7 @@ class Plan:
         aligned: edits whose members are the rows, one for one
         members, row_index: members of the edits, and where in `rows` they are
         bounds: where each block of rows begins in each edit's list. [B+1]
-        prepared: see `stacked`, by the edits of a stack
+        prepared: see `stack_edits`, by the edits of a stack
     """
 
     rows: NDArray[np.int64]
@@ -47,14 +47,14 @@ class Plan:
     members: NDArray[np.uint32]
     row_index: NDArray[np.uint32]
     bounds: Mapping[int, NDArray[np.int64]]
-    prepared: dict[tuple[int, ...], Stacked]
+    prepared: dict[tuple[int, ...], StackedEdits]
 
     @property
     def blocks(self) -> int:
         """How many blocks of rows there are."""
         return -(-len(self.rows) // BLOCK)
 
-    def stacked(self, edits: tuple[int, ...]) -> Stacked:
+    def stack_edits(self, edits: tuple[int, ...]) -> StackedEdits:
         """What the kernel reads of layers of these edits, lowest first; made once."""
         if edits not in self.prepared:
             if len(self.prepared) >= 32:
@@ -70,7 +70,7 @@ class Plan:
 
 def plan_rows(
     members: Sequence[NDArray[np.int64]], changed: frozenset[int], edited: NDArray[np.int64] | None = None
-) -> Plan:
+) -> RowPlan:
     """The plan that rewrites all members of the changed edits.
 
     Args:
@@ -102,7 +102,7 @@ def plan_rows(
         found_rows.append(row_index.astype(np.uint32))
         bounds[edit] = np.searchsorted(row_index, edges).astype(np.int64)
     nothing = np.zeros(0, np.uint32)
-    return Plan(
+    return RowPlan(
         rows=rows,
         base_index=nothing if edited is None else np.searchsorted(edited, rows).astype(np.uint32),
         edits=frozenset(begin),
@@ -134,7 +134,7 @@ class FlatEdits:
     nodes: tuple[tuple[float, ...], ...]
 
 
-def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
+def flatten_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
     """Lay out the edits' bases for these attributes, and their coverage."""
     edits = np.zeros((len(gdfs), len(EDIT)), np.int64)
     parts = np.full((len(gdfs), len(names), len(PART)), -1, np.int64)
@@ -174,15 +174,15 @@ def flat_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> F
                 coverages[KINDS[name]],
             )
         edits[i] = ends[0], len(float_lines), ends[1], len(byte_lines)
-        floats.append(in_blocks(float_lines, np.float32))
-        bytes_.append(in_blocks(byte_lines, np.int8))
+        floats.append(split_blocks(float_lines, np.float32))
+        bytes_.append(split_blocks(byte_lines, np.int8))
         ends[:2] = ends[0] + len(floats[-1]), ends[1] + len(bytes_[-1])
     nodes = tuple(tuple(gdf.field.knots.tolist()) for gdf in gdfs)
     flat = (np.concatenate(floats), np.concatenate(bytes_), np.concatenate(tables))
     return FlatEdits(edits, parts, *flat, nodes)
 
 
-def in_blocks(lines: Sequence[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
+def split_blocks(lines: Sequence[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
     """Lines of as many numbers, cut into blocks of 256; the last is filled up with 0. P × [M] -> [B·P·256]"""
     if not lines:
         return np.zeros(0, dtype)
@@ -195,7 +195,7 @@ def in_blocks(lines: Sequence[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
     return laid.reshape(-1)
 
 
-def flat_scene(
+def flatten_scene(
     scene: Gaussians, names: Sequence[str], edited: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
     """Attributes of the edited rows in blocks, those of all rows back to back, and where each is.
@@ -205,7 +205,7 @@ def flat_scene(
     """
     tensors: list[Tensor] = [getattr(scene, name).detach().float() for name in names]
     tables = [tensor.numpy().reshape(len(tensor), math.prod(tensor.shape[1:])) for tensor in tensors]
-    base = in_blocks([line for table in tables for line in table[edited].T], np.float32)
+    base = split_blocks([line for table in tables for line in table[edited].T], np.float32)
     out = np.concatenate([np.zeros(0, np.float32), *(table.reshape(-1) for table in tables)])
     columns = np.zeros((len(names), len(COLUMN)), np.int64)
     line = at = 0
@@ -215,7 +215,7 @@ def flat_scene(
     return base, out, columns
 
 
-def between(nodes: Sequence[float] | NDArray[np.float64], s: float) -> tuple[int, bool, float]:
+def find_segment(nodes: Sequence[float] | NDArray[np.float64], s: float) -> tuple[int, bool, float]:
     """The node at or right of `s`, whether it is there, and else its share of the way from the left one.
 
     As `BakedField.coefficients`, which continues the outer segments.
@@ -239,7 +239,7 @@ def factors(
         step: what one unit of bases 1..R is worth. [R,c]
         s: strength
     """
-    right, on_node, share = between(nodes, s)
+    right, on_node, share = find_segment(nodes, s)
     row = table[right]
     if not on_node:
         left = table[right - 1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from .assemble import DemoScene
 from .bear import SMALLEST, bear
-from .edits import AnalyticEdit, bear_edits, darkened, grown, recolored, striped, swung
+from .edits import AnalyticEdit, bear_edits, darken_edit, recolor_edit, scale_edit, stripes_edit, swing_edit
 from .room import SMALLEST_ROOM, room
 
 __all__ = [
@@ -14,10 +14,10 @@ __all__ = [
     "DemoScene",
     "bear",
     "bear_edits",
-    "darkened",
-    "grown",
-    "recolored",
+    "darken_edit",
+    "recolor_edit",
     "room",
-    "striped",
-    "swung",
+    "scale_edit",
+    "stripes_edit",
+    "swing_edit",
 ]

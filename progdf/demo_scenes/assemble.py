@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.sh import rgb_to_sh0
 
-from .light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, sheen
+from .light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, view_dependent_light
 from .noise import lattice
 from .paint import Paint, Painter
 from .surface import Part, Samples, sample
@@ -70,10 +70,10 @@ def assemble(
     with _one_thread():
         counts, shown = _budget(parts, size)
         for part, count, share in zip(parts, counts, shown, strict=True):
-            at = _visible(parts, part, count, share, random)
-            pieces.append(_clothe(parts, part, at, paint(part, at, table), daylight, random))
+            at = _sample_visible(parts, part, count, share, random)
+            pieces.append(_make_gaussians(parts, part, at, paint(part, at, table), daylight, random))
             labels.append(torch.full((count,), label_names.index(part.label), dtype=torch.uint8))
-    return _joined(pieces), torch.cat(labels)
+    return _concatenate(pieces), torch.cat(labels)
 
 
 @contextmanager
@@ -115,7 +115,9 @@ def _is_shown(parts: Sequence[Part], own: Part, at: Samples) -> Tensor:
     return shown
 
 
-def _visible(parts: Sequence[Part], part: Part, count: int, share: float, random: torch.Generator) -> Samples:
+def _sample_visible(
+    parts: Sequence[Part], part: Part, count: int, share: float, random: torch.Generator
+) -> Samples:
     """Exactly `count` shown samples of a part: enough are drawn, the few too many are dropped at random."""
     drawn = math.ceil(count / share)
     while True:
@@ -130,7 +132,7 @@ def _visible(parts: Sequence[Part], part: Part, count: int, share: float, random
     return at[kept[chosen]]
 
 
-def _clothe(
+def _make_gaussians(
     parts: Sequence[Part], part: Part, at: Samples, coat: Paint, daylight: Daylight, random: torch.Generator
 ) -> Gaussians:
     """Light and shape the painted Gaussians of one part."""
@@ -143,13 +145,15 @@ def _clothe(
     color = (
         coat.color if coat.glows else develop(albedo * irradiance(at.points, leaning, parts, part, daylight))
     )
-    glow, band = sheen(at.normals, coat.velvet, coat.gloss, 0.35 + 0.65 * color)
-    means, quats, log_scales = _lay(at, coat, stands, random)
+    glow, band = view_dependent_light(at.normals, coat.velvet, coat.gloss, 0.35 + 0.65 * color)
+    means, quats, log_scales = _place_gaussians(at, coat, stands, random)
     opacity = 0.97 - 0.10 * torch.rand(n, generator=random) - 0.25 * stands
     return Gaussians(means, quats, log_scales, torch.logit(opacity), rgb_to_sh0(color + glow), band)
 
 
-def _lay(at: Samples, coat: Paint, stands: Tensor, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+def _place_gaussians(
+    at: Samples, coat: Paint, stands: Tensor, random: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
     """Flat Gaussians on the surface, hairs and blades standing out of it. -> means, quats, log_scales"""
     n, pelt = len(at), coat.pelt
     h, up = at.spacing[:, None], stands[:, None]
@@ -190,6 +194,6 @@ def _quats(frames: Tensor) -> Tensor:
     return normalize_quats(quats)
 
 
-def _joined(pieces: Sequence[Gaussians]) -> Gaussians:
+def _concatenate(pieces: Sequence[Gaussians]) -> Gaussians:
     joined: dict[str, Any] = {name: torch.cat([getattr(p, name) for p in pieces]) for name in ATTRIBUTES}
     return Gaussians(**joined)

@@ -10,7 +10,7 @@ from torch import Tensor
 from progdf.color.edits import stripe_profile
 
 from .noise import noise
-from .paint import Paint, Pelt, between, bumps, flat, mix, step, swirl
+from .paint import Paint, Pelt, bumps, flat, mix, mix_colors, step, swirl
 from .surface import Part, Samples
 
 FUR = ("body", "tail", "head", "muzzle", "ear", "arm", "leg", "foot")
@@ -35,7 +35,7 @@ def paint(part: Part, at: Samples, table: Tensor) -> Paint:
     if part.name == "grass":
         return _lawn(at, table)
     if part.name == "pad":
-        color = between("#d59a78", "#f0c4a2", 0.5 + 0.5 * noise(at.points, table, 22.0, 2))
+        color = mix_colors("#d59a78", "#f0c4a2", 0.5 + 0.5 * noise(at.points, table, 22.0, 2))
         return Paint(color, bumps(at.points, table, 25.0, 0.2), 0.12, 0.03)
     if part.name == "glint":
         return Paint(flat("#ffffff", at.points), torch.zeros_like(at.points), glows=True)
@@ -48,8 +48,8 @@ def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
     p = at.points
     patches = noise(p, table, 3.0, 2)
     tufts = noise(p * torch.tensor([1.0, 0.45, 1.0]), table, 17.0, 2)
-    brown = between("#6b3f1f", "#b3733a", 0.5 + 0.35 * patches + 0.45 * tufts)
-    cream = between("#c99b63", "#f0d3a2", 0.5 + 0.3 * patches + 0.5 * tufts)
+    brown = mix_colors("#6b3f1f", "#b3733a", 0.5 + 0.35 * patches + 0.45 * tufts)
+    cream = mix_colors("#c99b63", "#f0d3a2", 0.5 + 0.3 * patches + 0.5 * tufts)
     ragged = 0.07 * noise(p, table, 14.0, 2)
     color = brown
     if part.name == "muzzle":
@@ -60,12 +60,14 @@ def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
         color = mix(brown, cream, step(1.0 - belly + 1.3 * ragged, -0.10, 0.06) * front)
     elif part.name == "ear":
         inner = at.local[:, 0] ** 2 + (at.local[:, 1] + 0.06) ** 2
-        rose = between("#b97f5c", "#e3b08c", 0.5 + 0.5 * tufts)
+        rose = mix_colors("#b97f5c", "#e3b08c", 0.5 + 0.5 * tufts)
         color = mix(
             brown, rose, step(0.46 - inner + 1.2 * ragged, -0.08, 0.08) * (at.local[:, 2] > 0).float()
         )
     elif part.name in ("head", "arm"):
-        color = mix(brown, between("#55301a", "#8a5228", 0.5 + 0.5 * tufts), 0.35 * step(patches, 0.1, 0.5))
+        color = mix(
+            brown, mix_colors("#55301a", "#8a5228", 0.5 + 0.5 * tufts), 0.35 * step(patches, 0.1, 0.5)
+        )
     down = swirl(p, table, (0.0, -1.0, 0.0))
     return Paint(color, bumps(p, table, 15.0, 0.34), 0.17, 0.02, down, _COAT)
 
@@ -79,7 +81,7 @@ def _wool(part: Part, at: Samples, table: Tensor) -> Paint:
         along = at.local[:, 1] * torch.linalg.svdvals(part.matrix)[0]
         turns, ribs = along / (0.30 if part.name == "knot" else 0.135), along / 0.0145
     red = stripe_profile(turns, width=0.52, softness=0.05)
-    color = mix(between("#e9dfcc", "#fffaf0", 0.6 + 0.4 * noise(p, table, 25.0)), flat("#c8102e", p), red)
+    color = mix(mix_colors("#e9dfcc", "#fffaf0", 0.6 + 0.4 * noise(p, table, 25.0)), flat("#c8102e", p), red)
     knit = (ribs * 2 * math.pi).sin() * step(0.013 - at.spacing, 0.0, 0.006)
     fuzz = 1 + 0.07 * noise(p, table, 40.0) + 0.10 * knit
     color = (color * fuzz[:, None]).clamp(0, 1)
@@ -93,11 +95,11 @@ def _stone(at: Samples, table: Tensor) -> Paint:
     p = at.points
     grain = noise(p, table, 4.0, 4)
     speckle = noise(p, table, 45.0)
-    color = between("#6f6a64", "#bdb6a8", 0.52 + 0.55 * grain + 0.12 * speckle)
+    color = mix_colors("#6f6a64", "#bdb6a8", 0.52 + 0.55 * grain + 0.12 * speckle)
     vein = 1 - (noise(p, table, 2.3, 3).abs() / 0.035).clamp(0, 1)
     color = mix(color, flat("#4b4742", p), 0.55 * vein)
     low = step(-p[:, 1], 0.10, 0.30) + step(grain, 0.25, 0.5) * step(-at.normals[:, 1], -0.8, 0.0)
-    moss = between("#4c5a2a", "#7a8a3c", 0.5 + 0.5 * noise(p, table, 20.0))
+    moss = mix_colors("#4c5a2a", "#7a8a3c", 0.5 + 0.5 * noise(p, table, 20.0))
     color = mix(color, moss, 0.55 * low.clamp(0, 1) * step(noise(p, table, 5.0, 2), -0.25, 0.3))
     return Paint(color, bumps(p, table, 7.0, 0.30), gloss=0.05)
 
@@ -106,7 +108,7 @@ def _lawn(at: Samples, table: Tensor) -> Paint:
     p = at.points
     meadow = noise(p, table, 0.9, 3)
     detail = noise(p, table, 9.0, 2)
-    color = between("#2f5a1b", "#7fae3a", 0.45 + 0.6 * meadow + 0.35 * detail)
+    color = mix_colors("#2f5a1b", "#7fae3a", 0.45 + 0.6 * meadow + 0.35 * detail)
     up = swirl(p, table, (0.0, 1.0, 0.0))
     return Paint(color, bumps(p, table, 6.0, 0.35), 0.06, 0.0, up, _TURF)
 

@@ -14,7 +14,7 @@ LABELS = ("body", "head", "ears", "arms", "legs", "scarf", "plinth", "grass")
 Triple = tuple[float, float, float]
 
 
-def turned(degrees: Triple) -> Tensor:
+def rotation_matrix(degrees: Triple) -> Tensor:
     """Rotation about x, then y, then z, in degrees. [3,3]"""
     matrix = torch.eye(3)
     for axis, angle in enumerate(degrees):
@@ -38,7 +38,7 @@ def ellipsoid(
     clears: float = 0.0,
 ) -> Part:
     """An ellipsoid of these radii, turned by degrees about x, then y, then z; see `Part` for the rest."""
-    matrix = turned(turn) @ torch.diag(torch.tensor(radii))
+    matrix = rotation_matrix(turn) @ torch.diag(torch.tensor(radii))
     return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow, clears)
 
 
@@ -122,7 +122,7 @@ def bear_parts() -> list[Part]:
             "scarf",
             ring(0.27),
             torch.tensor([0.0, 1.10, 0.03]),
-            turned((6.0, 0.0, 0.0)) @ torch.diag(torch.tensor([0.350, 0.42, 0.330])),
+            rotation_matrix((6.0, 0.0, 0.0)) @ torch.diag(torch.tensor([0.350, 0.42, 0.330])),
             weight=3.5,
             casts_shadow=False,
         ),

@@ -57,7 +57,7 @@ class AnalyticEdit:
         )
 
 
-def recolored(target: Tensor) -> AnalyticEdit:
+def recolor_edit(target: Tensor) -> AnalyticEdit:
     """`colour.recolor` of every Gaussian, seen from the members' own colour; `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
@@ -67,7 +67,7 @@ def recolored(target: Tensor) -> AnalyticEdit:
     return AnalyticEdit("recolor", change)
 
 
-def striped(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
+def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
     """Stripes across `axis` [3], `period` world units apart, in the colour `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
@@ -79,7 +79,7 @@ def striped(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
     return AnalyticEdit("stripes", change)
 
 
-def darkened(stops: float = 3.0) -> AnalyticEdit:
+def darken_edit(stops: float = 3.0) -> AnalyticEdit:
     """Night falls: `colour.night`, view-dependent light fading with the rest."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
@@ -90,7 +90,7 @@ def darkened(stops: float = 3.0) -> AnalyticEdit:
     return AnalyticEdit("night", change)
 
 
-def grown(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
+def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
     """Scale about the nearest of `pivots` [P,3]: centres move straight, log-scales by log of the size.
 
     Args:
@@ -110,7 +110,7 @@ def grown(factor: float, pivots: Tensor, shift: Tensor | None = None) -> Analyti
     return AnalyticEdit("grow", change)
 
 
-def swung(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
+def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
     """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centres run on circles."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
@@ -134,14 +134,17 @@ def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
     roots = _ear_roots(scene.gaussians.means[ears])
     return {
         "gold": (
-            recolored(colour.parse_color("#d89a12")),
+            recolor_edit(colour.parse_color("#d89a12")),
             scene.members("body", "head", "ears", "arms", "legs"),
         ),
-        "blue scarf": (recolored(colour.parse_color("#2356c7")), scene.members("scarf")),
-        "stripes": (striped(colour.parse_color("#2b62c9"), scene.up, 0.20), scene.members("body", "arms")),
-        "big ears": (grown(1.7, roots), ears),
-        "tilted ears": (swung(35.0, torch.tensor([1.0, 0.0, 0.0]), roots), ears),
-        "night": (darkened(), torch.arange(len(scene.gaussians))),
+        "blue scarf": (recolor_edit(colour.parse_color("#2356c7")), scene.members("scarf")),
+        "stripes": (
+            stripes_edit(colour.parse_color("#2b62c9"), scene.up, 0.20),
+            scene.members("body", "arms"),
+        ),
+        "big ears": (scale_edit(1.7, roots), ears),
+        "tilted ears": (swing_edit(35.0, torch.tensor([1.0, 0.0, 0.0]), roots), ears),
+        "night": (darken_edit(), torch.arange(len(scene.gaussians))),
     }
 
 

@@ -60,13 +60,13 @@ def irradiance(
         local = part.to_local(points)
         open_sky = open_sky * (1 - _occlusion(points, normals, local, part))
         if part.casts_shadow:
-            lit = lit * _unshadowed(local, part)
-    facing = _wrapped(normals @ KEY.direction, 0.18)
+            lit = lit * _key_light_share(local, part)
+    facing = _wrap_light(normals @ KEY.direction, 0.18)
     up = 0.5 + 0.5 * normals[:, 1:2]
     ambient = daylight.fill * (SKY * up + GROUND * (1 - up))
     return (
         KEY.color * (facing * lit * (0.4 + 0.6 * open_sky))[:, None]
-        + RIM.color * _wrapped(normals @ RIM.direction, 0.3)[:, None] * open_sky[:, None]
+        + RIM.color * _wrap_light(normals @ RIM.direction, 0.3)[:, None] * open_sky[:, None]
         + ambient * open_sky[:, None]
     )
 
@@ -84,7 +84,9 @@ def linear_from_srgb(rgb: Tensor) -> Tensor:
     return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
 
 
-def sheen(normals: Tensor, velvet: float, gloss: float, color: Tensor) -> tuple[Tensor, Tensor]:
+def view_dependent_light(
+    normals: Tensor, velvet: float, gloss: float, color: Tensor
+) -> tuple[Tensor, Tensor]:
     """View-dependent light that one SH band can hold.
 
     With d the direction from the eye: velvet adds velvet·(1 + n·d), brighter where the surface turns away, as
@@ -104,7 +106,7 @@ def sheen(normals: Tensor, velvet: float, gloss: float, color: Tensor) -> tuple[
     return velvet * color, band[:, :, None] * color[:, None, :]
 
 
-def _wrapped(cosine: Tensor, softness: float) -> Tensor:
+def _wrap_light(cosine: Tensor, softness: float) -> Tensor:
     return ((cosine + softness) / (1 + softness)).clamp_min(0)
 
 
@@ -121,7 +123,7 @@ def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Te
     return hidden
 
 
-def _unshadowed(local: Tensor, part: Part) -> Tensor:
+def _key_light_share(local: Tensor, part: Part) -> Tensor:
     """How much of the key light passes a part: the ray's closest approach to it, blurred. [N] in 0..1"""
     towards: Tensor = torch.linalg.inv(part.matrix) @ KEY.direction
     reach = float(towards.norm())

@@ -30,13 +30,13 @@ def noise(points: Tensor, table: Tensor, frequency: float, octaves: int = 1) -> 
     height, span = 1.0, 0.0
     for octave in range(octaves):
         # the shift keeps the lattice planes of the octaves, and the part's planes of symmetry, apart
-        total += height * _one_layer(points * frequency + 17.31 * (octave + 1), table)
+        total += height * _value_noise(points * frequency + 17.31 * (octave + 1), table)
         span += height
         height, frequency = height / 2, frequency * 2
     return total / span
 
 
-def _one_layer(places: Tensor, table: Tensor) -> Tensor:
+def _value_noise(places: Tensor, table: Tensor) -> Tensor:
     cell = places.floor()
     f = places - cell
     f = f * f * (3 - 2 * f)

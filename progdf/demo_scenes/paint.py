@@ -79,7 +79,7 @@ def swirl(points: Tensor, table: Tensor, main: tuple[float, float, float], heigh
     return torch.tensor(main) + height * bend
 
 
-def between(dark: str, light: str, share: Tensor) -> Tensor:
+def mix_colors(dark: str, light: str, share: Tensor) -> Tensor:
     """From one `#rrggbb` to another; what lies outside 0..1 is cut. [N] -> [N,3]"""
     return torch.lerp(parse_color(dark), parse_color(light), share.clamp(0, 1)[:, None])
 

@@ -77,7 +77,7 @@ def room_parts() -> list[Part]:
         ellipsoid("wood", "table", (table[0], 0.74, table[1]), (0.62, 0.028, 0.62), weight=1.8, exponent=8),
         ellipsoid("wood", "table", (table[0], 0.37, table[1]), (0.055, 0.36, 0.055), weight=1.5, exponent=6),
         ellipsoid("wood", "table", (table[0], 0.03, table[1]), (0.30, 0.03, 0.30), weight=1.5, exponent=4),
-        _turned_body(
+        _lathe_body(
             "vase",
             "vase",
             (vase[0], 0.765, vase[1]),
@@ -103,7 +103,7 @@ def room_parts() -> list[Part]:
         ],
         ellipsoid("metal", "lamp", (lamp[0], 0.02, lamp[1]), (0.17, 0.02, 0.17), weight=2.0, exponent=4),
         ellipsoid("metal", "lamp", (lamp[0], 0.75, lamp[1]), (0.016, 0.74, 0.016), weight=2.0, exponent=8),
-        _turned_body("shade", "lamp", (lamp[0], 1.42, lamp[1]), (0.14, 0.26), (0.36, 0.0)),
+        _lathe_body("shade", "lamp", (lamp[0], 1.42, lamp[1]), (0.14, 0.26), (0.36, 0.0)),
         ellipsoid(
             "cushion", "stool", (stool[0], 0.44, stool[1]), (0.24, 0.055, 0.24), weight=2.0, exponent=2.8
         ),
@@ -133,7 +133,7 @@ def _flat(
     return Part(name, label, panel(), torch.tensor(centre, dtype=torch.float32), matrix, weight, None, False)
 
 
-def _turned_body(
+def _lathe_body(
     name: str, label: str, foot: Triple, radii: tuple[float, ...], heights: tuple[float, ...]
 ) -> Part:
     return Part(name, label, lathe(radii, heights), torch.tensor(foot), torch.eye(3), 3.0, None, False)

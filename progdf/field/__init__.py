@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .bake import NeuralForm, baked_neural
+from .bake import NeuralForm, bake_network
 from .baked import AttributeBases, BakedField
 from .choose import Choice, choose_field
 from .evaluate import Candidate, FieldEvaluator
@@ -20,7 +20,7 @@ __all__ = [
     "NeuralField",
     "NeuralForm",
     "NeuralSettings",
-    "baked_neural",
+    "bake_network",
     "choose_field",
     "fit_keyframes",
     "fit_lossless",

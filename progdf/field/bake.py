@@ -77,14 +77,14 @@ class NeuralForm:
     rows_sha256: str = ""
     error: Mapping[str, float] | None = None
 
-    def baked(self, rows: Tensor) -> BakedField:
+    def bake(self, rows: Tensor) -> BakedField:
         """The field that runs. `rows`: raw values of the members before the edit, packed. [M,≥14]
 
         Raises:
             ValueError: not as many Gaussians, or a number of the network is not usable.
         """
         network = self.network
-        trajectory = pinned_trajectory(network.bound(rows), full_end(network), self.plan)
+        trajectory = pinned_trajectory(network.bind(rows), full_end(network), self.plan)
         baked = fit_separable(self.plan.knots, trajectory, self.plan.ranks, recorded=network.recorded)
         return replace(baked, kind="neural", origin=self)
 
@@ -102,7 +102,7 @@ def full_end(network: NeuralField) -> Tensor:
     return end
 
 
-def baked_neural(
+def bake_network(
     network: NeuralField,
     rows: Tensor,
     truth: Callable[[float], Tensor] | None = None,
@@ -119,7 +119,7 @@ def baked_neural(
         render: of some views; None leaves the error in decibels out
         tolerance: see `TOLERANCE`
     """
-    field, end = network.bound(rows), full_end(network)
+    field, end = network.bind(rows), full_end(network)
     large = network.parameters - network.codes.numel() > _LARGE
     nodes = bake_nodes(network.shape.bins, network.shape.hard, _FEW_PER_BIN if large else _PER_BIN)
     plan = BakePlan(nodes, {}, _end_corrections(field, end, nodes, truth))
@@ -127,7 +127,7 @@ def baked_neural(
     plan = replace(plan, ranks=_ranks(trajectory, tolerance))
     own = network.shape.inputs == "own"
     form = NeuralForm(network, plan, rows_hash(rows) if own else "")
-    baked = form.baked(rows)
+    baked = form.bake(rows)
     return replace(baked, origin=replace(form, error=bake_error(field, baked, plan, render)))
 
 

@@ -1,7 +1,7 @@
 """Which field to ship: ranks by rendered error per byte, kinds by the fewest bytes that meet the target
 (docs/method.md 5).
 
-Nothing is fitted and rendered only to be thrown away: `rendered_trajectories` looks at the trajectory once,
+Nothing is fitted and rendered only to be thrown away: `render_trajectories` looks at the trajectory once,
 ranks are grown on what that predicts, and the pictures have the last word.
 """
 
@@ -18,9 +18,9 @@ from torch import Tensor
 from .baked import BakedField
 from .evaluate import Candidate, FieldEvaluator, sample_strengths
 from .keyframes import Between, bending_snapshots, fit_keyframes, fit_lossless
-from .ranks import emphasized_modes, expected_worst, grown_ranks
-from .rendered import Render, RenderedTrajectories, picture_gram, rendered_trajectories
-from .separable import channel_weights, check_trajectory, moving_attributes, principal_modes, stored_attribute
+from .ranks import emphasize_modes, expected_worst, grow_ranks
+from .rendered import Render, RenderedTrajectories, picture_gram, render_trajectories
+from .separable import channel_weights, check_trajectory, moving_attributes, principal_modes, store_attribute
 
 __all__ = [
     "Candidate",
@@ -105,9 +105,9 @@ def choose_field(
         return Choice(found, met, (found,), "nothing is left out")
     if kind in ("auto", "separable"):
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
-        seen = rendered_trajectories(offsets, spread, render)
+        seen = render_trajectories(offsets, spread, render)
         gram = seen.pictures
-        tried += _grown(seen, strengths, target, budget, evaluator, recorded)
+        tried += _grow_fields(seen, strengths, target, budget, evaluator, recorded)
     if kind in ("auto", "keyframes"):
         limit = min([budget or math.inf, *(c.field.bytes_per_member for c in tried if c.worst >= target)])
         gram = picture_gram(offsets, render) if gram is None else gram
@@ -143,10 +143,10 @@ def separable_within(
     recorded: Sequence[float] | None = None,
 ) -> Candidate:
     """The separable field with the ranks expected to be best within `budget` bytes a member."""
-    return _separable(seen, strengths, grown_ranks(seen, budget)[-1], evaluator, recorded)
+    return _separable(seen, strengths, grow_ranks(seen, budget)[-1], evaluator, recorded)
 
 
-def _grown(
+def _grow_fields(
     seen: RenderedTrajectories,
     strengths: Tensor,
     target: float,
@@ -155,13 +155,13 @@ def _grown(
     recorded: Sequence[float] | None,
 ) -> list[Candidate]:
     """Separable fields along the path of growing ranks, until one just meets the target."""
-    path = grown_ranks(seen, budget or MOST_BYTES)
+    path = grow_ranks(seen, budget or MOST_BYTES)
     expected = expected_worst(seen, path)
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     stored = [sum((4 + ranks[name]) * width for name, width in widths.items()) for ranks in path]
     tried: dict[int, Candidate] = {}
 
-    def look(i: int) -> Candidate:
+    def evaluate(i: int) -> Candidate:
         if i not in tried:
             tried[i] = _separable(seen, strengths, path[i], evaluator, recorded, target)
         return tried[i]
@@ -173,10 +173,10 @@ def _grown(
         likely = [i for i in range(low + 1, high) if expected[i] + correction >= target]
         i = likely[0] if likely else high - 1
         if high < len(path) and stored[high] - stored[i] <= CLOSE * stored[high]:
-            if look(high).worst < target + SPARE:
+            if evaluate(high).worst < target + SPARE:
                 break
             i = (low + high) // 2  # the prediction asks for too much
-        found = look(i)
+        found = evaluate(i)
         correction = found.worst - expected[i]
         low, high = (low, i) if found.worst >= target else (i, high)
     return list(tried.values())
@@ -199,11 +199,11 @@ def _separable(
     label = ", ".join(f"{name} {rank}" for name, rank in ranks.items() if rank) or "rank 0"
     found = []
     for modes in (
-        emphasized_modes(seen, ranks),
+        emphasize_modes(seen, ranks),
         {n: principal_modes(c.gram) for n, c in seen.trajectories.items()},
     ):
         attributes = {
-            name: stored_attribute(trajectory, modes[name][0][:, : ranks[name]])
+            name: store_attribute(trajectory, modes[name][0][:, : ranks[name]])
             for name, trajectory in seen.trajectories.items()
         }
         field = BakedField("separable", strengths.float(), attributes, seen.channels, ticks)

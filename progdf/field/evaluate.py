@@ -76,7 +76,7 @@ class FieldEvaluator:
         render: Render,
         truth: Callable[[float], Tensor] | None = None,
     ) -> None:
-        course = truth or (lambda s: _between(strengths, offsets, s))
+        course = truth or (lambda s: _interpolate(strengths, offsets, s))
         self._render = render
         self._nothing = torch.zeros_like(offsets[0])
         with torch.no_grad():
@@ -99,7 +99,7 @@ class FieldEvaluator:
         return Candidate(field, self.curve(field), label)
 
 
-def _between(strengths: Tensor, offsets: Tensor, s: float) -> Tensor:
+def _interpolate(strengths: Tensor, offsets: Tensor, s: float) -> Tensor:
     """The trajectory at `s`, linear between snapshots. [M,C]"""
     right = int(
         torch.searchsorted(strengths, torch.tensor(s, dtype=strengths.dtype)).clamp(1, len(strengths) - 1)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .baked import AttributeBases, BakedField
-from .separable import check_trajectory, moving_attributes, stored_bases
+from .separable import check_trajectory, moving_attributes, quantize_bases
 
 Between = Literal["linear", "cubic"]
 
@@ -70,7 +70,7 @@ def fit_keyframes(
             # as it is: a unit of another size would round it
             rest, step = inner.to(rest_type), torch.ones(len(inner), full.shape[1])
         else:
-            rest, step = stored_bases(inner - straight.float()[:, None, None] * full, rest_type)
+            rest, step = quantize_bases(inner - straight.float()[:, None, None] * full, rest_type)
         attributes[name] = AttributeBases(full, rest, step, table.clone())
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("keyframes", nodes, attributes, offsets.shape[2], tuple(ticks))

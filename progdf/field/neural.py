@@ -187,7 +187,7 @@ class NeuralField:
         """Bytes on disk for one member, its share of the network included."""
         return self.stored_bytes / max(1, self.members)
 
-    def bound(self, rows: Tensor) -> BoundField:
+    def bind(self, rows: Tensor) -> BoundField:
         """The field of these Gaussians. `rows`: their raw values, packed, in the region's order. [M,≥14]"""
         if rows.shape[0] != self.members:
             raise ValueError(f"rows is {list(rows.shape)}, expected {self.members} of them")
@@ -205,7 +205,7 @@ class BoundField:
         self.attributes = field.shape.attributes
         self._weights = weights
         with torch.no_grad():
-            told = torch.cat([encoded(self.shape, weights, rows, self.end), codes], dim=1)
+            told = torch.cat([encode(self.shape, weights, rows, self.end), codes], dim=1)
             # all of the first layer that does not depend on s
             first = weights["layers.0.weight"]
             self._first = linear(told, first[:, : told.shape[1]], weights["layers.0.bias"])
@@ -217,30 +217,30 @@ class BoundField:
             return packed
         strengths = torch.full((1,), s)
         with torch.no_grad():
-            signal = control(self.shape, self._weights["control"], strengths)
+            signal = control_signal(self.shape, self._weights["control"], strengths)
             hidden = self._first + linear(signal, self._weights["layers.0.weight"][:, -CONTROL:])
-            answer = beyond_first(self.shape, self._weights, hidden)
-            packed[:, self.shape.columns] = course(self.shape, strengths, answer, self.end)
+            answer = apply_later_layers(self.shape, self._weights, hidden)
+            packed[:, self.shape.columns] = offsets_of_answer(self.shape, strengths, answer, self.end)
         return packed
 
 
-def encoded(shape: NeuralShape, frame: Mapping[str, Tensor], rows: Tensor, end: Tensor) -> Tensor:
+def encode(shape: NeuralShape, frame: Mapping[str, Tensor], rows: Tensor, end: Tensor) -> Tensor:
     """What the network sees of the Gaussians. [M,≥14], [M,c] -> [M,seen]"""
     place = (rows[:, :3] - frame["centre"]) / frame["extent"]
     waves = place[:, None, :] * (math.pi / 2 * 2.0 ** torch.arange(shape.frequencies))[:, None]
     parts = [place, waves.sin().flatten(1), waves.cos().flatten(1)]
     if shape.inputs == "own":
-        look = (look_of(rows, end) - frame["look_mean"]) / frame["look_spread"]
+        look = (appearance(rows, end) - frame["look_mean"]) / frame["look_spread"]
         parts.append(look.clamp(-_LIMIT, _LIMIT))
     return torch.cat(parts, dim=1)
 
 
-def look_of(rows: Tensor, end: Tensor) -> Tensor:
+def appearance(rows: Tensor, end: Tensor) -> Tensor:
     """What a Gaussian looks like and where it ends, raw units. [M,≥14], [M,c] -> [M,11+c]"""
     return torch.cat([rows[:, _LOOK], end], dim=1)
 
 
-def control(shape: NeuralShape, nodes: Tensor, s: Tensor) -> Tensor:
+def control_signal(shape: NeuralShape, nodes: Tensor, s: Tensor) -> Tensor:
     """The control signal H(s) of each strength. [bins,CONTROL], [B] -> [B,CONTROL]"""
     position = s.clamp(0.0, 1.0) * shape.bins
     left = position.floor().clamp(max=shape.bins - 1).long()
@@ -250,7 +250,7 @@ def control(shape: NeuralShape, nodes: Tensor, s: Tensor) -> Tensor:
     return torch.lerp(full[left], full[left + 1], (position - left)[:, None])
 
 
-def beyond_first(shape: NeuralShape, weights: Mapping[str, Tensor], hidden: Tensor) -> Tensor:
+def apply_later_layers(shape: NeuralShape, weights: Mapping[str, Tensor], hidden: Tensor) -> Tensor:
     """What the network answers, in spreads, from the sums of its first layer. [B,width] -> [B,c]"""
     hidden = silu(hidden)
     for i in range(1, shape.layers):
@@ -258,7 +258,7 @@ def beyond_first(shape: NeuralShape, weights: Mapping[str, Tensor], hidden: Tens
     return linear(hidden, weights["heads.weight"], weights["heads.bias"]) * weights["spread"]
 
 
-def course(shape: NeuralShape, s: Tensor, answer: Tensor, end: Tensor) -> Tensor:
+def offsets_of_answer(shape: NeuralShape, s: Tensor, answer: Tensor, end: Tensor) -> Tensor:
     """Offsets from the network's answer; exactly 0 at s = 0. [B], [B,c], [B,c] -> [B,c]"""
     s = s[:, None]
     if shape.inputs == "own":

@@ -22,11 +22,11 @@ from .neural import (
     NeuralField,
     NeuralShape,
     Size,
-    beyond_first,
-    control,
-    course,
-    encoded,
-    look_of,
+    appearance,
+    apply_later_layers,
+    control_signal,
+    encode,
+    offsets_of_answer,
 )
 from .rendered import Render
 from .separable import LEVELS, channel_weights, check_trajectory, moving_attributes
@@ -70,7 +70,7 @@ class NeuralSettings:
     picture_share: float = 0.02
     seed: int = 0
 
-    def settled(self) -> NeuralSettings:
+    def resolve(self) -> NeuralSettings:
         """The same with every 0 replaced by the size's own value."""
         steps, batch, rate = EFFORT[self.size]
         return replace(self, steps=self.steps or steps, batch=self.batch or batch, rate=self.rate or rate)
@@ -95,7 +95,7 @@ class NeuralFit:
         settings: NeuralSettings,
         visibility: Tensor | None = None,
     ) -> None:
-        self.settings = settings.settled()
+        self.settings = settings.resolve()
         width, layers = LAYOUT[settings.size]
         self.shape = NeuralShape(
             width, layers, attributes, channels, settings.inputs, settings.code, hard=settings.bins == "hard"
@@ -104,7 +104,7 @@ class NeuralFit:
         self._rows = rows
         self._draws = torch.Generator().manual_seed(settings.seed)
         self._frame = _place_frame(self.shape, rows)
-        self._learned = _first(self.shape, self._draws)
+        self._learned = _initial_weights(self.shape, self._draws)
         if self.shape.code:
             self._learned["codes"] = 0.1 * torch.randn(len(rows), self.shape.code, generator=self._draws)
         for tensor in self._learned.values():
@@ -146,11 +146,11 @@ class NeuralFit:
                     self._learned[name].mul_(factor[:, None] if name == "heads.weight" else factor)
         self._frame["spread"] = after
         if self.shape.inputs == "own" and len(self._rows):
-            look = look_of(self._rows, self._end)
+            look = appearance(self._rows, self._end)
             spread = look.std(dim=0, correction=0)
             self._frame["look_mean"] = look.mean(dim=0)
             self._frame["look_spread"] = torch.where(spread > 1e-6, spread, torch.ones_like(spread))
-        self._told = encoded(self.shape, self._frame, self._rows, self._end)
+        self._told = encode(self.shape, self._frame, self._rows, self._end)
 
     def step(
         self,
@@ -209,17 +209,17 @@ class NeuralFit:
 
     def _answer(self, rows: Tensor, s: Tensor) -> Tensor:
         """The field's offsets for drawn members and strengths. [B], [B] -> [B,c]"""
-        signal = control(self.shape, self._learned["control"], s)
+        signal = control_signal(self.shape, self._learned["control"], s)
         parts = [self._told[rows], signal]
         if self.shape.code:
             parts.insert(1, self._learned["codes"][rows])
         hidden = linear(
             torch.cat(parts, dim=1), self._learned["layers.0.weight"], self._learned["layers.0.bias"]
         )
-        answer = beyond_first(self.shape, {**self._learned, "spread": self._frame["spread"]}, hidden)
-        return course(self.shape, s, answer, self._end[rows])
+        answer = apply_later_layers(self.shape, {**self._learned, "spread": self._frame["spread"]}, hidden)
+        return offsets_of_answer(self.shape, s, answer, self._end[rows])
 
-    def saved(self) -> dict[str, Tensor]:
+    def capture_state(self) -> dict[str, Tensor]:
         """Everything that the next steps depend on, by name; the snapshots aside."""
         kept = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
         kept |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
@@ -230,7 +230,7 @@ class NeuralFit:
         return kept | {"draws": self._draws.get_state()}
 
     def restore(self, saved: Mapping[str, Tensor]) -> None:
-        """Take over what `saved` gave, of a fit made with the same arguments."""
+        """Take over what `capture_state` gave, of a fit made with the same arguments."""
         for name, tensor in self._learned.items():
             tensor.data.copy_(saved[f"learned.{name}"])
             begin = f"adam.{name}."
@@ -241,14 +241,14 @@ class NeuralFit:
         self._end, self._importance = saved["end"].clone(), saved["importance"].clone()
         self.steps = int(saved["steps"])
         self._draws.set_state(saved["draws"])
-        self._told = encoded(self.shape, self._frame, self._rows, self._end)
+        self._told = encode(self.shape, self._frame, self._rows, self._end)
 
     def adopt(self, shape: NeuralShape, saved: Mapping[str, Tensor]) -> None:
         """Begin with the weights of another fit of the same members, whose outputs may be more than ours.
 
         Args:
             shape: of the other
-            saved: what its `saved` gave
+            saved: what its `capture_state` gave
         """
         rows = torch.cat(
             [torch.arange(p.start, p.stop) for n, p in shape.outputs.items() if n in self.shape.outputs]
@@ -283,7 +283,7 @@ def _place_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
     return frame
 
 
-def _first(shape: NeuralShape, draws: torch.Generator) -> dict[str, Tensor]:
+def _initial_weights(shape: NeuralShape, draws: torch.Generator) -> dict[str, Tensor]:
     """Weights to begin with (He et al. 2015); the heads are 0, so the field begins at its simplest course."""
     weights = {}
     for name, size in shape.weights().items():
@@ -350,11 +350,11 @@ def fit_neural(
         raise ValueError("nothing moves, so there is nothing for a network to learn")
     fit = NeuralFit(rows, offsets.shape[2], attributes, settings or NeuralSettings(), visibility)
     fit.scale_to(offsets, rendered_importance(offsets, render) if render is not None else None)
-    trained(fit, strengths, offsets, fit.settings.steps, pictures, on_step)
+    train_network(fit, strengths, offsets, fit.settings.steps, pictures, on_step)
     return fit.field(tuple(strengths.tolist()) if recorded is None else recorded)
 
 
-def trained(
+def train_network(
     fit: NeuralFit,
     strengths: Tensor,
     offsets: Tensor,

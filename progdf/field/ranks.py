@@ -14,7 +14,7 @@ NO_DIFFERENCE = 99.0
 """PSNR, dB, that stands for pictures which do not differ."""
 
 
-def grown_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
+def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
     """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     evenly = torch.ones(seen.gram.shape[1], dtype=torch.float64)
@@ -46,7 +46,7 @@ def _hardness(mse: Tensor) -> float:
     return float(mse.pow(4).mean().pow(0.25))
 
 
-def emphasized_modes(seen: RenderedTrajectories, ranks: Mapping[str, int]) -> Modes:
+def emphasize_modes(seen: RenderedTrajectories, ranks: Mapping[str, int]) -> Modes:
     """Bases for these ranks, with snapshots of large error made to count more until the worst is least."""
     emphasis = torch.ones(seen.gram.shape[1], dtype=torch.float64)
     best = modes = seen.modes(emphasis)

@@ -74,7 +74,7 @@ class RenderedTrajectories:
         return torch.einsum("atbu,btu->t", half, left).clamp(min=0) / self.values
 
 
-def rendered_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> RenderedTrajectories:
+def render_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> RenderedTrajectories:
     """Straighten every attribute at every snapshot, and look.
 
     Args:
@@ -88,7 +88,7 @@ def rendered_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> R
         for name, columns in attributes.items()
     }
     snapshots = len(offsets)
-    looked = _looked_at(snapshots)
+    looked = _rendered_snapshots(snapshots)
     with torch.no_grad():
         original = render(offsets[0])
         stride = _stride(original)
@@ -102,7 +102,7 @@ def rendered_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> R
                 straight[:, columns] = trajectories[name].amplitude[t] * offsets[-1, :, columns]
                 changes[i].append((pixels - render(straight))[::stride].flatten())
         seen.append((render(offsets[-1]) - original)[::stride].flatten())
-    spread = _between(looked, snapshots)
+    spread = _interpolation_weights(looked, snapshots)
     shown = torch.stack(seen)
     pictures = spread @ (shown @ shown.T).double() @ spread.T
     gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
@@ -116,23 +116,23 @@ def rendered_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> R
 
 def picture_gram(offsets: Tensor, render: Render) -> Tensor:
     """Inner products of what the snapshots change in the pictures. [T,M,C] -> [T,T] float64"""
-    looked = _looked_at(len(offsets))
+    looked = _rendered_snapshots(len(offsets))
     with torch.no_grad():
         original = render(offsets[0])
         stride = _stride(original)
         rows = torch.stack([(render(offsets[t]) - original)[::stride].flatten() for t in looked])
-    spread = _between(looked, len(offsets))
+    spread = _interpolation_weights(looked, len(offsets))
     return spread @ (rows @ rows.T).double() @ spread.T
 
 
-def _looked_at(snapshots: int) -> list[int]:
+def _rendered_snapshots(snapshots: int) -> list[int]:
     """Snapshots that are rendered, even and both ends among them."""
     if snapshots <= MOST_SNAPSHOTS:
         return list(range(snapshots))
     return [round(i * (snapshots - 1) / (MOST_SNAPSHOTS - 1)) for i in range(MOST_SNAPSHOTS)]
 
 
-def _between(looked: Sequence[int], snapshots: int) -> Tensor:
+def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:
     """How much of each snapshot that is looked at every one holds. [T,L] float64"""
     shares = torch.zeros(snapshots, len(looked), dtype=torch.float64)
     shares[looked, range(len(looked))] = 1.0

@@ -124,7 +124,7 @@ def principal_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tenso
     return root[:, None] * vectors, vectors / root[:, None]
 
 
-def stored_attribute(
+def store_attribute(
     trajectory: AttributeTrajectory, mix: Tensor, rest_type: torch.dtype = torch.int8
 ) -> AttributeBases:
     """Bases as stored, with coefficients solved for them as they are stored.
@@ -136,12 +136,12 @@ def stored_attribute(
     """
     full = trajectory.offsets[-1].contiguous()
     exact = (mix.T.float() @ trajectory.residual.flatten(1)).reshape(-1, *full.shape)
-    rest, step = stored_bases(exact, rest_type)
-    table = solved_coefficients(trajectory.offsets, full, rest.float() * step[:, None], trajectory.weights)
+    rest, step = quantize_bases(exact, rest_type)
+    table = solve_coefficients(trajectory.offsets, full, rest.float() * step[:, None], trajectory.weights)
     return AttributeBases(full, rest, step, table)
 
 
-def stored_bases(exact: Tensor, rest_type: torch.dtype) -> tuple[Tensor, Tensor]:
+def quantize_bases(exact: Tensor, rest_type: torch.dtype) -> tuple[Tensor, Tensor]:
     """Bases in their stored type, and what one unit is worth. [R,M,c] -> [R,M,c], [R,c] float32"""
     largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
     if rest_type == torch.int8:
@@ -152,7 +152,7 @@ def stored_bases(exact: Tensor, rest_type: torch.dtype) -> tuple[Tensor, Tensor]
     return (exact / step[:, None]).to(rest_type), step
 
 
-def solved_coefficients(offsets: Tensor, full: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
+def solve_coefficients(offsets: Tensor, full: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
     """Least squares for a_0 … a_R at every snapshot; both ends are given, not solved. [T,1+R] float32
 
     Args:
@@ -204,7 +204,7 @@ def fit_separable(
     check_trajectory(strengths, offsets)
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     attributes = {
-        name: _fitted(
+        name: _fit_attribute(
             fit_amplitude(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type
         )
         for name, columns in moving_attributes(offsets).items()
@@ -213,6 +213,6 @@ def fit_separable(
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
 
 
-def _fitted(trajectory: AttributeTrajectory, rank: int, rest_type: torch.dtype) -> AttributeBases:
+def _fit_attribute(trajectory: AttributeTrajectory, rank: int, rest_type: torch.dtype) -> AttributeBases:
     mix, _ = principal_modes(trajectory.gram)
-    return stored_attribute(trajectory, mix[:, :rank], rest_type)
+    return store_attribute(trajectory, mix[:, :rank], rest_type)

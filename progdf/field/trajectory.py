@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, open_failure
-from progdf.io.json_values import decode_json, typed
+from progdf.io.atomic import atomic_write, open_error
+from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
 
 from .baked import BakedField
@@ -115,7 +115,7 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
     for name, dtype, sides in _NEEDED_FORMS:
         found = tensors[name]
         if found.dtype != dtype or found.ndim != sides:
-            raise _damaged(path, f"{name} is {list(found.shape)} {found.dtype}")
+            raise _damage_error(path, f"{name} is {list(found.shape)} {found.dtype}")
     trajectory = Trajectory(
         tensors.pop("s"),
         tensors.pop("offsets"),
@@ -151,30 +151,30 @@ def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dic
         if header.get("format") != _FORMAT:
             raise ProgdfError(f"{path} is not a recorded trajectory; give a run folder of progdf train")
         if not names and (missing := _NEEDED - set(tensors)):
-            raise _damaged(path, f"it has no {min(missing)}")
-        return tensors, typed(decode_json(header["about"]), dict[str, Any])
+            raise _damage_error(path, f"it has no {min(missing)}")
+        return tensors, convert_json(decode_json(header["about"]), dict[str, Any])
     except OSError as error:
-        raise open_failure(path, error) from error
+        raise open_error(path, error) from error
     except ProgdfError:
         raise
     except (KeyError, ValueError) as error:
-        raise _damaged(path, error) from error
+        raise _damage_error(path, error) from error
 
 
 def _check(path: Path, found: Trajectory) -> None:
     s, shape = found.s, found.offsets.shape
     fits = s.ndim == 1 and len(s) >= 2 and len(shape) == 3 and len(s) == shape[0]
     if not fits or found.end.shape != shape[1:]:
-        raise _damaged(path, "its tensors do not fit each other")
+        raise _damage_error(path, "its tensors do not fit each other")
     if float(s[0]) != 0.0 or float(s[-1]) != 1.0 or not bool((s.diff() > 0).all()):
-        raise _damaged(path, "its slider values do not ascend from 0 to 1")
+        raise _damage_error(path, "its slider values do not ascend from 0 to 1")
     ends = found.stage_ends
     ascend = all(before < after for before, after in pairwise((0, *ends)))
     if not ends or len(ends) != len(found.strengths) or not ascend or ends[-1] != len(s) - 1:
-        raise _damaged(path, "its stages do not fit its recordings")
+        raise _damage_error(path, "its stages do not fit its recordings")
     if len(found.steps) != len(s) or not bool(found.offsets.isfinite().all() & found.end.isfinite().all()):
-        raise _damaged(path, "it has numbers that are not finite, or not one step a recording")
+        raise _damage_error(path, "it has numbers that are not finite, or not one step a recording")
 
 
-def _damaged(path: Path, reason: object) -> ProgdfError:
+def _damage_error(path: Path, reason: object) -> ProgdfError:
     return ProgdfError(f"{path} is damaged ({reason}); train again")

@@ -58,16 +58,16 @@ def read_compressed_ply(path: str | os.PathLike[str], header: PlyHeader) -> Gaus
     ranges, packed = _rows(name, header, chunk), _rows(name, header, vertex)
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
     rgba = _unorm(color, (24, 16, 8, 0), (8, 8, 8, 8))
-    rgb = rgba[:, :3] if "min_r" not in chunk.names else _within(ranges, at, rgba, _RGB)
+    rgb = rgba[:, :3] if "min_r" not in chunk.names else _dequantize(ranges, at, rgba, _RGB)
     with np.errstate(divide="ignore"):  # 0 and 1 are infinite
         logits = -np.log(1.0 / rgba[:, 3].astype(np.float64) - 1.0)
     higher = np.zeros((vertex.count, 0, 3), np.float32)
     if sh is not None and sh.properties:
         higher = _higher_bands(name, _rows(name, header, sh), len(sh.properties))
     found = {
-        "means": _within(ranges, at, _unorm(position, (21, 11, 0), (11, 10, 11)), _XYZ),
+        "means": _dequantize(ranges, at, _unorm(position, (21, 11, 0), (11, 10, 11)), _XYZ),
         "quats": _quats(rotation),
-        "log_scales": _within(ranges, at, _unorm(scale, (21, 11, 0), (11, 10, 11)), _SCALES),
+        "log_scales": _dequantize(ranges, at, _unorm(scale, (21, 11, 0), (11, 10, 11)), _SCALES),
         "logit_opacities": logits,
         "sh0": (rgb - 0.5) / C0,
         "shN": higher,
@@ -94,7 +94,7 @@ def _unorm(words: npt.NDArray[np.uint32], shifts: tuple[int, ...], bits: tuple[i
     return np.stack(parts, axis=1).astype(np.float32)
 
 
-def _within(
+def _dequantize(
     ranges: npt.NDArray[np.void], at: npt.NDArray[np.int64], share: Floats, names: tuple[str, ...]
 ) -> Floats:
     """Shares of each chunk's range. [N,3]"""

@@ -16,7 +16,7 @@ import zipfile
 from pathlib import Path
 
 
-def _bundled(meta: Path) -> bytes:
+def _bundle(meta: Path) -> bytes:
     """An unpacked .sog as the archive that it would be: meta.json and the images that it names."""
     table = json.loads(meta.read_bytes())
     named = [name for part in table.values() if isinstance(part, dict) for name in part.get("files", ())]
@@ -43,7 +43,7 @@ def main(kind: str, source: str, target: str, memory: int, output: int, seconds:
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     path = Path(source)
-    content = _bundled(path) if path.name.lower() == "meta.json" else path.read_bytes()
+    content = _bundle(path) if path.name.lower() == "meta.json" else path.read_bytes()
     found = gaussforge.GaussForge().convert(content, kind, "ply")
     if "data" not in found:
         raise ValueError(str(found.get("error", "it gives no scene")))

@@ -18,7 +18,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import open_failure
+from progdf.io.atomic import open_error
 from progdf.sh import C0
 
 _HEADER, _SECTION = 4096, 1024
@@ -62,13 +62,13 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     try:
         content = Path(path).read_bytes()
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     if len(content) < _HEADER or not is_ksplat(content):
         raise ProgdfError(f"{path} is not a .ksplat scene; export it again")
     level = _number(content, 20, "<u2")
     sections = _number(content, 4, "<u4")
     if level > 2 or _HEADER + sections * _SECTION > len(content):
-        raise _damaged(path)
+        raise _damage_error(path)
     low, high = (float(np.frombuffer(content, "<f4", 1, at)[0]) for at in (36, 40))
     sh_range = (low or -1.5, high or 1.5)
     at, parts = _HEADER + sections * _SECTION, []
@@ -80,7 +80,7 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         parts.append(_rows(path, content, section, row, level, sh_range))
     count = sum(len(part["means"]) for part in parts)
     if not count or count != _number(content, 16, "<u4"):
-        raise _damaged(path)
+        raise _damage_error(path)
     most = max(part["shN"].shape[1] for part in parts)
     for part in parts:
         part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
@@ -97,7 +97,7 @@ def _section(
     """A section's header, the layout of its rows, and where the next section begins."""
     degree = _number(content, head + 40, "<u2")
     if degree > 3:
-        raise _damaged(path)
+        raise _damage_error(path)
     small = [("xyz", "<u2", 3), ("scale", "<f2", 3), ("quat", "<f2", 4), ("rgba", "u1", 4)]
     large = [("xyz", "<f4", 3), ("scale", "<f4", 3), ("quat", "<f4", 4), ("rgba", "u1", 4)]
     row = np.dtype([*(small if level else large), ("sh", _SH_TYPES[level], _SH_REST[degree])])
@@ -107,7 +107,7 @@ def _section(
     end = rows_at + row.itemsize * _number(content, head + 4, "<u4")
     rows = _number(content, head, "<u4")
     if end > len(content) or rows > _number(content, head + 4, "<u4"):
-        raise _damaged(path)
+        raise _damage_error(path)
     section = _Section(
         rows=rows,
         bucket_size=_number(content, head + 8, "<u4"),
@@ -167,7 +167,7 @@ def _centers(path: str | os.PathLike[str], content: bytes, section: _Section) ->
     later = section.full_buckets + np.searchsorted(ends[1:], index, side="right")
     bucket = np.where(index < full, index // max(section.bucket_size, 1), later)
     if section.bucket_bytes < 12 or (section.rows and int(bucket.max()) >= section.buckets):
-        raise _damaged(path)
+        raise _damage_error(path)
     kind = np.dtype({"names": ["xyz"], "formats": [("<f4", 3)], "itemsize": section.bucket_bytes})
     centers = np.frombuffer(content, kind, section.buckets, section.centers_at)["xyz"]
     found: Floats = centers[bucket]
@@ -178,5 +178,5 @@ def _number(content: bytes, at: int, kind: str) -> int:
     return int(np.frombuffer(content, kind, 1, at)[0])
 
 
-def _damaged(path: str | os.PathLike[str]) -> ProgdfError:
+def _damage_error(path: str | os.PathLike[str]) -> ProgdfError:
     return ProgdfError(f"{path} is a .ksplat that is cut short or damaged; copy or export it again")

@@ -69,7 +69,7 @@ class LoadReport:
             (self.bad_opacities, "NaN opacity"),
             (self.bad_colours, "NaN or infinite colour"),
         )
-        hidden = ", ".join(f"{grouped(rows)} with {what}" for rows, what in reasons if rows)
+        hidden = ", ".join(f"{group_digits(rows)} with {what}" for rows, what in reasons if rows)
         phrases = (
             (self.hidden, f"made invisible: {hidden}"),
             (self.bad_sh, "with NaN or infinite SH coefficients, which were set to 0"),
@@ -78,7 +78,7 @@ class LoadReport:
             (self.transparent, "with an opacity of −inf, made finite and just as invisible"),
             (self.zero_quats, "with a zero quaternion, taken as no rotation"),
         )
-        return tuple(f"{counted(rows)} {what}" for rows, what in phrases if rows)
+        return tuple(f"{format_count(rows)} {what}" for rows, what in phrases if rows)
 
     @property
     def ignored(self) -> tuple[str, ...]:
@@ -86,9 +86,9 @@ class LoadReport:
         phrases = []
         if self.ignored_properties:
             phrases.append(f"properties {', '.join(_EXPLAINED.get(p, p) for p in self.ignored_properties)}")
-        phrases += [f"element '{name}' ({counted(rows, 'row')})" for name, rows in self.ignored_elements]
+        phrases += [f"element '{name}' ({format_count(rows, 'row')})" for name, rows in self.ignored_elements]
         if self.trailing_bytes:
-            phrases.append(f"{counted(self.trailing_bytes, 'byte')} after the last row")
+            phrases.append(f"{format_count(self.trailing_bytes, 'byte')} after the last row")
         return tuple(phrases)
 
     def lines(self) -> list[str]:
@@ -97,19 +97,21 @@ class LoadReport:
         if self.sh_degree == 4:
             sh += " (band 4 is kept, and not shown)"
         lines = [
-            f"{self.file}: {counted(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
+            f"{self.file}: {format_count(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
             *(f"ignored: {phrase}" for phrase in self.ignored),
         ]
         if self.antialiased:
             lines.append("trained anti-aliased (mip), and drawn so")
         if self.scaled_quats:
-            lines.append(f"normalised: {counted(self.scaled_quats, 'quaternion')} of another length than 1")
+            lines.append(
+                f"normalised: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
+            )
         return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]
 
 
-def counted(count: int, noun: str = "Gaussian") -> str:
+def format_count(count: int, noun: str = "Gaussian") -> str:
     """1 as "1 Gaussian", 12345 as "12 345 Gaussians"."""
-    return f"{grouped(count)} {noun}{'' if count == 1 else 's'}"
+    return f"{group_digits(count)} {noun}{'' if count == 1 else 's'}"
 
 
 def file_size(count: int) -> str:
@@ -117,6 +119,6 @@ def file_size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
 
 
-def grouped(number: int) -> str:
+def group_digits(number: int) -> str:
     """12345 as "12 345"."""
     return f"{number:,}".replace(",", " ")

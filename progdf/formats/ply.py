@@ -20,7 +20,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.io.atomic import atomic_write, open_failure
+from progdf.io.atomic import atomic_write, open_error
 
 from .load_report import LoadReport
 from .ply_header import ANTIALIASED_COMMENT, Element, PlyHeader, read_header
@@ -72,7 +72,7 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
     try:
         trailing = read_blocks(path, header, vertex, used, store, _threads(vertex.count))
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     scene, counts = repair(replace(_gaussians(attributes), antialiased=header.antialiased))
     return scene, LoadReport(
         file=Path(path).name,
@@ -152,7 +152,7 @@ def _check_properties(name: str, header: PlyHeader, vertex: Element) -> int:
     present = {column.name for column in vertex.properties if not column.count_type}
     missing = [column for names in GEOMETRY.values() for column in names if column not in present]
     if missing:
-        raise ProgdfError(f"{name} {_what_it_is(header, present, missing)}")
+        raise ProgdfError(f"{name} {_describe(header, present, missing)}")
     rest = sum(column.startswith("f_rest_") for column in present)
     absent = next((f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in present), None)
     if rest not in _SH_REST or absent:
@@ -165,7 +165,7 @@ def _check_properties(name: str, header: PlyHeader, vertex: Element) -> int:
     return rest
 
 
-def _what_it_is(header: PlyHeader, present: set[str], missing: list[str]) -> str:
+def _describe(header: PlyHeader, present: set[str], missing: list[str]) -> str:
     if "packed_position" in present:
         return "is a compressed .ply; open it with load_scene"
     if missing == ["scale_2"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import check_regular, open_failure
+from progdf.io.atomic import check_regular, open_error
 
 MAX_HEADER_BYTES = 1 << 20
 """A header that has not ended by then is no header."""
@@ -116,7 +116,7 @@ def read_header(path: str | os.PathLike[str]) -> PlyHeader:
             size = os.fstat(file.fileno()).st_size
             return _parse(name, _header_lines(name, file), file.tell(), size)
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
 
 
 def _header_lines(name: str, file: BinaryIO) -> list[str]:

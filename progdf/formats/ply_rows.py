@@ -63,7 +63,7 @@ def read_blocks(
         else:
             start = file.tell()
             if start + element.count * element.least_row_bytes > header.file_size:
-                raise _cut_short(name, element)
+                raise _truncation_error(name, element)
             _read_fixed(path, header, element, start, wanted, store, threads)
             file.seek(element.count * element.least_row_bytes, os.SEEK_CUR)
         following = header.elements[place + 1 :]
@@ -78,7 +78,7 @@ def _skip(name: str, file: BinaryIO, header: PlyHeader, element: Element) -> Non
     """Move behind an element that is not wanted."""
     if header.format == "ascii":
         if sum(1 for _ in itertools.islice(file, element.count)) < element.count:
-            raise _cut_short(name, element)
+            raise _truncation_error(name, element)
     elif not element.has_lists:
         file.seek(element.count * element.least_row_bytes, os.SEEK_CUR)
     elif element.count * len(element.properties) > _MOST_LISTS:
@@ -96,11 +96,11 @@ def _skip(name: str, file: BinaryIO, header: PlyHeader, element: Element) -> Non
                 found = file.read(kind.itemsize)
                 length = int(np.frombuffer(found, kind)[0]) if len(found) == kind.itemsize else -1
                 if length < 0:
-                    raise _cut_short(name, element)
+                    raise _truncation_error(name, element)
                 file.seek(length * int(column.type[1]), os.SEEK_CUR)
 
 
-def _cut_short(name: str, element: Element) -> ProgdfError:
+def _truncation_error(name: str, element: Element) -> ProgdfError:
     return ProgdfError(
         f"{name} ends within element '{element.name}'; it is cut short or damaged: copy or export it again"
     )

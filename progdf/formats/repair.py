@@ -37,7 +37,7 @@ def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
     """
     quats, lengths = _unit(scene.quats)
     counts = {"scaled_quats": int((lengths != 1).sum())}
-    if _all_good(scene, lengths):
+    if _is_clean(scene, lengths):
         return replace(scene, quats=quats), counts
 
     bad_means = ~(scene.means.abs() <= LARGEST_MEAN).all(dim=1)
@@ -95,7 +95,7 @@ def _unit(quats: Tensor) -> tuple[Tensor, Tensor]:
     return unit, lengths
 
 
-def _all_good(scene: Gaussians, lengths: Tensor) -> bool:
+def _is_clean(scene: Gaussians, lengths: Tensor) -> bool:
     """Whether nothing at all needs repair; one pass over the data without temporaries."""
     return (
         _within(scene.means, -LARGEST_MEAN, LARGEST_MEAN)

@@ -24,8 +24,8 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import check_regular, open_failure
-from progdf.terminal import printable
+from progdf.io.atomic import check_regular, open_error
+from progdf.terminal import escape_text
 
 from . import gaussforge_child
 from .compressed_ply import is_compressed, read_compressed_ply
@@ -60,11 +60,11 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         with path.open("rb") as file:
             start = file.read(64)
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     suffix = path.suffix.lower().lstrip(".")
     if start[:3] == b"ply":
         return "ply"
-    if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflated(start)[:4] == b"NGSP"):
+    if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
         return "spz"
     if start[:4] == b"PK\x03\x04":
         return "sog" if _sog_meta(path) is not None else None
@@ -108,15 +108,15 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         header = read_header(path)  # which knows best what is wrong with a file that is no .ply
         if not is_compressed(header):
             return load_ply_with_report(path)
-        return _repaired(path, read_compressed_ply(path, header), "compressed .ply")
+        return _repair(path, read_compressed_ply(path, header), "compressed .ply")
     if kind == "ksplat":
         scene, level = read_ksplat(path)
-        return _repaired(path, scene, f".ksplat, level {level}")
+        return _repair(path, scene, f".ksplat, level {level}")
     scene, report = _through_gaussforge(path, kind)
     told, antialiased = f".{kind}", False
     if kind == "spz":
         version, antialiased = _spz_header(path)
-        scene, told = turned_about_x(scene), f".spz {version}, turned from y up to y down"
+        scene, told = rotate_about_x(scene), f".spz {version}, turned from y up to y down"
     elif kind == "sog":
         meta = _sog_meta(path) or {}
         antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
@@ -126,7 +126,7 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     return replace(scene, antialiased=antialiased), report
 
 
-def turned_about_x(scene: Gaussians) -> Gaussians:
+def rotate_about_x(scene: Gaussians) -> Gaussians:
     """The scene after half a turn about x: y up and z towards the viewer become y down and z away from it."""
     turn = torch.tensor([1.0, -1.0, -1.0])
     degree = scene.sh_degree
@@ -140,7 +140,7 @@ def turned_about_x(scene: Gaussians) -> Gaussians:
     )
 
 
-def _repaired(path: Path, found: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
+def _repair(path: Path, found: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
     scene, counts = repair(found)
     repairs: dict[str, Any] = dict(counts)
     report = LoadReport(
@@ -178,13 +178,13 @@ def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise _unreadable(path, kind, f"gave no answer in {2 * seconds} s") from None
+            raise _read_error(path, kind, f"gave no answer in {2 * seconds} s") from None
         if ended.returncode or not target.is_file():
-            raise _unreadable(path, kind, _reason(ended.returncode, ended.stderr))
+            raise _read_error(path, kind, _reason(ended.returncode, ended.stderr))
         try:
             return load_ply_with_report(target)
         except ProgdfError:
-            raise _unreadable(path, kind, "gave no scene") from None
+            raise _read_error(path, kind, "gave no scene") from None
 
 
 def _reason(status: int, stderr: bytes) -> str:
@@ -193,13 +193,13 @@ def _reason(status: int, stderr: bytes) -> str:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
         return "ran out of its time" if name in ("SIGXCPU", "SIGKILL") else f"crashed ({name})"
     lines = stderr.decode("utf-8", "replace").strip().splitlines()
-    said = printable(lines[-1] if lines else "")
+    said = escape_text(lines[-1] if lines else "")
     if "bad_alloc" in said or said.startswith("MemoryError"):
         return "wanted more memory than such a file can need"
     return f"said: {said[:160]}" if said else "said nothing"
 
 
-def _unreadable(path: Path, kind: str, why: str) -> ProgdfError:
+def _read_error(path: Path, kind: str, why: str) -> ProgdfError:
     return ProgdfError(
         f"{path} cannot be read as .{kind}: its reader {why}; it is damaged: copy or export it again"
     )
@@ -211,7 +211,7 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _inflated(start: bytes) -> bytes:
+def _inflate(start: bytes) -> bytes:
     """What the beginning of a gzip file holds, at most 16 bytes of it."""
     try:
         return zlib.decompressobj(wbits=31).decompress(start, 16)
@@ -223,9 +223,9 @@ def _spz_header(path: Path) -> tuple[int, bool]:
     """The version of an .spz, and whether it was trained with Mip-Splatting's 2D filter."""
     with path.open("rb") as file:
         start = file.read(4096)
-    head = start if start[:4] == b"NGSP" else _inflated(start)
+    head = start if start[:4] == b"NGSP" else _inflate(start)
     if len(head) < 16:
-        raise _unreadable(path, "spz", "finds no header")
+        raise _read_error(path, "spz", "finds no header")
     return int.from_bytes(head[4:8], "little"), bool(head[14] & 1)
 
 

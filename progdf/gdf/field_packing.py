@@ -21,7 +21,7 @@ _PARTS = {"end_offset": "full", "residual_basis": "rest", "scale": "step", "coef
 _NETWORK = "network."
 
 
-def packed_field(field: BakedField) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def pack_field(field: BakedField) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and JSON values for a .gdf file; of a baked network, the network."""
     described: dict[str, Any] = {
         "kind": field.kind,
@@ -51,8 +51,8 @@ def packed_field(field: BakedField) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, described
 
 
-def unpacked_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[BakedField, NeuralForm | None]:
-    """The inverse of `packed_field`; of a network, a field that is not baked yet and moves nothing, and it.
+def unpack_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[BakedField, NeuralForm | None]:
+    """The inverse of `pack_field`; of a network, a field that is not baked yet and moves nothing, and it.
 
     Raises:
         ValueError, KeyError, TypeError: the parts do not fit each other.
@@ -67,7 +67,7 @@ def unpacked_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[Ba
             for name in table.attributes
         }
         return BakedField(table.kind, tensors["nodes"], attributes, table.channels, recorded), None
-    form = _unpacked_network(table.network, tensors, recorded)
+    form = _unpack_network(table.network, tensors, recorded)
     if form.network.shape.channels != table.channels:
         raise ValueError(
             f"the network has {form.network.shape.channels} channels, the field {table.channels}"
@@ -75,7 +75,7 @@ def unpacked_field(table: FieldTable, tensors: Mapping[str, Tensor]) -> tuple[Ba
     return BakedField("neural", torch.tensor([0.0, 1.0]), {}, table.channels, recorded, form), form
 
 
-def _unpacked_network(
+def _unpack_network(
     table: NetworkTable, tensors: Mapping[str, Tensor], recorded: tuple[float, ...]
 ) -> NeuralForm:
     end = tensors["end"]

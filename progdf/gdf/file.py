@@ -27,13 +27,21 @@ from progdf.errors import ProgdfError
 from progdf.field.bake import rows_hash
 from progdf.field.baked import BakedField
 from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
-from progdf.io.atomic import atomic_write, open_failure
+from progdf.io.atomic import atomic_write, open_error
 from progdf.io.tensors import table_of, write_tensors
 from progdf.region import Region
 
-from .field_packing import packed_field, unpacked_field
-from .header import FORMAT, GdfHead, SceneFingerprint, contradiction, damaged, head_checksum, read_head
-from .region_packing import packed_region, unpacked_region
+from .field_packing import pack_field, unpack_field
+from .header import (
+    FORMAT,
+    GdfHead,
+    SceneFingerprint,
+    contradiction_error,
+    damage_error,
+    head_checksum,
+    read_head,
+)
+from .region_packing import pack_region, unpack_region
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[int, str]] = WeakIdKeyDictionary()
 """Version and hash of the centres of scenes that are alive."""
@@ -133,8 +141,8 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ProgdfError: the place cannot be written.
         ValueError: a number of the field is not finite, or options or report hold something JSON cannot.
     """
-    tensors, described = packed_field(gdf.field)
-    tensors |= packed_region(gdf.region)
+    tensors, described = pack_field(gdf.field)
+    tensors |= pack_region(gdf.region)
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} of {gdf.name} has a number that is not finite")
@@ -148,8 +156,8 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
             "region": gdf.region.name,
             "members": len(gdf.region),
             "field": described,
-            "options": _plain(gdf.options),
-            "report": _plain(gdf.report),
+            "options": _to_json(gdf.options),
+            "report": _to_json(gdf.report),
         },
         ensure_ascii=False,
         allow_nan=False,
@@ -203,11 +211,11 @@ def load_gdf(
             f"{name} was made for another scene: {scene_name} has its Gaussians, but they look different"
         )
     try:
-        baked = gdf.field.origin.baked(rows)
+        baked = gdf.field.origin.bake(rows)
         _check_reach(baked)
         return replace(gdf, field=baked)
     except (ValueError, RuntimeError) as error:
-        raise contradiction(name, error) from error
+        raise contradiction_error(name, error) from error
 
 
 def _read(head: GdfHead) -> Gdf:
@@ -215,25 +223,25 @@ def _read(head: GdfHead) -> Gdf:
     try:
         content = head.path.read_bytes()
     except OSError as error:
-        raise open_failure(head.path, error) from error
+        raise open_error(head.path, error) from error
     try:
         tensors: dict[str, Tensor] = safetensors.torch.load(content)
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError, OverflowError):
-        raise damaged(head.path.name) from None
+        raise damage_error(head.path.name) from None
     if _checksum(head.text, tensors) != head.sha256:
-        raise damaged(head.path.name)
+        raise damage_error(head.path.name)
     try:
-        return _assembled(head, tensors)
+        return _assemble(head, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise contradiction(head.path.name, error) from error
+        raise contradiction_error(head.path.name, error) from error
 
 
-def _assembled(head: GdfHead, tensors: dict[str, Tensor]) -> Gdf:
+def _assemble(head: GdfHead, tensors: dict[str, Tensor]) -> Gdf:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} has a number that is not finite")
-    field, form = unpacked_field(head.field, tensors)
-    region = unpacked_region(head.region, tensors, head.scene.count, head.members)
+    field, form = unpack_field(head.field, tensors)
+    region = unpack_region(head.region, tensors, head.scene.count, head.members)
     _check_reach(field)
     if head.members != len(region):
         raise ValueError(f"the header has {head.members} members, the region {len(region)}")
@@ -271,12 +279,12 @@ def _checksum(header: str, tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """The same as JSON knows it: tuples become lists, paths text, numbers that are not finite null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): _to_json(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
+        return [_to_json(entry) for entry in value]
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, float) and not math.isfinite(value):

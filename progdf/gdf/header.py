@@ -18,8 +18,8 @@ import msgspec
 
 from progdf.errors import ProgdfError
 from progdf.field.neural import NeuralShape
-from progdf.io.atomic import check_regular, open_failure
-from progdf.io.json_values import decode_json, typed
+from progdf.io.atomic import check_regular, open_error
+from progdf.io.json_values import convert_json, decode_json
 
 FORMAT = 1
 """The version of the file format."""
@@ -110,7 +110,7 @@ class GdfHead:
         name, region, instruction: the layer's, the region's, and what was asked for
         members: Gaussians of the region
         scene: the scene it was made for
-        field: kind, channels, attributes …, see `field_packing.packed_field`
+        field: kind, channels, attributes …, see `field_packing.pack_field`
         options, report: of the training, JSON values
     """
 
@@ -187,7 +187,7 @@ def read_head(path: str | os.PathLike[str]) -> GdfHead:
                 )
             header = start[8:] + file.read(size - 1)
     except OSError as error:
-        raise open_failure(path, error) from error
+        raise open_error(path, error) from error
     return _head(Path(path), length, header)
 
 
@@ -195,20 +195,22 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
     name = path.name
     try:
         outer = decode_json(header)
-        metadata = typed(outer.pop("__metadata__", {}), dict[str, str]) if isinstance(outer, dict) else {}
-        table = typed(outer, dict[str, _Tensor])
+        metadata = (
+            convert_json(outer.pop("__metadata__", {}), dict[str, str]) if isinstance(outer, dict) else {}
+        )
+        table = convert_json(outer, dict[str, _Tensor])
         text = metadata.get("progdf")
     except ValueError:
-        raise damaged(name) from None
+        raise damage_error(name) from None
     if text is None:
         raise ProgdfError(
             f"{name} is a safetensors file, but not a .gdf; give one that progdf train has written"
         )
     try:
         content = decode_json(text)
-        version = typed(content["format"], int)
+        version = convert_json(content["format"], int)
     except (ValueError, KeyError, TypeError):
-        raise damaged(name) from None
+        raise damage_error(name) from None
     if version > FORMAT:
         raise ProgdfError(f"{name} has format {version}, this progdf reads format {FORMAT}; update progdf")
     needed = 8 + len(header) + max((tensor.data_offsets[1] for tensor in table.values()), default=0)
@@ -218,16 +220,16 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
         )
     tensors = {key: (tuple(tensor.shape), tensor.dtype) for key, tensor in table.items()}
     if version < FORMAT or metadata.get("header_sha256") != head_checksum(text, tensors):
-        raise damaged(name)
+        raise damage_error(name)
     try:
-        found = typed(content, _Header)
+        found = convert_json(content, _Header)
         if found.field.network is not None:
             strange = set(content["field"]["network"]["shape"]) - {part.name for part in fields(NeuralShape)}
             if strange:  # of a later version, perhaps, which reads the network in another way
                 raise ValueError(f"the network has {min(strange)}, which is unknown here")
         _check(found, tensors)
     except ValueError as error:
-        raise contradiction(name, error) from error
+        raise contradiction_error(name, error) from error
     return GdfHead(
         path=path,
         size=length,
@@ -274,12 +276,12 @@ def head_checksum(text: str, tensors: Mapping[str, tuple[tuple[int, ...], str]])
     return digest.hexdigest()
 
 
-def damaged(name: str) -> ProgdfError:
+def damage_error(name: str) -> ProgdfError:
     """The line for a file that is not what was saved."""
     return ProgdfError(f"{name} is damaged: its checksum does not match; copy it again or make it again")
 
 
-def contradiction(name: str, error: Exception) -> ProgdfError:
+def contradiction_error(name: str, error: Exception) -> ProgdfError:
     """The line for a file whose parts do not fit each other."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return ProgdfError(f"{name} is inconsistent ({reason}); make it again with progdf train")

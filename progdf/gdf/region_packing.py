@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.region import Region
 
 
-def packed_region(region: Region) -> dict[str, Tensor]:
+def pack_region(region: Region) -> dict[str, Tensor]:
     """Tensors for a .gdf file.
 
     The score is kept to 1/255, and only where that differs from 1 for members and 0 for all others.
@@ -22,34 +22,34 @@ def packed_region(region: Region) -> dict[str, Tensor]:
     crisp = np.zeros(count, np.uint8)
     crisp[members] = 255
     soft = np.flatnonzero(levels != crisp)
-    tensors = _packed_rows("members", members, count)
+    tensors = _pack_rows("members", members, count)
     if len(soft):
-        tensors |= _packed_rows("score", soft, count)
+        tensors |= _pack_rows("score", soft, count)
         tensors["score.levels"] = torch.from_numpy(levels[soft])
     return tensors
 
 
-def unpacked_region(
+def unpack_region(
     name: str, tensors: Mapping[str, Tensor], count: int, expected: int | None = None
 ) -> Region:
-    """The inverse of `packed_region` for a scene of `count` Gaussians; with how many members, if it is known.
+    """The inverse of `pack_region` for a scene of `count` Gaussians; with how many members, if it is known.
 
     Raises:
         ValueError, KeyError: the tensors do not describe rows of that scene.
     """
-    members = _unpacked_rows("members", tensors, count, expected)
+    members = _unpack_rows("members", tensors, count, expected)
     score = torch.zeros(count)
     score[members] = 1.0
     if "score.levels" in tensors:
         levels = tensors["score.levels"]
-        soft = _unpacked_rows("score", tensors, count, levels.numel())
+        soft = _unpack_rows("score", tensors, count, levels.numel())
         if levels.dtype != torch.uint8 or levels.shape != soft.shape:
             raise ValueError(f"{len(soft)} soft scores have levels {list(levels.shape)} {levels.dtype}")
         score[soft] = levels.float() / 255
     return Region(name, members, score)
 
 
-def _packed_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
+def _pack_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
     """Sorted unique rows below `count`: `.bits` [⌈N/8⌉], `.runs` [R,2] first and length, or `.rows` [M]."""
     breaks = np.flatnonzero(np.diff(rows) != 1) + 1
     starts = np.concatenate([rows[:1], rows[breaks]])
@@ -68,7 +68,7 @@ def _packed_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
     return {f"{key}.{shortest}": torch.from_numpy(stored)}
 
 
-def _unpacked_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: int | None) -> Tensor:
+def _unpack_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: int | None) -> Tensor:
     """Sorted, unique and within the scene, or a ValueError; as many as expected, told before they are made,
     as eight bytes of a run can name millions. [M] int64"""
     if f"{key}.bits" in tensors:

@@ -43,7 +43,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.is_dir():
         raise ProgdfError(f"{target} is a folder; give the name of a file in it")
     if target.exists() and not target.is_file():
-        with _copied_into(target) as temporary_file:
+        with _copy_into(target) as temporary_file:
             yield temporary_file
         return
     if target.is_symlink():
@@ -56,7 +56,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         _create(temporary_file, target.stat().st_mode & 0o777 if target.exists() else None)
     except OSError as error:
-        raise unwritable(target, error) from error
+        raise write_error(target, error) from error
     try:
         yield temporary_file
         os.replace(temporary_file, target)
@@ -64,7 +64,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         full = disk_full(error)
         if full is None:
             raise
-        raise unwritable(target, full) from full
+        raise write_error(target, full) from full
     finally:
         temporary_file.unlink(missing_ok=True)
 
@@ -82,7 +82,7 @@ def _create(path: Path, mode: int | None) -> None:
 
 
 @contextmanager
-def _copied_into(target: Path) -> Iterator[Path]:
+def _copy_into(target: Path) -> Iterator[Path]:
     """A temporary file whose bytes go into a pipe or a device in the end."""
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         whole = Path(folder) / f"whole{target.suffix}"
@@ -134,10 +134,10 @@ def make_folder(path: str | os.PathLike[str]) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise unwritable(path, error) from error
+        raise write_error(path, error) from error
 
 
-def unwritable(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
+def write_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     """The one line for a file or a folder that cannot be written."""
     reason = error.strerror or error
     return ProgdfError(f"{path} cannot be written ({reason}); give a place that can be written to")
@@ -159,7 +159,7 @@ def check_regular(path: str | os.PathLike[str]) -> None:
         raise ProgdfError(f"{path} is a pipe or a device; give a file")
 
 
-def open_failure(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
+def open_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     """The one line for a file that cannot be opened."""
     if isinstance(error, FileNotFoundError):
         return ProgdfError(f"{path} does not exist; check the name and the folder")

@@ -21,7 +21,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.lens import Lens
 
-from .atomic import atomic_write, check_regular, open_failure
+from .atomic import atomic_write, check_regular, open_error
 from .colmap import find_model, load_model
 from .json_values import angle_at, decode_json, matrix_at, number_at, pixels_at, table_at
 
@@ -116,7 +116,7 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     try:
         content = decode_json(Path(path).read_bytes())
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     except ValueError as error:
         raise ProgdfError(
             f"{name} is not JSON ({error}); give a cameras.json, a transforms.json or a file of saved cameras"
@@ -145,7 +145,7 @@ def kind_of_cameras(path: str | os.PathLike[str]) -> str:
     try:
         content = json.loads(Path(path).read_bytes())
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     except (ValueError, RecursionError):
         return "other"
     return "own" if isinstance(content, dict) and content.get("format") == _FORMAT else "other"

@@ -22,8 +22,8 @@ from progdf.errors import ProgdfError
 from progdf.lens import Lens
 
 from . import colmap_child
-from .atomic import open_failure
-from .json_values import decode_json, typed
+from .atomic import open_error
+from .json_values import convert_json, decode_json
 
 _NEEDED = ("cameras", "images")
 _OPTIONAL = ("rigs", "frames")
@@ -85,7 +85,7 @@ def load_model(model: Path) -> list[Camera]:
                 if name in _NEEDED or source.is_file():
                     shutil.copyfile(source, Path(beside, source.name))
         except OSError as error:
-            raise open_failure(error.filename or model, error) from None
+            raise open_error(error.filename or model, error) from None
         Path(beside, f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         images = _images(Path(beside))
     if images is None:
@@ -106,7 +106,7 @@ def _images(folder: Path) -> list[_Image] | None:
         ended = subprocess.run(
             words, stdin=subprocess.DEVNULL, capture_output=True, timeout=6 * seconds, check=False
         )
-        return None if ended.returncode else typed(decode_json(ended.stdout), list[_Image])
+        return None if ended.returncode else convert_json(decode_json(ended.stdout), list[_Image])
     except (subprocess.TimeoutExpired, ValueError):
         return None
 

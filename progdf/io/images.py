@@ -112,7 +112,7 @@ def open_picture(path: str | os.PathLike[str], proportions: tuple[int, int] | No
     Raises:
         ProgdfError: it is missing, no picture, too large, or of other proportions.
     """
-    with _opened(path) as picture:
+    with _open(path) as picture:
         width, height = picture.size
         if proportions is not None and abs(width * proportions[1] / (height * proportions[0]) - 1) > 0.02:
             raise ProgdfError(
@@ -125,12 +125,12 @@ def open_picture(path: str | os.PathLike[str], proportions: tuple[int, int] | No
 
 def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Width and height of a picture. Raises ProgdfError as `open_picture` does."""
-    with _opened(path) as picture:
+    with _open(path) as picture:
         return picture.size
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
+def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     check_regular(path)
     try:
         with warnings.catch_warnings():
@@ -148,14 +148,14 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
         raise ProgdfError(f"{path} cannot be read as a picture ({reason}); save it as PNG") from error
 
 
-def laid_on(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
+def flatten_onto(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
     """The picture without transparency, on a paper of one colour, scaled to `size`. RGB"""
     if not picture.has_transparency_data:
         plain = picture.convert("RGB")
         return plain if size in (None, plain.size) else plain.resize(size, Image.Resampling.LANCZOS)
     paper = Image.new("RGBA", picture.size, color)
     paper.alpha_composite(picture.convert("RGBA"))
-    return laid_on(paper.convert("RGB"), color, size)
+    return flatten_onto(paper.convert("RGB"), color, size)
 
 
 def to_picture(image: Tensor) -> Image.Image:

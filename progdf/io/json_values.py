@@ -33,10 +33,10 @@ def decode_json(content: bytes | str) -> Any:
     try:
         value = json.loads(
             content,
-            parse_int=lambda digits: int(digits) if len(digits) <= _LONGEST_INT else _finite(digits),
-            parse_float=_finite,
-            parse_constant=_finite,
-            object_pairs_hook=_without_repeats,
+            parse_int=lambda digits: int(digits) if len(digits) <= _LONGEST_INT else _parse_finite(digits),
+            parse_float=_parse_finite,
+            parse_constant=_parse_finite,
+            object_pairs_hook=_refuse_repeats,
         )
     except RecursionError:
         raise ValueError(f"it is nested more than {DEEPEST} deep") from None
@@ -44,7 +44,7 @@ def decode_json(content: bytes | str) -> Any:
     return value
 
 
-def typed(value: object, kind: type[_T]) -> _T:
+def convert_json(value: object, kind: type[_T]) -> _T:
     """A JSON value as a dataclass, a `msgspec.Struct`, or what else declares its types.
 
     Raises:
@@ -56,14 +56,14 @@ def typed(value: object, kind: type[_T]) -> _T:
         raise ValueError(str(error)) from None
 
 
-def _finite(digits: str) -> float:
+def _parse_finite(digits: str) -> float:
     number = float(digits)
     if not math.isfinite(number):
         raise ValueError(f"{digits[:12]}{'…' * (len(digits) > 12)} is not a usable number")
     return number
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
         raise ValueError("a key is there twice")
@@ -95,7 +95,7 @@ def number_at(where: str, table: Mapping[str, Any], key: str) -> float:
     """A number that is finite in float32."""
     value = table.get(key)
     if not _is_number(value):
-        raise ProgdfError(f"{where} has {key} = {_shown(value)}; expected a number")
+        raise ProgdfError(f"{where} has {key} = {_short_text(value)}; expected a number")
     return float(table[key])
 
 
@@ -135,5 +135,5 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
 
 
-def _shown(value: object) -> str:
+def _short_text(value: object) -> str:
     return "nothing" if value is None else repr(value)[:40]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 
-from .atomic import check_regular, open_failure
+from .atomic import check_regular, open_error
 
 
 def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any]:
@@ -27,7 +27,7 @@ def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any
     try:
         array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     except Exception:  # numpy reads the header as a Python literal, and raises whatever that raises
         raise ProgdfError(
             f"{path} is not a readable .npy file of {what}; save them with numpy.save"

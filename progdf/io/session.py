@@ -29,8 +29,8 @@ import msgspec
 
 from progdf.errors import ProgdfError
 
-from .atomic import atomic_write, check_regular, open_failure
-from .json_values import decode_json, typed
+from .atomic import atomic_write, check_regular, open_error
+from .json_values import convert_json, decode_json
 
 VERSION = 1
 MARK = "progdf_session"
@@ -124,7 +124,7 @@ def write_session(path: Path, session: SessionFile) -> None:
 
 
 def read_session(path: str | os.PathLike[str]) -> SessionFile:
-    """Read it; the files it names are not touched, see `verified`.
+    """Read it; the files it names are not touched, see `verify_files`.
 
     Raises:
         ProgdfError: it cannot be read, is no session, of a newer version, or holds what no session holds.
@@ -135,7 +135,7 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
         with Path(path).open("rb") as file:
             content = file.read(_LARGEST + 1)
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     if len(content) > _LARGEST:
         raise ProgdfError(
             f"{name} has more than {_LARGEST >> 20} MB, too much for a session; give one saved with Ctrl+S"
@@ -154,13 +154,13 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
             f"{name} is a session of version {version}; this progdf reads up to {VERSION}, update it"
         )
     try:
-        found = typed(table, _Table)
+        found = convert_json(table, _Table)
     except ValueError as error:
         raise ProgdfError(f"{name} is a damaged session ({error}); save it anew or update progdf") from None
     return SessionFile(found.scene, tuple(found.edits), found.view, tuple(found.snapshots))
 
 
-def verified(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
+def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
     """The scene and the edits of the session at `path`, each found and with the content it had then.
 
     Raises:
@@ -191,7 +191,7 @@ def sha256(path: Path) -> str:
         state = path.stat()
         return _sha256(str(path), state.st_size, state.st_mtime_ns, state.st_ino)
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
 
 
 @lru_cache(maxsize=256)

@@ -50,11 +50,11 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     _check_pair(image, target)
     x, y = (v.movedim(-1, 0)[:, None] for v in (image, target))
     # beyond the border the window is cut off and its weights scaled back to a sum of 1
-    share = _blurred(torch.ones_like(x[:1]))
-    mean_x, mean_y = _blurred(x) / share, _blurred(y) / share
-    var_x = (_blurred(x * x) / share - mean_x * mean_x).clamp(min=0)
-    var_y = (_blurred(y * y) / share - mean_y * mean_y).clamp(min=0)
-    covariance = _blurred(x * y) / share - mean_x * mean_y
+    share = _blur(torch.ones_like(x[:1]))
+    mean_x, mean_y = _blur(x) / share, _blur(y) / share
+    var_x = (_blur(x * x) / share - mean_x * mean_x).clamp(min=0)
+    var_y = (_blur(y * y) / share - mean_y * mean_y).clamp(min=0)
+    covariance = _blur(x * y) / share - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity = similarity / ((mean_x * mean_x + mean_y * mean_y + c1) * (var_x + var_y + c2))
@@ -68,7 +68,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     return per_pixel.mean()
 
 
-def _blurred(planes: Tensor) -> Tensor:
+def _blur(planes: Tensor) -> Tensor:
     """Weighted sums over the window, zero beyond the border. [C,1,H,W]"""
     offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
     kernel = torch.exp(-offsets.square() / (2 * SIGMA**2))

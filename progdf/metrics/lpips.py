@@ -130,13 +130,13 @@ class Lpips:
                 stored = layers[backbone.group][f"Conv_{i}"]
                 shape = (layer.side, layer.side, layer.inputs, layer.outputs)
                 # stored as height, width, in, out; torch wants out, in, height, width
-                kernels.append(_checked(stored["kernel"], shape).permute(3, 2, 0, 1).contiguous())
-                biases.append(_checked(stored["bias"], (layer.outputs,)))
+                kernels.append(_check_array(stored["kernel"], shape).permute(3, 2, 0, 1).contiguous())
+                biases.append(_check_array(stored["bias"], (layer.outputs,)))
             for i, layer in enumerate(layer for layer in backbone.convolutions if layer.compared):
                 line = layers[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
-                importance.append(_checked(line, (1, 1, layer.outputs, 1)).flatten())
+                importance.append(_check_array(line, (1, 1, layer.outputs, 1)).flatten())
         except (KeyError, TypeError) as error:
-            raise _unexpected(f"{error} is missing") from error
+            raise _format_error(f"{error} is missing") from error
         parts = ([tensor.to(device) for tensor in part] for part in (kernels, biases, importance))
         return cls(backbone, *parts)
 
@@ -217,23 +217,23 @@ def _read_weights(path: Path) -> Mapping[str, Any]:
         AttributeError,
         IndexError,
     ) as error:
-        raise _unexpected(str(error)) from error
+        raise _format_error(str(error)) from error
     if not isinstance(layers, dict):
         _refuse(f"it holds a {type(layers).__name__}")
     return layers
 
 
-def _checked(array: Any, shape: tuple[int, ...]) -> Tensor:
+def _check_array(array: Any, shape: tuple[int, ...]) -> Tensor:
     if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.shape != shape:
         _refuse(f"an array is {getattr(array, 'shape', type(array))}, expected {shape}")
     return torch.from_numpy(array.copy())
 
 
 def _refuse(reason: str) -> NoReturn:
-    raise _unexpected(reason)
+    raise _format_error(reason)
 
 
-def _unexpected(reason: str) -> ProgdfError:
+def _format_error(reason: str) -> ProgdfError:
     return ProgdfError(
         f"LPIPS' file of weights is not what was expected ({reason}); {REMEDY} --force-reinstall"
     )

@@ -58,8 +58,8 @@ def slider_statistics(
         monotone=max(falls) <= 0.01 * whole,
         uniformity=min(steps) / max(steps) if max(steps) > 0 else 0.0,
         largest_jump=_largest_jump(pictures, steps, masks) / whole if whole > 0 else 0.0,
-        t50=_reached(distances, 0.5),
-        t90=_reached(distances, 0.9),
+        t50=_place_of_share(distances, 0.5),
+        t90=_place_of_share(distances, 0.9),
         distances=tuple(distances),
         steps=tuple(steps),
     )
@@ -93,7 +93,7 @@ def _largest_jump(pictures: Pictures, steps: Sequence[float], masks: Sequence[Te
     return change
 
 
-def _reached(distances: Sequence[float], share: float) -> float:
+def _place_of_share(distances: Sequence[float], share: float) -> float:
     """Where the course of distances first reaches a share of its last value, linear in between. 0..1"""
     goal = share * distances[-1]
     if goal <= 0:

@@ -78,7 +78,7 @@ def rasterize(
         ProgdfError: more (Gaussian, tile) pairs than memory should hold.
     """
     _check_shapes(means, quats, scales, opacities, colors, viewmat, K, sh_degree)
-    window = _checked_crop(crop, width, height)
+    window = _resolve_crop(crop, width, height)
     if grad_rows is not None and (viewmat.requires_grad or K.requires_grad):
         raise ValueError("grad_rows are given, but viewmat or K wants gradients, which need all rows")
     if background is None:
@@ -180,7 +180,7 @@ def _check_shapes(
         )
 
 
-def _checked_crop(crop: Crop | None, width: int, height: int) -> Crop:
+def _resolve_crop(crop: Crop | None, width: int, height: int) -> Crop:
     if width < 1 or height < 1:
         raise ValueError(f"the image is {width}x{height} pixels; both must be at least 1")
     if crop is None:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .cpu.engine import bin_view, float32, make_pinhole, share_tiles
+from .cpu.engine import bin_view, make_pinhole, share_tiles, to_float32
 from .cpu.jit import compilation
 from .cpu.weights import Runs, add_gradients, add_images, list_weights
 from .engines import ActivatedGaussians, Crop, RasterView
@@ -35,13 +35,13 @@ class ColorMap:
     def picture(self, colors: Tensor) -> Tensor:
         """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
         image = np.zeros((self.size[0] * self.size[1], 3), np.float32)
-        add_images(self.runs, float32(colors).numpy(), image)
+        add_images(self.runs, to_float32(colors).numpy(), image)
         return torch.from_numpy(image).view(*self.size, 3)
 
     def gradient(self, image: Tensor) -> Tensor:
         """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
         colors = np.zeros((self.count, 3), np.float32)
-        add_gradients(self.runs, float32(image).numpy().reshape(-1, 3), colors)
+        add_gradients(self.runs, to_float32(image).numpy().reshape(-1, 3), colors)
         return torch.from_numpy(colors)
 
 

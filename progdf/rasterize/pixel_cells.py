@@ -74,7 +74,7 @@ def _cells_of(
 
 
 @kernel()
-def _all_marked(cells: Array, x0: int, y0: int, x1: int, y1: int) -> bool:
+def _are_all_marked(cells: Array, x0: int, y0: int, x1: int, y1: int) -> bool:
     for y in range(y0, y1):
         for x in range(x0, x1):
             if not cells[y, x]:
@@ -91,7 +91,7 @@ def _mark(cells: Array, rows: Array, scene: Scene, camera: Pinhole) -> None:
             continue
         # first the bound that needs no covariance: most land where others did
         x0, y0, x1, y1 = _cells_of(px, py, math.sqrt(wide2), math.sqrt(high2), width, height)
-        if _all_marked(cells, x0, y0, x1, y1):
+        if _are_all_marked(cells, x0, y0, x1, y1):
             continue
         seen = footprint(camera, scene, i)
         radius2 = 2.0 * math.log(np.float64(scene.opacities[i]) / ALPHA_MIN)

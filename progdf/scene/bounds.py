@@ -47,7 +47,7 @@ def near_plane(radius: float) -> float:
     return NEAR * min(1.0, radius)
 
 
-def front(up: Tensor) -> Tensor:
+def front_direction(up: Tensor) -> Tensor:
     """The level direction from a scene to someone who looks at its front. [3] -> [3], unit length
 
     +z for y up, −z for y down (the side the cameras of a COLMAP scene mostly look from), −y for z up; the
@@ -89,14 +89,14 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
 
 def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
     """The cell of a square grid over the ground plan that each Gaussian's mean falls in. [N] int64"""
-    ahead = front(up)
+    ahead = front_direction(up)
     plan = scene.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
     place = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
     return place[:, 0] * per_side + place[:, 1]
 
 
-def without_background(scene: Gaussians) -> Gaussians | None:
+def drop_background(scene: Gaussians) -> Gaussians | None:
     """An even sample of what is visible and near the middle; None where that tells nothing of a shape."""
     sample = _sample(scene)
     sample = sample[(sample.opacities > _SOLID).nonzero()[:, 0]]

@@ -12,7 +12,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 
-from .bounds import front, is_surrounding, scene_sphere
+from .bounds import front_direction, is_surrounding, scene_sphere
 from .up_axis import guess_up
 
 _log = logging.getLogger(__name__)
@@ -37,8 +37,8 @@ def orbit_rig(
 ) -> list[Camera]:
     """Cameras all around a scene that has none, in order of azimuth.
 
-    Azimuths are even and begin at the front (see `framing.front`); elevations follow the golden ratio over
-    the band, even in area: every n-th camera of the list is spread as evenly as the whole.
+    Azimuths are even and begin at `bounds.front_direction`; elevations follow the golden ratio over the band,
+    even in area: every n-th camera of the list is spread as evenly as the whole.
 
     Args:
         scene: framed by its median centre and 97th-percentile radius, see `scene_sphere`
@@ -70,7 +70,7 @@ def orbit_rig(
     K = intrinsics(fov_y, width, height)
     half = math.atan(0.5 * min(width, height) / float(K[1, 1]))
     away = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
-    ahead = front(up)
+    ahead = front_direction(up)
     side = torch.linalg.cross(up, ahead)
     low, high = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
     cameras = []

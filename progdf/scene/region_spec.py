@@ -29,13 +29,13 @@ from progdf.gaussians import Gaussians
 from progdf.io.npy import open_npy
 from progdf.region import (
     Region,
-    everything,
+    difference,
     from_labels,
     from_mask,
     inside_box,
     inside_sphere,
     union,
-    without,
+    whole_scene,
 )
 
 Kind = Callable[[str, Gaussians], Region]
@@ -64,12 +64,12 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
     for sign, part in split_spec(spec, tuple(known)):
         kind, colon, rest = part.partition(":")
         if part == "all":
-            found = everything(scene)
+            found = whole_scene(scene)
         elif colon and kind in known:
             found = known[kind](rest, scene)
         else:
             raise _unknown(part, known)
-        region = (union if sign == "+" else without)(region, found)
+        region = (union if sign == "+" else difference)(region, found)
     if not len(region):
         raise ProgdfError(f"region '{spec}' holds no Gaussian; the scene reaches {_extent(scene)}")
     return Region(name or spec.strip(), region.members, region.score)
@@ -175,10 +175,10 @@ def _open_labels(path: str) -> NDArray[Any]:
 
 
 def _check_labels(rest: str) -> None:
-    _open_labels(_labels_wanted(rest)[0])
+    _open_labels(_parse_labels(rest)[0])
 
 
-def _labels_wanted(rest: str) -> tuple[str, list[int]]:
+def _parse_labels(rest: str) -> tuple[str, list[int]]:
     """The file and the labels of FILE.npy:ID[,ID…]."""
     path, colon, ids = rest.rpartition(":")
     if not colon or not path:
@@ -192,7 +192,7 @@ def _labels_wanted(rest: str) -> tuple[str, list[int]]:
 
 
 def _labels(rest: str, scene: Gaussians) -> Region:
-    path, wanted = _labels_wanted(rest)
+    path, wanted = _parse_labels(rest)
     labels = read_labels(path, len(scene))
     present = torch.unique(labels).tolist()
     absent = [wanted_id for wanted_id in wanted if wanted_id not in present]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.formats.load_report import counted
+from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
 
 from .bounds import is_surrounding, scene_sphere
@@ -74,7 +74,7 @@ class Survey:
             (self.giants, "giant", f"(longer than {GIANT:g} of the scene's radius)"),
             (self.needles, "needle", f"({NEEDLE:g} times as long as wide, and long)"),
         )
-        lines += [f"odd: {counted(rows, noun)} {what}" for rows, noun, what in odd if rows]
+        lines += [f"odd: {format_count(rows, noun)} {what}" for rows, noun, what in odd if rows]
         if self.surrounding:
             lines.append(
                 "cameras: a scene to stand inside, which cameras around it cannot frame; give its own, "

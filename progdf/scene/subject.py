@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 
-from .bounds import front, has_ceiling
+from .bounds import front_direction, has_ceiling
 
 _SAMPLE = 60_000
 _ENOUGH = 64
@@ -54,14 +54,14 @@ def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
     if len(solid) < _ENOUGH:
         return rows
     rows = _without_background(scene, solid)
-    height, plan = _upright(scene.means[rows], up)
-    standing = _standing(height, plan)
+    height, plan = _heights_and_plan(scene.means[rows], up)
+    standing = _rows_above_ground(height, plan)
     if standing is not None:
         rows, height, plan = rows[standing], height[standing], plan[standing]
-    return rows[_of_large_things(torch.cat([plan, height[:, None]], dim=1))]
+    return rows[_rows_of_large_things(torch.cat([plan, height[:, None]], dim=1))]
 
 
-def fitted_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, float]) -> Tensor:
+def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, float]) -> Tensor:
     """Where the eye stands that looks along −back and has the points in its picture, as near as can be. [3]
 
     Args:
@@ -94,7 +94,7 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
         eye [3], target [3]
     """
     means = scene.means[_sample(scene)]
-    ahead = front(up)
+    ahead = front_direction(up)
     axes = torch.stack([ahead, torch.linalg.cross(up, ahead), up])
     inside = means @ axes.T
     low, high = (torch.stack([_quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
@@ -132,9 +132,9 @@ def _without_background(scene: Gaussians, rows: Tensor) -> Tensor:
     return rows
 
 
-def _upright(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+def _heights_and_plan(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     """Heights [R] and places in plan [R,2], both over the plan's half diagonal, the plan about its middle."""
-    ahead = front(up)
+    ahead = front_direction(up)
     plan = means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.01, 0.99))
     unit = (0.5 * (high - low)).norm().clamp_min(1e-12)
@@ -142,7 +142,7 @@ def _upright(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     return (height - height.median()) / unit, (plan - 0.5 * (low + high)) / unit
 
 
-def _standing(height: Tensor, plan: Tensor) -> Tensor | None:
+def _rows_above_ground(height: Tensor, plan: Tensor) -> Tensor | None:
     """Which rows stand above a ground. [R], [R,2] -> [R] bool; None where there is no ground to speak of."""
     cells = ((plan + 1.0) * 0.5 * _PLAN).long().clamp(0, _PLAN - 1)
     taken, cell, counts = torch.unique(
@@ -189,19 +189,19 @@ def _powers(plan: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
-def _of_large_things(places: Tensor) -> Tensor:
+def _rows_of_large_things(places: Tensor) -> Tensor:
     """Which rows belong to large connected things. [R,3] -> [R] bool, at least one"""
     low, high = (torch.stack([_quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
     side = float((high - low).amax().clamp_min(1e-9)) / _ACROSS
     span = 2 * _ACROSS + 2
     keys = ((places - low) / side + 0.5 * _ACROSS).clamp(0, span - 3).long() + 1
     boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
-    thing = _connected(boxes, span)
+    thing = _connected_cells(boxes, span)
     size = torch.zeros(len(boxes)).index_add(0, thing, torch.ones(len(boxes)))
     return (size[thing] >= _LEAST * size.max())[box]
 
 
-def _connected(boxes: Tensor, span: int) -> Tensor:
+def _connected_cells(boxes: Tensor, span: int) -> Tensor:
     """Which thing each cell belongs to; cells that touch, corners included, are one. [B] ascending -> [B]"""
     steps = torch.tensor([-1, 0, 1])
     around = boxes[:, None] + ((steps[:, None, None] * span + steps[:, None]) * span + steps).flatten()

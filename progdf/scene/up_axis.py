@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 
-from .bounds import has_ceiling, plan_cells, plane_facing, without_background
+from .bounds import drop_background, has_ceiling, plan_cells, plane_facing
 
 if TYPE_CHECKING:
     from progdf.camera import Camera
@@ -57,7 +57,7 @@ class UpAxis:
             return ("-" if float(self.direction[axis]) < 0 else "+") + "xyz"[axis]
         return " ".join(f"{float(x):.3g}" for x in self.direction)
 
-    def saved(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, object]:
         """As JSON values, for reports and .gdf files."""
         return {"direction": [float(x) for x in self.direction], "reason": self.reason}
 
@@ -97,8 +97,8 @@ def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
     return find_up(scene, cameras).direction
 
 
-def saved_up(saved: object) -> Tensor | None:
-    """The direction that `UpAxis.saved` wrote. [3] unit length; None for anything else."""
+def up_from_json(saved: object) -> Tensor | None:
+    """The direction that `UpAxis.to_json` wrote. [3] unit length; None for anything else."""
     numbers = saved.get("direction") if isinstance(saved, dict) else None
     if not isinstance(numbers, list) or len(numbers) != 3:
         return None
@@ -110,7 +110,7 @@ def saved_up(saved: object) -> Tensor | None:
 
 def _ground_axis(scene: Gaussians, convention: Axis) -> Axis | None:
     """The axis that stands on a ground, if one clearly does."""
-    sample = without_background(scene)
+    sample = drop_background(scene)
     if sample is None:
         return None
     slabs = [_slab(sample, axis) for axis in range(3)]

@@ -19,7 +19,7 @@ import torch
 import tyro
 
 from progdf.demo_scenes import bear
-from progdf.demo_scenes.edits import AnalyticEdit, bear_edits, grown
+from progdf.demo_scenes.edits import AnalyticEdit, bear_edits, scale_edit
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.images import write_image
@@ -64,7 +64,9 @@ def hands_truth(path: Path = PLAYBOT, factor: float = 1.35, lift: float = 0.12) 
     scene = load_ply(path)
     labels = np.load(path.with_name(f"{path.stem}_labels.npy"))
     centres = [scene.means[torch.from_numpy(labels == hand)].mean(dim=0) for hand in _HANDS]
-    return Truth(scene, labels, _HANDS, grown(factor, torch.stack(centres), torch.tensor([0.0, -lift, 0.0])))
+    return Truth(
+        scene, labels, _HANDS, scale_edit(factor, torch.stack(centres), torch.tensor([0.0, -lift, 0.0]))
+    )
 
 
 def write_truth(folder: Path, truth: Truth) -> tuple[Path, str]:

@@ -8,7 +8,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField, NeuralField, NeuralSettings, baked_neural, fit_neural
+from progdf.field import BakedField, NeuralField, NeuralSettings, bake_network, fit_neural
 from progdf.gaussians import Gaussians, pack
 from tests.helpers.edits import curved_trajectory, some_rows
 from tests.helpers.scenes import random_gaussians
@@ -45,7 +45,7 @@ def network(form: str = "own", moving: tuple[str, ...] = ("means", "sh0")) -> Ne
 
 @cache
 def baked(form: str = "own") -> BakedField:
-    return baked_neural(network(form), rows())
+    return bake_network(network(form), rows())
 
 
 def smooth_trajectory(places: Tensor) -> tuple[Tensor, Tensor]:

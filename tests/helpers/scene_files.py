@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from progdf.formats.ply import save_ply
-from progdf.formats.scene_file import turned_about_x
+from progdf.formats.scene_file import rotate_about_x
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 
@@ -20,7 +20,7 @@ def write_scene(path: Path, scene: Gaussians, spz_version: int = 4) -> Path:
     gaussforge = pytest.importorskip("gaussforge")
     kind = path.suffix.lstrip(".")
     plain = path.with_suffix(".plain.ply")
-    save_ply(plain, turned_about_x(scene) if kind == "spz" else scene)  # gaussforge leaves axes as they are
+    save_ply(plain, rotate_about_x(scene) if kind == "spz" else scene)  # gaussforge leaves axes as they are
     found = gaussforge.GaussForge().convert(plain.read_bytes(), "ply", kind, spz_version=spz_version)
     plain.unlink()
     path.write_bytes(found["data"])

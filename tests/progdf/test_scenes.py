@@ -64,7 +64,7 @@ def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
         x, y, z = camera.position.tolist()
         assert max(abs(x), abs(z)) < 1.9
         assert 0.9 < y < 2.0
-    camera = scene.cameras[5].resized(96, 72)
+    camera = scene.cameras[5].resize(96, 72)
     red, green = (render(scene.gaussians, camera, background=c) for c in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     # closed on all sides: next to nothing of the background is left
     assert float((red - green).abs().mean()) < 0.02
@@ -118,7 +118,7 @@ def test_no_gaussian_is_buried_in_another_part() -> None:
 def test_the_bear_has_no_holes_seen_from_its_cameras(bear: scenes.DemoScene) -> None:
     # what shines through from behind changes with the background, and nothing else does
     red, green = (
-        render(bear.gaussians, bear.cameras[0].resized(160, 160), background=color)
+        render(bear.gaussians, bear.cameras[0].resize(160, 160), background=color)
         for color in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     )
     leak = (red - green).abs().amax(dim=2)
@@ -134,7 +134,7 @@ def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
     assert float(front.position[2]) > 2
     assert abs(float(front.position[0])) < 1e-4
     assert float(back.position[2]) < -2
-    image = render(bear.gaussians, front.resized(128, 128), background=bear.background)
+    image = render(bear.gaussians, front.resize(128, 128), background=bear.background)
     assert torch.allclose(image[2, 2], torch.tensor(bear.background), atol=0.02)
     dark = (image.amax(dim=2) < 0.2).nonzero().float().mean(0)
     assert 25 < float(dark[0]) < 60  # eyes and nose: the darkest of the picture, in its upper half
@@ -176,7 +176,7 @@ def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
 
 def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoScene) -> None:
     ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
-    edited = scenes.grown(3.0, pivot).apply(bear.gaussians, ears, 0.5)
+    edited = scenes.scale_edit(3.0, pivot).apply(bear.gaussians, ears, 0.5)
     before = bear.gaussians[ears]
     assert torch.allclose(edited.means[ears] - pivot, 2 * (before.means - pivot), atol=1e-5)
     assert torch.allclose(edited.scales[ears], 2 * before.scales, rtol=1e-5)
@@ -184,16 +184,18 @@ def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoSce
 
 def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
-    edit = scenes.swung(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
+    edit = scenes.swing_edit(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
     half = edit.apply(bear.gaussians, ears, 0.5)[ears]
     arm = bear.gaussians.means[ears] - pivot
     expected = torch.stack([-arm[:, 1], arm[:, 0], arm[:, 2]], dim=1)
     assert torch.allclose(half.means - pivot, expected, atol=1e-5)
     # the picture turns with it: a quarter turn about z of everything, seen by a camera turned alike
-    camera = bear.cameras[0].resized(96, 96)
+    camera = bear.cameras[0].resize(96, 96)
     whole = torch.arange(len(bear.gaussians))
     plain = replace(bear.gaussians, shN=torch.zeros(len(bear.gaussians), 0, 3))
-    turned = scenes.swung(180.0, torch.tensor([0.0, 0.0, 1.0]), torch.zeros(1, 3)).apply(plain, whole, 0.5)
+    turned = scenes.swing_edit(180.0, torch.tensor([0.0, 0.0, 1.0]), torch.zeros(1, 3)).apply(
+        plain, whole, 0.5
+    )
     quarter = torch.eye(4)
     quarter[:2, :2] = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
     same = render(turned, replace(camera, viewmat=camera.viewmat @ quarter))
@@ -203,11 +205,11 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
 def test_recolouring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
     scarf = bear.members("scarf")
     target = torch.tensor([0.1, 0.5, 0.3])
-    edited = scenes.recolored(target).apply(bear.gaussians, scarf, 1.0)
+    edited = scenes.recolor_edit(target).apply(bear.gaussians, scarf, 1.0)
     assert torch.allclose(typical_color(sh0_to_rgb(edited.sh0[scarf])), target, atol=0.12)
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
 def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
     with pytest.raises(ProgdfError, match="between 0 and 1"):
-        scenes.darkened().apply(bear.gaussians, torch.arange(3), strength)
+        scenes.darken_edit().apply(bear.gaussians, torch.arange(3), strength)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.lens import straightened
+from progdf.lens import undistort
 from progdf.region import Region
 from trainer.store.images import read_picture
 from trainer.views.view import View
@@ -80,7 +80,7 @@ class FolderEditor:
         picture = read_picture(_picture(where, camera.name, self.bent), size=(camera.width, camera.height))
         if not self.bent or camera.lens is None:
             return picture, torch.ones_like(picture[..., 0], dtype=torch.bool)
-        return straightened(picture, camera.K, camera.lens)
+        return undistort(picture, camera.K, camera.lens)
 
 
 def folder_of(what: str) -> Path:

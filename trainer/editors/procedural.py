@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
-from progdf.color.path import ColorPath, bend_of, between, path_of
+from progdf.color.path import ColorPath, bend_of, interpolate_colors, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
@@ -69,9 +69,9 @@ class StripesEditor:
     def painted(self, rgb: Tensor, strength: float) -> Tensor:
         """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
         plainer = torch.lerp(rgb, self.typical.expand_as(rgb), (_COVER * self.pattern)[:, None])
-        under = color.recolored(plainer, self.target, self.typical)
+        under = color.recolor_fully(plainer, self.target, self.typical)
         bend = bend_of(self.typical, self.target, self.path)
-        return between(rgb, under, strength * self.pattern, bend)
+        return interpolate_colors(rgb, under, strength * self.pattern, bend)
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""

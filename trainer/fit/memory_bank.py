@@ -105,9 +105,9 @@ class JointTraining:
         if len(self.bank) > 1:
             self.fit.step(self._strengths, self._offsets)
 
-    def saved(self) -> Saved:
+    def capture_state(self) -> Saved:
         """The fit; the bank is made again from the recordings."""
-        return Saved(self.fit.saved(), {"banked": len(self.bank)})
+        return Saved(self.fit.capture_state(), {"banked": len(self.bank)})
 
     def restore(self, saved: Saved) -> None:
         """Take over the fit; `refill` comes after."""

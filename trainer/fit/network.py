@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field import BakedField, NeuralSettings, baked_neural
+from progdf.field import BakedField, NeuralSettings, bake_network
 from progdf.field.evaluate import FieldEvaluator
 from progdf.field.neural import NeuralShape
-from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, trained
+from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, train_network
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
@@ -104,7 +104,7 @@ def begin_joint_training(
 
 def save_network(joint: JointTraining, folder: StateFolder) -> None:
     """Save the network for the end of the run, when the trajectory is whole."""
-    folder.save(PART, joint.fit.saved(), {"shape": asdict(joint.fit.shape)})
+    folder.save(PART, joint.fit.capture_state(), {"shape": asdict(joint.fit.shape)})
 
 
 def fit_network(
@@ -151,7 +151,7 @@ def fit_network(
     pictures = _picture_loss(setup, trajectory, perceptual, weight, settings.seed) if weight > 0 else None
     try:
         with log.steps("field", steps) as advance:
-            trained(
+            train_network(
                 fit, trajectory.s, offsets, steps, pictures, lambda n, loss: advance(n, f"loss {loss:.5f}")
             )
     except FloatingPointError as error:
@@ -159,8 +159,8 @@ def fit_network(
     network = fit.field(tuple(float(s) for s in trajectory.s))
     errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
     return NetworkFit(
-        baked_neural(network, rows, trajectory.at, evaluator.counted_pixels),
-        errors.curve(network.bound(rows)),
+        bake_network(network, rows, trajectory.at, evaluator.counted_pixels),
+        errors.curve(network.bind(rows)),
     )
 
 

@@ -80,7 +80,7 @@ class Groups:
             for index in range(len(sizes))
         ]
 
-    def saved(self) -> dict[str, Tensor]:
+    def capture_state(self) -> dict[str, Tensor]:
         """Part of each member [M] and motions [T,P,7]; `restore_groups` takes them."""
         motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
         return {"part": self.parts.part, "motions": torch.stack(motions)}
@@ -123,7 +123,7 @@ def group_stage(
 
 
 def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
-    """What `Groups.saved` gave, of the same members."""
+    """What `Groups.capture_state` gave, of the same members."""
     motions = tuple(Motion(m[:, :3], m[:, 3], m[:, 4:]) for m in saved["motions"])
     return Groups(make_parts(original, saved["part"]), motions)
 

@@ -1,7 +1,7 @@
 """Where the optimisation stands between two steps: the members' offsets, Adam's memory, what was measured.
 
 Everything that decides the steps to come is here, and nothing that can be computed again from the run's
-inputs. So a run that is stopped between two steps goes on from what `PgsState.saved` gives to the same bits.
+inputs. So a run that is stopped between two steps goes on from `PgsState.capture_state` to the same bits.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
-from progdf.io.json_values import typed
+from progdf.io.json_values import convert_json
 from trainer.store.state import Saved, generator
 
 from .objective import TermMeans
@@ -23,7 +23,7 @@ _ROWS = ("moved", "previous", "average", "first", "second")
 
 
 class _Values(msgspec.Struct):
-    """What `PgsState.saved` gives beside tensors."""
+    """What `PgsState.capture_state` gives beside tensors."""
 
     step: int
     stage: int
@@ -113,7 +113,7 @@ class PgsState:
         self.step, self.local = done, self.local + 1
         self._queue.pop()
 
-    def saved(self) -> Saved:
+    def capture_state(self) -> Saved:
         """See `state.Resumable`."""
         tensors = {name: getattr(self, name) for name in _ROWS}
         tensors |= {f"picture{i}": picture for i, picture in enumerate(self.pictures)}
@@ -131,7 +131,7 @@ class PgsState:
 
     def restore(self, saved: Saved) -> None:
         """See `state.Resumable`."""
-        tensors, values = saved.tensors, typed(saved.values, _Values)
+        tensors, values = saved.tensors, convert_json(saved.values, _Values)
         with torch.no_grad():
             for name in _ROWS:
                 getattr(self, name).copy_(tensors[name])

@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from progdf.cli.options import parsed
+from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.demo_scenes import DemoScene, bear, room
 from progdf.errors import ProgdfError
@@ -137,7 +137,7 @@ class DemoOptions:
 
 def main(argv: Sequence[str]) -> int:
     """Run the demo. Raises ProgdfError for options that cannot be met."""
-    options = parsed(DemoOptions, argv, "progdf demo")
+    options = parse_options(DemoOptions, argv, "progdf demo")
     _check(options)
     begun = time.perf_counter()
     show = SHOWS[options.scene]
@@ -197,7 +197,7 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
 
     def shot(height: int, strengths: Mapping[str, float]) -> Tensor:
         layers = [Layer(gdfs[name], strength) for name, strength in strengths.items()]
-        sized = camera.resized(round(height * camera.width / camera.height), height)
+        sized = camera.resize(round(height * camera.width / camera.height), height)
         with torch.no_grad():
             return render(compose_layers(gaussians, layers), sized, background=scene.background)
 

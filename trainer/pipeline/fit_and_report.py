@@ -17,7 +17,7 @@ from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
-from progdf.io.json_values import decode_json, typed
+from progdf.io.json_values import convert_json, decode_json
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility
 from trainer.fit.network import fit_network
@@ -224,7 +224,7 @@ def load_result(folder: RunFolder, options: TrainOptions, scene: Gaussians, log:
     trajectory, _, _ = load_trajectory(folder.trajectory)
     log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
     try:
-        report = typed(decode_json(folder.report.read_bytes()), dict[str, Any])
+        report = convert_json(decode_json(folder.report.read_bytes()), dict[str, Any])
     except ValueError as error:
         raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
     return RunResult(folder, path, report, replace(trajectory, s=torch.tensor(gdf.field.recorded)))

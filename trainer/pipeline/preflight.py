@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from progdf.io.atomic import check_regular, open_failure
+from progdf.io.atomic import check_regular, open_error
 from progdf.io.cameras import load_cameras
 from progdf.scene.region_spec import check_region
 from trainer.editors import check_editor, check_new_editor
@@ -35,7 +35,7 @@ def check_command(options: TrainOptions, edit: Mapping[str, str]) -> None:
         try:
             options.scene.open("rb").close()
         except OSError as error:
-            raise open_failure(options.scene, error) from None
+            raise open_error(options.scene, error) from None
     if options.cameras is not None and not options.resume:
         load_cameras(options.cameras)
     if load_region(options) is None:

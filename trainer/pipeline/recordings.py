@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.json_values import typed
+from progdf.io.json_values import convert_json
 from trainer.optimize.pgs import ParameterSnapshot
 from trainer.store.state import Saved, StateFolder
 
@@ -57,7 +57,7 @@ class Recordings:
         offsets = found.offsets.half()
         self.made.append(SavedSnapshot(found.step, found.stage, found.ends_stage, offsets, found.means))
 
-    def saved(self) -> Saved:
+    def capture_state(self) -> Saved:
         """How many there are; those that came since the last time are written first."""
         for index in range(self._written, len(self.made)):
             kept = self.made[index]
@@ -75,7 +75,7 @@ class Recordings:
         self.made = [self._read(kept) for kept in found if kept]
 
     def _read(self, kept: Saved) -> SavedSnapshot:
-        values, offsets = typed(kept.values, _Values), kept.tensors["offsets"]
+        values, offsets = convert_json(kept.values, _Values), kept.tensors["offsets"]
         if offsets.shape != self._shape or offsets.dtype != torch.float16:
             raise ValueError("a recording is of other members")
         return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)

@@ -16,7 +16,7 @@ from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.formats.scene_file import load_scene, scene_file
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
-from progdf.io.json_values import typed
+from progdf.io.json_values import convert_json
 from progdf.region import Region
 from trainer.editors.base import EditKind
 from trainer.option_checks import checked_name
@@ -79,9 +79,9 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
         raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
-        kept = typed(about, _About)
+        kept = convert_json(about, _About)
         options_of(about)
-        name = typed(kept.options["name"], str)
+        name = convert_json(kept.options["name"], str)
         try:
             checked_name(name)
         except ProgdfError:

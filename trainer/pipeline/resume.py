@@ -14,7 +14,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
-from progdf.io.json_values import decode_json, typed
+from progdf.io.json_values import convert_json, decode_json
 from progdf.region import Region
 from trainer.option_checks import plain_options, resolve_options
 from trainer.options import MOST_THREADS, TrainOptions
@@ -171,7 +171,7 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
     if found is None:
         return None
     try:
-        return typed(found, _Identity)
+        return convert_json(found, _Identity)
     except ValueError as error:
         raise folder.state.damaged(folder.state.path / "run.json", error) from None
 
@@ -188,7 +188,7 @@ def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOp
 
 def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
     try:
-        return typed(decode_json(folder.report.read_bytes())["options"], dict[str, Any])
+        return convert_json(decode_json(folder.report.read_bytes())["options"], dict[str, Any])
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave --resume away to train anew") from error
 

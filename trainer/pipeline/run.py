@@ -134,7 +134,7 @@ def _run_training(
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, log)
         _record(options, setup, train_edits, approach, trial, perceptual, folder, log, agreement)
-        folder.state.save("recorded", {}, log.saved().values)
+        folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
@@ -275,7 +275,7 @@ def _record(
         "attribute_worth_db": costs,
         "agreement": agreement.figures() if agreement is not None else None,
         "followed": len(unseen_members.places),
-        "up": setup.up.saved() if setup.up is not None else None,
+        "up": setup.up.to_json() if setup.up is not None else None,
     }
     save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)
     with log.stage("final"):

@@ -234,7 +234,7 @@ def _groups(
         raise ProgdfError(
             f"training broke down: {error}; mend the edited views and go on with --resume"
         ) from error
-    folder.save("groups", groups.saved(), {})
+    folder.save("groups", groups.capture_state(), {})
     for line in groups.lines():
         log.say(line)
     return groups

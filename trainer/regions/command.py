@@ -15,16 +15,16 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import counted, grouped
+from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import atomic_write
 from progdf.io.cameras import load_cameras, read_camera
 from progdf.io.images import write_image
 from progdf.region import Region
-from progdf.scene.bounds import front
+from progdf.scene.bounds import front_direction
 from progdf.scene.region_spec import parse_region
-from progdf.scene.subject import fitted_eye, subject_rows
+from progdf.scene.subject import fit_eye, subject_rows
 from progdf.scene.up_axis import find_up
 from trainer.option_checks import check_ranges
 from trainer.views.view import render_colors, seen_colors, with_near_plane
@@ -75,7 +75,9 @@ def show(options: RegionOptions) -> str:
         cameras = with_near_plane(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
     share = 100 * len(region) / max(1, len(scene))
-    said.append(f"wrote {options.out}: {counted(len(region))} of {grouped(len(scene))} ({share:.3g} %)")
+    said.append(
+        f"wrote {options.out}: {format_count(len(region))} of {group_digits(len(scene))} ({share:.3g} %)"
+    )
     return "\n".join(said)
 
 
@@ -115,7 +117,7 @@ def _fitted(
     scene: Gaussians, up: Tensor, azimuth: float, elevation: float, away: float | None, size: tuple[int, int]
 ) -> Camera:
     """A camera that what the scene is about fills, from this direction; as `progdf render --orbit`."""
-    ahead = front(up)
+    ahead = front_direction(up)
     side = torch.linalg.cross(up, ahead)
     around, above = math.radians(azimuth), math.radians(elevation)
     back = math.cos(above) * (math.cos(around) * ahead + math.sin(around) * side) + math.sin(above) * up
@@ -123,7 +125,7 @@ def _fitted(
     shown = scene[subject_rows(scene, up)]
     tangent = _FILLED * math.tan(0.5 * _FOV)
     radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
-    eye = fitted_eye(shown.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
+    eye = fit_eye(shown.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
     if away is not None:
         depth = float(eye @ back - (shown.means @ back).median())
         eye = eye + (away - depth) * back

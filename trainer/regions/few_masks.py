@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from progdf.formats.load_report import counted
+from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
 from progdf.scene.neighbors import nearest_rows
 
@@ -69,7 +69,7 @@ def without_strays(
     result[rows[kept]] = True
     dropped = int((~kept).sum())
     pieces = int((weight >= _PIECE * weight.max()).sum())
-    _tell(say, dropped, f"apart from the {counted(pieces, 'largest connected surface')}, left out")
+    _tell(say, dropped, f"apart from the {format_count(pieces, 'largest connected surface')}, left out")
     return result
 
 
@@ -120,4 +120,4 @@ def _pieces(points: Tensor) -> np.ndarray:
 
 def _tell(say: Callable[[str], None] | None, count: int, what: str) -> None:
     if say is not None and count:
-        say(f"the masks: {counted(count)} {what}")
+        say(f"the masks: {format_count(count)} {what}")

@@ -10,7 +10,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import write_image
-from progdf.region import everything
+from progdf.region import whole_scene
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import parse_region
@@ -59,7 +59,7 @@ def write(options: ViewsOptions) -> str:
         cameras = orbit_rig(scene, options.views, options.image_size, options.image_size, up=up)
     cameras = with_near_plane(name_cameras(cameras), scene)
     if len(cameras) > options.views:
-        choice = choose_views(scene, region or everything(scene), cameras, options.views, background)
+        choice = choose_views(scene, region or whole_scene(scene), cameras, options.views, background)
         cameras = [view.camera for view in choice.views]
     for camera in cameras:
         write_image(out / "original" / f"{camera.name}.png", render_view(scene, camera, background))

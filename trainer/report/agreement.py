@@ -157,7 +157,7 @@ def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
 
 
 def view_change(setup: TrainingSetup, view: View, edited: Tensor) -> ViewChange:
-    camera = view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2))
+    camera = view.camera.resize(max(1, view.camera.width // 2), max(1, view.camera.height // 2))
     x0, y0, x1, y1 = view.box
     box = (x0 // 2, y0 // 2, min(camera.width, -(-x1 // 2)), min(camera.height, -(-y1 // 2)))
 

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io.images import laid_on, open_picture
-from progdf.lens import straightened
+from progdf.io.images import flatten_onto, open_picture
+from progdf.lens import undistort
 from trainer.editors.folder import SUFFIXES
 
 
@@ -54,10 +54,10 @@ def _file(folder: Path, camera: Camera) -> Path | None:
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
     size = (camera.width, camera.height)
-    grey = laid_on(open_picture(path, size), "black").convert("L")
+    grey = flatten_onto(open_picture(path, size), "black").convert("L")
     if grey.size != size:
         grey = grey.resize(size, Image.Resampling.BOX)
     mask = torch.from_numpy(np.asarray(grey, dtype=np.float32) / 255.0)
     if bent and camera.lens:
-        return straightened(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
+        return undistort(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
     return mask

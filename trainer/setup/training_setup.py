@@ -167,7 +167,7 @@ def probe_views(setup: TrainingSetup, count: int = _PROBES, still: bool = False)
         crop_scene(
             setup.scene,
             setup.region.members,
-            view.camera.resized(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
+            view.camera.resize(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
             (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
             setup.background,
             still,

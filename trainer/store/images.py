@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from progdf.io.images import laid_on, open_picture
+from progdf.io.images import flatten_onto, open_picture
 
 
 def read_picture(path: Path, size: tuple[int, int] | None = None) -> Tensor:
@@ -21,5 +21,5 @@ def read_picture(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     Raises:
         ProgdfError: it is missing or no picture, or `size` has other proportions (by more than 2 %).
     """
-    picture = laid_on(open_picture(path, size), "white", size)
+    picture = flatten_onto(open_picture(path, size), "white", size)
     return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)

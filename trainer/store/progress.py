@@ -17,7 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from progdf.terminal import printable
+from progdf.terminal import escape_text
 
 from .memory import PeakMemory
 from .state import Saved
@@ -56,7 +56,7 @@ class RunLog:
         all_of_it = {"refit" if self.refits else "total": self._total()}
         return {name: round(seconds, 2) for name, seconds in {**self.seconds, **all_of_it}.items()}
 
-    def saved(self) -> Saved:
+    def capture_state(self) -> Saved:
         """Seconds so far; those of the stages that have not ended too."""
         now = time.perf_counter()
         running = {name: now - begun for name, begun in self._running.items()}
@@ -75,7 +75,7 @@ class RunLog:
 
     def note(self, text: str) -> None:
         """A line for the file alone."""
-        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {printable(text)}\n")
+        self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {escape_text(text)}\n")
 
     def say(self, text: str) -> None:
         """One line."""
@@ -147,4 +147,4 @@ class RunLog:
 
 
 def _escaped(text: str) -> str:
-    return printable(text).replace("[", "\\[")
+    return escape_text(text).replace("[", "\\[")

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
-from progdf.io.json_values import decode_json, typed
+from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
 
 SHARE = 0.01
@@ -57,12 +57,12 @@ class Resumable(Protocol):
     inputs and the recordings stays out. Dropout and the like must draw from a generator of their own.
     """
 
-    def saved(self) -> Saved:
+    def capture_state(self) -> Saved:
         """Everything that the next steps depend on; the tensors may be the live ones."""
         ...
 
     def restore(self, saved: Saved) -> None:
-        """Take over what `saved` gave, of a run with the same options."""
+        """Take over what `capture_state` gave, of a run with the same options."""
         ...
 
 
@@ -83,7 +83,7 @@ class StateFolder:
     def identity(self) -> dict[str, Any] | None:
         """What `begin` was told; None where no run was stopped."""
         try:
-            return typed(decode_json(self._run.read_bytes()), dict[str, Any])
+            return convert_json(decode_json(self._run.read_bytes()), dict[str, Any])
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:
@@ -132,7 +132,7 @@ class StateFolder:
             return None
         try:
             tensors, metadata = read_tensors(path)
-            return Saved(tensors, typed(decode_json(metadata["values"]), dict[str, Any]))
+            return Saved(tensors, convert_json(decode_json(metadata["values"]), dict[str, Any]))
         except (OSError, KeyError, ValueError) as error:
             raise self.damaged(path, error) from error
 
@@ -211,7 +211,7 @@ class PeriodicSave:
     def save(self) -> None:
         """Save now. Raises OSError where it cannot; the last save stays whole."""
         begun = time.perf_counter()
-        parts = {name: member.saved() for name, member in self._members.items()}
+        parts = {name: member.capture_state() for name, member in self._members.items()}
         tensors = {f"{name}/{key}": t for name, part in parts.items() for key, t in part.tensors.items()}
         self._folder.save(self._part, tensors, {name: part.values for name, part in parts.items()})
         self._last = time.perf_counter()

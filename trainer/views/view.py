@@ -183,7 +183,7 @@ def fit_size(camera: Camera, image_size: int) -> Camera:
     scale = image_size / max(camera.width, camera.height)
     if scale >= 1.0:
         return camera
-    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    return camera.resize(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
 def name_cameras(cameras: Sequence[Camera]) -> list[Camera]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from progdf.terminal import printable
+from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, SMALL_PX, Rgba, UiContext
 from viewer.ui.overlay import Area
@@ -101,7 +101,7 @@ def _content(
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.text(TITLES[dialog.kind])
     imgui.pop_font()
-    _wrapped_text(_HINTS[dialog.kind].format(printable(Path(dialog.text).name)), PALETTE.dim)
+    _wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
@@ -115,7 +115,7 @@ def _content(
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
     flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
-    shown = printable(dialog.text)
+    shown = escape_text(dialog.text)
     _, text = imgui.input_text("##path", shown, flags)
     text = dialog.text if text == shown else text  # a name that is not UTF-8 stays the file's own
     dialog = replace(dialog, text=text)
@@ -129,7 +129,7 @@ def _content(
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
-        _wrapped_text(printable(dialog.error), PALETTE.error)
+        _wrapped_text(escape_text(dialog.error), PALETTE.error)
     if dialog.kind != "save":
         fitting = [path for path in recent if dialog.kind == "open" or path.suffix == ".gdf"]
         chosen = _recent(fitting, bottom, ui)
@@ -213,11 +213,11 @@ def _recent(recent: Sequence[Path], bottom: float, ui: UiContext) -> Path | None
     imgui.begin_child("recent", imgui.ImVec2(0.0, min(len(recent) * row, space)))
     for i, path in enumerate(recent):
         room = imgui.get_content_region_avail().x
-        if imgui.selectable(f"{elide(printable(path.name), 0.4 * room)}##{i}", False)[0]:
+        if imgui.selectable(f"{elide(escape_text(path.name), 0.4 * room)}##{i}", False)[0]:
             chosen = path
         imgui.same_line(0.42 * room)
         imgui.push_font(None, SMALL_PX)
-        imgui.text_disabled(elide(printable(str(path.parent)), 0.56 * room))
+        imgui.text_disabled(elide(escape_text(str(path.parent)), 0.56 * room))
         imgui.pop_font()
     imgui.end_child()
     return chosen

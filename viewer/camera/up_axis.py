@@ -8,7 +8,7 @@ from pathlib import Path
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.scene.up_axis import find_up, saved_up
+from progdf.scene.up_axis import find_up, up_from_json
 
 Vec3 = tuple[float, float, float]
 
@@ -29,7 +29,7 @@ def up_of(
         asked: an axis, or "auto"
         cameras: given with the scene
     """
-    kept = (saved_up(gdf.report.get("up")) for gdf in gdfs) if asked == "auto" else ()
+    kept = (up_from_json(gdf.report.get("up")) for gdf in gdfs) if asked == "auto" else ()
     found = next((up for up in kept if up is not None), None)
     if found is None:
         found = find_up(scene, cameras, asked).direction if len(scene) else None

@@ -17,7 +17,7 @@ import torch
 from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians
 from progdf.scene.bounds import scene_sphere
-from progdf.scene.subject import fitted_eye, is_room, standpoint, subject_rows
+from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
 
 from .up_axis import Vec3, up_of
 
@@ -225,7 +225,7 @@ def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera
     tangent = math.tan(math.radians(camera.fov_y) / 2)
     frame_axes = torch.tensor([picture.right, picture.up, picture.back], dtype=torch.float64)
     radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
-    found = fitted_eye(shown.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
+    found = fit_eye(shown.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
     x, y, z = (float(c) for c in found)
     depth = dot((x, y, z), picture.back) - float((shown.means.double() @ frame_axes[2]).median())
     if not (math.isfinite(x + y + z) and 0.0 < depth < FARTHEST):

@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from plyfile import PlyData
 
-from progdf.cli.options import parsed
+from progdf.cli.options import parse_options
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import counted
+from progdf.formats.load_report import format_count
 from progdf.formats.ply import GEOMETRY, load_ply, save_ply
 from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.io.atomic import atomic_write
-from progdf.terminal import say
+from progdf.terminal import print_line
 from viewer.camera.view_camera import first_camera
 from viewer.render.threads import one_thread
 from viewer.state.layers import visible_layers
@@ -31,7 +31,7 @@ from .options import ExportOptions, ViewOptions
 @one_thread()
 def view(argv: Sequence[str]) -> int:
     """`progdf view`: open the window and stay until it is closed."""
-    options = parsed(ViewOptions, arguments.join_arguments(opening.without_name(argv)), "progdf view")
+    options = parse_options(ViewOptions, arguments.join_arguments(opening.without_name(argv)), "progdf view")
     found = opening.open_stack(options)
     from viewer.app.app import run  # imgui and glfw, which render and export do without
 
@@ -50,7 +50,9 @@ def view(argv: Sequence[str]) -> int:
 
 def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
-    options = parsed(ExportOptions, arguments.join_arguments(opening.without_name(argv)), "progdf export")
+    options = parse_options(
+        ExportOptions, arguments.join_arguments(opening.without_name(argv)), "progdf export"
+    )
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
     found = opening.open_stack(options, unset=1.0)
@@ -63,10 +65,10 @@ def export(argv: Sequence[str]) -> int:
         _check_reloaded(edited, load_ply(temporary_file))
         _check_by_plyfile(edited, temporary_file)
     told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
-    say(f"wrote {options.out}: {counted(len(edited))}, {told}; read back and compared")
+    print_line(f"wrote {options.out}: {format_count(len(edited))}, {told}; read back and compared")
     source = found.document.path
     if source is not None and (kind := scene_format(source)) != "ply":
-        say(f"{found.document.title} is a .{kind}, this is a plain .ply")
+        print_line(f"{found.document.title} is a .{kind}, this is a plain .ply")
     return 0
 
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 from PIL import Image
 
 from progdf.camera import Camera
-from progdf.cli.options import parsed
+from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write
-from progdf.terminal import say
+from progdf.terminal import print_line
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
@@ -37,7 +37,9 @@ ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 @one_thread()
 def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
-    options = parsed(RenderOptions, arguments.join_arguments(opening.without_name(argv)), "progdf render")
+    options = parse_options(
+        RenderOptions, arguments.join_arguments(opening.without_name(argv)), "progdf render"
+    )
     _check_output(options)
     size = None if options.size is None else arguments.parse_size(options.size)
     one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
@@ -50,7 +52,7 @@ def render(argv: Sequence[str]) -> int:
     if options.timeline is not None:
         keys, count = _keys(options, found), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
-            say(timeline_film.write(options.out, keys, view, camera, engine, count))
+            print_line(timeline_film.write(options.out, keys, view, camera, engine, count))
         return 0
     swept = _swept(options, found)
     with _engine(scene, gdfs, options) as engine:
@@ -61,11 +63,13 @@ def render(argv: Sequence[str]) -> int:
             told = _still(options, found, view, camera, engine)
         drawn_by = _drawn_by(engine)
     each = "each " if options.sheet is not None else ""
-    say(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
+    print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
     if told:
-        say(told)
+        print_line(told)
     if view.layers and not swept and not any(layer.strength for layer in view.layers):
-        say(f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit")
+        print_line(
+            f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit"
+        )
     return 0
 
 

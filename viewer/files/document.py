@@ -9,7 +9,7 @@ from pathlib import Path
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
-from progdf.terminal import printable
+from progdf.terminal import escape_text
 from viewer.camera.view_camera import bounds_of, first_camera, fit_all
 from viewer.render.threads import all_threads
 from viewer.state.layer_facts import layer_rows
@@ -73,7 +73,7 @@ def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
     scene = scene_file(scene)
     gaussians = load_scene(scene)
     return Document(
-        printable(scene_name(scene)), gaussians, load_edits(gdfs, gaussians, scene), scene, tuple(gdfs)
+        escape_text(scene_name(scene)), gaussians, load_edits(gdfs, gaussians, scene), scene, tuple(gdfs)
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from progdf.compose.layers import BLENDS
 from progdf.errors import ProgdfError
-from progdf.io.session import SUFFIX, SessionFile, read_session, reference, verified, write_session
+from progdf.io.session import SUFFIX, SessionFile, read_session, reference, verify_files, write_session
 from viewer.camera.view_camera import FARTHEST, ViewCamera
 from viewer.state import paint
 from viewer.state.comparison import AGAINST, MODES, MOST_AMPLIFIED
@@ -63,7 +63,7 @@ def open_session(path: Path) -> WindowSession:
     """
     file = read_session(path)
     view, snapshots = _states(path.name, file)
-    scene, gdfs = verified(path, file)
+    scene, gdfs = verify_files(path, file)
     opened = document.load(scene, gdfs)
     for layer in (*view.layers, *(layer for kept in snapshots for layer in kept.edit.layers)):
         paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit

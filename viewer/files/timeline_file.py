@@ -23,7 +23,7 @@ from pathlib import Path
 
 from progdf.cli.info import TIMELINE_MARK as MARK
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, check_regular, open_failure
+from progdf.io.atomic import atomic_write, check_regular, open_error
 from progdf.io.json_values import decode_json
 from viewer.camera.view_camera import FARTHEST, ViewCamera
 from viewer.state import timeline
@@ -93,7 +93,7 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
         with path.open("rb") as opened:
             text = opened.read(_LARGEST + 1)
     except OSError as error:
-        raise open_failure(path, error) from None
+        raise open_error(path, error) from None
     try:
         value = decode_json(text) if len(text) <= _LARGEST else None
     except ValueError:

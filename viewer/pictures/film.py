@@ -17,7 +17,7 @@ from PIL import Image
 
 from progdf.errors import ProgdfError
 from progdf.io import images as pictures
-from progdf.io.atomic import unwritable
+from progdf.io.atomic import write_error
 from viewer.state.view_state import ViewState
 
 Pixels = NDArray[np.uint8]
@@ -112,7 +112,7 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
         home = folder if there else folder.absolute().parent
         drawn = Path(tempfile.mkdtemp(dir=home, prefix=f".{folder.name}."))
     except OSError as error:
-        raise unwritable(folder, error) from None
+        raise write_error(folder, error) from None
     try:
         for number, frame in enumerate(frames):
             Image.fromarray(frame).save(drawn / f"frame_{number:04d}.png")
@@ -123,7 +123,7 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
             drawn.chmod(0o755)
             drawn.rename(folder)
     except OSError as error:
-        raise unwritable(folder, error) from error
+        raise write_error(folder, error) from error
     finally:
         shutil.rmtree(drawn, ignore_errors=True)
 
@@ -133,7 +133,7 @@ def check_sequence(folder: Path) -> None:
     try:
         taken = os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir()))
     except OSError as error:
-        raise unwritable(folder, error) from None
+        raise write_error(folder, error) from None
     if taken:
         raise ProgdfError(f"{folder} exists and is not an empty folder; give a new name for the frames")
     if not folder.absolute().parent.is_dir():

@@ -38,8 +38,8 @@ class EditSample:
         everyone = np.unique(np.concatenate([np.zeros(0, np.int64), *members]))
         self._rows = everyone[np.isin(everyone // SPLATS_PER_ROW, self._texture_rows)]
         self._scene = scene[torch.from_numpy(self._rows)]
-        self._chosen = [torch.from_numpy(np.flatnonzero(np.isin(own, self._rows))) for own in members]
-        pairs = zip(gdfs, self._chosen, strict=True)
+        self._index_array = [torch.from_numpy(np.flatnonzero(np.isin(own, self._rows))) for own in members]
+        pairs = zip(gdfs, self._index_array, strict=True)
         self._gdfs = [_select_members(gdf, chosen, self._rows, self._scene) for gdf, chosen in pairs]
 
     def error(self, edit_pass: EditPass, stack: Sequence[tuple[int, Layer]], blend: str) -> float:
@@ -53,7 +53,7 @@ class EditSample:
         if not len(self._rows):
             return 0.0
         layers = [
-            replace(layer, gdf=self._gdfs[edit], weights=_some(layer.weights, self._chosen[edit]))
+            replace(layer, gdf=self._gdfs[edit], weights=_some(layer.weights, self._index_array[edit]))
             for edit, layer in stack
         ]
         expected = compose_layers(self._scene, layers, blend)

@@ -204,7 +204,7 @@ def feather(paint: str, points: Floats, width: float) -> str:
 def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -> Floats:
     """Depth of the front surface at each place, infinite on the background. [M]"""
     width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
-    small = camera.resized(width, height)
+    small = camera.resize(width, height)
     with torch.no_grad():
         image, clear, _ = rasterize(
             scene.means,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from progdf.terminal import printable
+from progdf.terminal import escape_text
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
 
 from . import history, playback, timeline
@@ -147,7 +147,7 @@ def original(view: ViewState) -> ViewState:
 def with_message(workspace: Workspace, text: str, now: float, error: bool = False) -> Workspace:
     """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
     until = now + (ERROR_S if error else MESSAGE_S)
-    return replace(workspace, message=Message(printable(" ".join(text.split())), until, error))
+    return replace(workspace, message=Message(escape_text(" ".join(text.split())), until, error))
 
 
 def record_undo(workspace: Workspace) -> Workspace:

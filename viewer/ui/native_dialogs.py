@@ -14,7 +14,7 @@ from pathlib import Path
 
 from imgui_bundle import portable_file_dialogs as dialogs
 
-from progdf.terminal import printable
+from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 
 PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")
@@ -64,9 +64,9 @@ class Browser:
         path = Path(dialog.text or near).expanduser().absolute()
         if dialog.kind != "save":
             folder = path if path.is_dir() else path.parent
-            self._shown = dialogs.open_file("Open", printable(f"{folder}/"), _OPEN)
+            self._shown = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
         else:
-            self._shown = dialogs.save_file("Save session", printable(str(path)), _SAVE)
+            self._shown = dialogs.save_file("Save session", escape_text(str(path)), _SAVE)
         return replace(
             dialog, choosing=True, notice="Choose a file in the system dialog, or type a path here"
         )

@@ -46,7 +46,7 @@ def rasterize(
     gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.rasterize`."""
-    inputs = [float32(tensor) for tensor in (*gaussians, background)]
+    inputs = [to_float32(tensor) for tensor in (*gaussians, background)]
     found: list[Array] = []
     image, transmittance = _Rasterize.apply(  # type: ignore[no-untyped-call]
         make_pinhole(view), grad_rows, found, *inputs, view.viewmat, view.K
@@ -60,7 +60,7 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
         camera = make_pinhole(view)
         splats, lists = bin_view(gaussians, camera)
         sums = np.zeros((len(lists.members), weights.SUMS))
-        inside = float32(mask).numpy()
+        inside = to_float32(mask).numpy()
         share_tiles(weights.accumulate_weights, camera, splats, lists, camera, inside, sums)
         totals = np.zeros((len(gaussians.means), weights.SUMS))
         weights.sum_slots(lists.offsets, sums, totals)
@@ -90,7 +90,7 @@ def make_pinhole(view: RasterView) -> Pinhole:
     )  # fmt: skip
 
 
-def float32(tensor: Tensor) -> Tensor:
+def to_float32(tensor: Tensor) -> Tensor:
     """As the kernels want it."""
     if tensor.dtype is torch.float32 and tensor.is_cpu and tensor.is_contiguous():
         return tensor
@@ -99,7 +99,7 @@ def float32(tensor: Tensor) -> Tensor:
 
 def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, TileLists]:
     """The splats and the tiles' lists of a view without an image; colors are not read."""
-    arrays = [float32(tensor).detach().numpy() for tensor in gaussians[:4]]
+    arrays = [to_float32(tensor).detach().numpy() for tensor in gaussians[:4]]
     arrays.append(np.zeros((len(gaussians.means), 1, 3), np.float32))
     return _project_and_bin(Scene(*arrays), camera._replace(degree=-1), with_slots=True)
 
@@ -187,7 +187,7 @@ class _Rasterize(torch.autograd.Function):
         camera, grad_rows, scene, background, splats, lists, out = ctx.kept
         viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
         by_out = Picture(_array(grads[0], out.image), _array(grads[1], out.transmittance), out.last)
-        wanted = _wanted(len(scene.means), grad_rows)
+        wanted = _wanted_rows(len(scene.means), grad_rows)
         gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
         sums = np.empty((len(lists.members), SUMS), np.float32)
 
@@ -231,7 +231,7 @@ def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor,
     return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
 
 
-def _wanted(count: int, grad_rows: Tensor | None) -> Array:
+def _wanted_rows(count: int, grad_rows: Tensor | None) -> Array:
     """Which rows want gradients; [0] where all do. [N] bool"""
     if grad_rows is None:
         return _ALL

@@ -82,7 +82,7 @@ def record_cache(folder: Path) -> None:
     """Write down what the cache holds, for `drop_damaged`; where that cannot be written nothing happens."""
     with suppress(OSError, ProgdfError):
         sums = _checksums(folder)
-        if sums != _recorded(folder):
+        if sums != _read_record(folder):
             with atomic_write(folder / _SUMS) as temporary_file:
                 temporary_file.write_text(json.dumps(sums, indent=0), encoding="utf-8")
 
@@ -94,7 +94,7 @@ def drop_damaged(folder: Path) -> bool:
     process at work, or of one that was killed; of these, and of indices that have grown, those are dropped
     that end too early.
     """
-    recorded, damaged = _recorded(folder), []
+    recorded, damaged = _read_record(folder), []
     with suppress(OSError):
         for name, checksum in _checksums(folder).items():
             known = recorded.get(name)
@@ -126,7 +126,7 @@ def _checksums(folder: Path) -> dict[str, int]:
     return {path.relative_to(folder).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
 
 
-def _recorded(folder: Path) -> dict[str, int]:
+def _read_record(folder: Path) -> dict[str, int]:
     try:
         found = json.loads((folder / _SUMS).read_bytes())
     except (OSError, ValueError, RecursionError):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from progdf.__main__ import main
-from progdf.formats.load_report import counted
+from progdf.formats.load_report import format_count
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
@@ -159,7 +159,7 @@ def test_every_real_file_is_described_or_refused_in_one_line(
             captured = capsys.readouterr()
             if status == 0:
                 assert captured.err == ""
-                assert captured.out.startswith(f"{path.name}: {counted(len(load_ply(path)))}, ")
+                assert captured.out.startswith(f"{path.name}: {format_count(len(load_ply(path)))}, ")
             else:
                 assert status == 2
                 assert captured.out == ""

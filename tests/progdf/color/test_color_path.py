@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.color import edits as colour
 from progdf.color.edits import parse_color, recolor
 from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
-from progdf.color.path import ColorPath, bend_of, between
+from progdf.color.path import ColorPath, bend_of, interpolate_colors
 
 PAIRS = {
     "skin to blue": ("#e0ac88", "#3060d0"),
@@ -52,7 +52,7 @@ def test_the_ends_are_exact_and_the_way_is_even(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
     way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
     assert torch.equal(way[0], start)
-    assert torch.equal(way[-1], colour.recolored(start.expand(21, 3), end, start)[-1])
+    assert torch.equal(way[-1], colour.recolor_fully(start.expand(21, 3), end, start)[-1])
     steps = srgb_to_oklab(way).diff(dim=0).norm(dim=1)
     assert float(steps.max()) < 2.5 * float(steps.min())
 
@@ -113,7 +113,7 @@ def test_hues_near_the_target_take_their_own_short_way(s: float, path: ColorPath
 
 def test_a_straight_and_a_bent_way_have_the_same_lightness() -> None:
     start, end = parse_color("#e0ac88").expand(21, 3), BLUE.expand(21, 3)
-    lab = srgb_to_oklab(between(start, end, STRENGTHS, bend_of(start[0], BLUE)))
+    lab = srgb_to_oklab(interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE)))
     expected = torch.lerp(srgb_to_oklab(start), srgb_to_oklab(end), STRENGTHS[:, None])
     # colours on the edge of the gamut are known to a thousandth
     assert torch.allclose(lab[:, 0], expected[:, 0], atol=2e-3)

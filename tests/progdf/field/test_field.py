@@ -19,8 +19,8 @@ from progdf.field import (
     fit_separable,
 )
 from progdf.field.choose import separable_within
-from progdf.field.rendered import rendered_trajectories
-from progdf.field.separable import channel_weights, stored_bases
+from progdf.field.rendered import render_trajectories
+from progdf.field.separable import channel_weights, quantize_bases
 from progdf.gaussians import ATTRIBUTES, attribute_slices
 from tests.helpers.edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
 
@@ -112,7 +112,7 @@ def test_a_trajectory_of_two_bends_is_exact_with_two_bases() -> None:
 
 def test_int8_bases_stay_within_half_a_step_each() -> None:
     exact = torch.randn(3, 100, 4, generator=torch.Generator().manual_seed(0))
-    rest, step = stored_bases(exact, torch.int8)
+    rest, step = quantize_bases(exact, torch.int8)
     assert rest.dtype == torch.int8
     assert bool(((rest.float() * step[:, None] - exact).abs() <= 0.5001 * step[:, None]).all())
 
@@ -288,7 +288,7 @@ def test_an_edit_that_no_view_shows_gets_the_fewest_bytes() -> None:
 def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> None:
     strengths, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)
-    seen = rendered_trajectories(offsets, channel_weights(None, 40, 14), render)
+    seen = render_trajectories(offsets, channel_weights(None, 40, 14), render)
     expected = seen.mse(seen.modes(torch.ones(17, dtype=torch.float64)), {})
     field = fit_separable(strengths, offsets, {})
     found = [
@@ -301,7 +301,7 @@ def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> N
 def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
     _, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)
-    seen = rendered_trajectories(offsets, channel_weights(None, 40, 14), render)
+    seen = render_trajectories(offsets, channel_weights(None, 40, 14), render)
     modes = seen.modes(torch.ones(17, dtype=torch.float64))
     left = torch.zeros_like(offsets)
     for name, columns in attribute_slices(14).items():
@@ -317,7 +317,7 @@ def test_bytes_go_first_to_what_shows_most() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
     judge = FieldEvaluator(strengths, offsets, render)
-    seen = rendered_trajectories(offsets, channel_weights(None, 60, 14), render)
+    seen = render_trajectories(offsets, channel_weights(None, 60, 14), render)
     best = separable_within(seen, strengths, 62, judge)
     assert best.field.bytes_per_member <= 62
     for ranks in ({"means": 2}, {"means": 1, "log_scales": 1}, {"quats": 1, "logit_opacities": 2}):

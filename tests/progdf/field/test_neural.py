@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from progdf.field.neural import NeuralShape, course
+from progdf.field.neural import NeuralShape, offsets_of_answer
 from progdf.gaussians import attribute_slices
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import FORMS, MEMBERS, network, rows
@@ -15,19 +15,19 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_network_answers_exactly_zero_at_zero(form: str) -> None:
-    assert not bool(network(form).bound(rows()).offsets(0.0).any())
+    assert not bool(network(form).bind(rows()).offsets(0.0).any())
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_no_answer_of_the_network_moves_anything_at_zero(form: str) -> None:
     shape = network(form).shape
     wild = torch.full((5, 6), 1e6)
-    assert not bool(course(shape, torch.zeros(5), wild, wild).any())
+    assert not bool(offsets_of_answer(shape, torch.zeros(5), wild, wild).any())
 
 
 @pytest.mark.parametrize("form", ["own", "position"])
 def test_interpolated_bins_leave_no_jump(form: str) -> None:
-    field = network(form).bound(rows())
+    field = network(form).bind(rows())
     whole = float((field.offsets(1.0) - field.offsets(0.0)).abs().max())
     for edge in torch.arange(11) / 10:
         step = field.offsets(float(edge) + 1e-4) - field.offsets(max(0.0, float(edge) - 1e-4))
@@ -35,7 +35,7 @@ def test_interpolated_bins_leave_no_jump(form: str) -> None:
 
 
 def test_hard_bins_stand_still_and_jump() -> None:
-    field = network("position, hard bins").bound(rows())
+    field = network("position, hard bins").bind(rows())
     assert torch.equal(field.offsets(0.31), field.offsets(0.39))
     assert torch.equal(field.offsets(1e-6), field.offsets(0.099))  # the paper's s = 0 and s = 0.1 are one
     assert float((field.offsets(0.401) - field.offsets(0.399)).abs().max()) > 1e-3
@@ -43,14 +43,14 @@ def test_hard_bins_stand_still_and_jump() -> None:
 
 def test_a_network_that_keeps_the_end_meets_it_by_itself() -> None:
     _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
-    assert torch.equal(network().bound(rows()).offsets(1.0), offsets[-1])
+    assert torch.equal(network().bind(rows()).offsets(1.0), offsets[-1])
 
 
 def test_only_attributes_that_move_have_outputs() -> None:
     shape = network().shape
     assert shape.attributes == ("means", "sh0")
     assert network().tensors["heads.weight"].shape[0] == 6
-    packed = network().bound(rows()).offsets(0.5)
+    packed = network().bind(rows()).offsets(0.5)
     still = [columns for name, columns in attribute_slices(14).items() if name not in shape.attributes]
     assert not any(bool(packed[:, columns].any()) for columns in still)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.field import baked_neural
+from progdf.field import bake_network
 from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
 from progdf.field.evaluate import FieldEvaluator, sample_strengths
 from tests.helpers.edits import curved_trajectory
@@ -24,7 +24,7 @@ def test_the_ends_of_a_baked_network_are_exact(form: str) -> None:
 
 @pytest.mark.parametrize("form", ["own", "own, hard bins"])
 def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
-    field, bound = baked(form), network(form).bound(rows())
+    field, bound = baked(form), network(form).bind(rows())
     strengths = sample_strengths()
     wrong = sum(float((field.offsets(float(s)) - bound.offsets(float(s))).square().sum()) for s in strengths)
     whole = sum(float(bound.offsets(float(s)).square().sum()) for s in strengths)
@@ -37,7 +37,7 @@ def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
 def test_what_a_network_misses_of_the_end_is_spread_over_the_way() -> None:
     form = network("position")
     _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
-    missing = float((form.bound(rows()).offsets(1.0) - offsets[-1]).norm())
+    missing = float((form.bind(rows()).offsets(1.0) - offsets[-1]).norm())
     field = baked("position")
     last = float((field.offsets(1.0) - field.offsets(0.99)).norm())
     assert last < 0.2 * missing
@@ -47,7 +47,7 @@ def test_the_pull_follows_the_recorded_errors_where_they_are_known() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
     judge = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14])
     follows = FieldEvaluator.curve
-    known = baked_neural(network("position"), rows(), lambda s: _at(strengths, offsets, s))
+    known = bake_network(network("position"), rows(), lambda s: _at(strengths, offsets, s))
     assert sum(follows(judge, known)) >= sum(follows(judge, baked("position"))) - 1e-6
 
 
@@ -70,11 +70,11 @@ def test_a_form_refuses_other_numbers_of_members() -> None:
     form = baked().origin
     assert isinstance(form, NeuralForm)
     with pytest.raises(ValueError, match="expected 40"):
-        form.baked(rows()[:39])
+        form.bake(rows()[:39])
 
 
 def test_a_looser_bake_has_fewer_bases() -> None:
-    tight, loose = (baked_neural(network(), rows(), tolerance=given).origin for given in (1e-3, 0.3))
+    tight, loose = (bake_network(network(), rows(), tolerance=given).origin for given in (1e-3, 0.3))
     assert tight is not None
     assert loose is not None
     assert sum(loose.plan.ranks.values()) < sum(tight.plan.ranks.values())

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.field import NeuralSettings, baked_neural, fit_neural
-from progdf.field.neural_fit import NeuralFit, rendered_importance, trained
+from progdf.field import NeuralSettings, bake_network, fit_neural
+from progdf.field.neural_fit import NeuralFit, rendered_importance, train_network
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
 
@@ -34,7 +34,7 @@ def test_training_brings_the_network_to_the_trajectory() -> None:
     errors = []
     for steps in (1, 300):
         given = NeuralSettings(inputs="position", steps=steps, batch=128)
-        field = fit_neural(strengths, offsets, rows(), given).bound(rows())
+        field = fit_neural(strengths, offsets, rows(), given).bind(rows())
         middle = field.offsets(float(strengths[4])) - offsets[4]
         errors.append(float(middle.square().mean() / offsets[4].square().mean()))
     assert errors[1] < 0.02 < 0.5 < errors[0]  # .0005 when written
@@ -47,7 +47,7 @@ def test_a_code_tells_what_no_place_can() -> None:
     errors = []
     for code in (0, 4):
         given = NeuralSettings(inputs="position", steps=400, batch=128, code=code)
-        field = fit_neural(strengths, offsets, same_place, given).bound(same_place)
+        field = fit_neural(strengths, offsets, same_place, given).bind(same_place)
         errors.append(float((field.offsets(0.5) - offsets[4]).square().sum() / offsets[4].square().sum()))
     assert errors[1] < 0.2 * errors[0]
 
@@ -58,7 +58,7 @@ def test_visible_members_are_fitted_first() -> None:
     visibility = torch.full((MEMBERS,), 1e-6)
     visibility[7] = 1.0
     given = NeuralSettings(inputs="position", steps=200, batch=128)
-    field = fit_neural(strengths, offsets, same_place, given, visibility).bound(same_place)
+    field = fit_neural(strengths, offsets, same_place, given, visibility).bind(same_place)
     wrong = (field.offsets(0.5) - offsets[4]).square().sum(dim=1)
     assert int(wrong.argmin()) == 7
 
@@ -91,7 +91,7 @@ def test_what_moves_nothing_cannot_be_learned() -> None:
 def test_hardly_any_members_are_enough(count: int) -> None:
     strengths, offsets = curved_trajectory(max(count, 1))
     field = fit_neural(strengths, offsets[:, :1], rows()[:1], SHORT)
-    assert torch.equal(baked_neural(field, rows()[:1]).offsets(1.0), offsets[-1])
+    assert torch.equal(bake_network(field, rows()[:1]).offsets(1.0), offsets[-1])
     empty = NeuralFit(rows()[:0], 14, ("sh0",), SHORT)
     assert empty.step(strengths, offsets[:, :0]) == 0.0
 
@@ -109,23 +109,25 @@ def test_a_fit_goes_on_to_the_same_bits_after_it_was_saved() -> None:
         whole.step(strengths, offsets)
     for _ in range(3):
         first.step(strengths, offsets)
-    kept = {name: tensor.clone() for name, tensor in first.saved().items()}
+    kept = {name: tensor.clone() for name, tensor in first.capture_state().items()}
     first.step(strengths, offsets)  # what was saved does not change with it
     second.restore(kept)
     for _ in range(3):
         second.step(strengths, offsets)
-    assert whole.saved().keys() == second.saved().keys()
-    assert all(torch.equal(tensor, second.saved()[name]) for name, tensor in whole.saved().items())
+    assert whole.capture_state().keys() == second.capture_state().keys()
+    assert all(
+        torch.equal(tensor, second.capture_state()[name]) for name, tensor in whole.capture_state().items()
+    )
 
 
 def test_a_trajectory_that_grows_does_not_change_what_the_network_answers() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
     fit = NeuralFit(rows(), 14, ("sh0",), replace(SHORT, inputs="position"))
     fit.scale_to(0.1 * offsets)
-    trained(fit, strengths, 0.1 * offsets, 20)
-    before = fit.field().bound(rows()).offsets(0.5)
+    train_network(fit, strengths, 0.1 * offsets, 20)
+    before = fit.field().bind(rows()).offsets(0.5)
     fit.scale_to(offsets)
-    after = fit.field().bound(rows()).offsets(0.5)
+    after = fit.field().bind(rows()).offsets(0.5)
     assert torch.allclose(before, after, atol=2e-3 * float(before.abs().max()))  # half precision
 
 
@@ -135,10 +137,10 @@ def test_a_fit_takes_over_the_outputs_that_still_move() -> None:
     first = NeuralFit(rows(), 14 + 9, ("means", "sh0", "shN"), given)
     wide = torch.cat([offsets, offsets[:, :, :9]], dim=2)
     first.scale_to(wide)
-    trained(first, strengths, wide, 20)
+    train_network(first, strengths, wide, 20)
     second = NeuralFit(rows(), 14, ("sh0",), given)
-    second.adopt(first.shape, first.saved())
+    second.adopt(first.shape, first.capture_state())
     second.scale_to(offsets)
-    expected = first.field().bound(rows()).offsets(0.5)[:, 11:14]
-    found = second.field().bound(rows()).offsets(0.5)[:, 11:14]
+    expected = first.field().bind(rows()).offsets(0.5)[:, 11:14]
+    found = second.field().bind(rows()).offsets(0.5)[:, 11:14]
     assert torch.allclose(found, expected, atol=2e-3 * float(expected.abs().max()))

@@ -20,7 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.formats import gaussforge_child
 from progdf.formats import scene_file as formats
 from progdf.formats.ply import load_ply
-from progdf.formats.scene_file import load_scene, load_scene_with_report, scene_format, turned_about_x
+from progdf.formats.scene_file import load_scene, load_scene_with_report, rotate_about_x, scene_format
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
 from progdf.rasterize.reference import rotation_matrices
@@ -109,7 +109,7 @@ def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> N
 def test_half_a_turn_about_x_turns_what_is_seen() -> None:
     """The signs of all bands, against the basis itself: what is seen along d is then seen along d turned."""
     scene = scene_of(3, 50)
-    turned, turn = turned_about_x(scene), torch.tensor([1.0, -1.0, -1.0])
+    turned, turn = rotate_about_x(scene), torch.tensor([1.0, -1.0, -1.0])
     directions = torch.nn.functional.normalize(scene.sh0, dim=1)
     torch.testing.assert_close(shade(3, directions * turn, turned.sh), shade(3, directions, scene.sh))
     frames, expected = (rotation_matrices(s.quats) * s.scales[:, None] for s in (turned, scene))

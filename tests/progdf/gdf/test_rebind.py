@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from progdf.__main__ import main
-from progdf.cli.rebind import match_scenes, rebound
+from progdf.cli.rebind import match_scenes, rebind_edit
 from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import save_ply
-from progdf.formats.scene_file import load_scene, turned_about_x
+from progdf.formats.scene_file import load_scene, rotate_about_x
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import load_gdf
 from progdf.rasterize import render
@@ -46,7 +46,7 @@ def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:
     assert np.array_equal(match.rows, order.numpy())
     assert (match.matched, match.once, match.p95) == (1.0, 1.0, 0.0)
     for gdf in stack.gdfs:
-        found = compose_layers(other, [Layer(rebound(gdf, stack.scene, other, match), 0.6)])
+        found = compose_layers(other, [Layer(rebind_edit(gdf, stack.scene, other, match), 0.6)])
         expected = compose_layers(stack.scene, [Layer(gdf, 0.6)])[order]
         for name in ("means", "log_scales", "logit_opacities", "sh0"):
             assert torch.equal(getattr(found, name), getattr(expected, name)), name
@@ -66,7 +66,7 @@ def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
     )
     gdf = replace(gdf, field=replace(gdf.field, attributes={"quats": turning}))
     other, order = shuffled(scene)
-    found = compose_layers(other, [Layer(rebound(gdf, scene, other, match_scenes(scene, other)), 1.0)])
+    found = compose_layers(other, [Layer(rebind_edit(gdf, scene, other, match_scenes(scene, other)), 1.0)])
     expected = compose_layers(scene, [Layer(gdf, 1.0)])[order]
     same = (found.unit_quats * expected.unit_quats).sum(dim=1).abs()
     torch.testing.assert_close(same, torch.ones(len(scene)))
@@ -114,7 +114,7 @@ def test_another_scene_is_refused_and_a_turned_one_is_named(
 ) -> None:
     a, edit, *_ = stack.save(tmp_path)
     moved = replace(stack.scene, means=stack.scene.means + torch.tensor([0.3, 0.0, 0.0]))
-    for scene, said in ((moved, "is another scene"), (turned_about_x(stack.scene), "half a turn about x")):
+    for scene, said in ((moved, "is another scene"), (rotate_about_x(stack.scene), "half a turn about x")):
         save_ply(tmp_path / "other.ply", scene)
         words = ["--from", str(a), "--to", str(tmp_path / "other.ply"), "-o", str(tmp_path / "new.gdf")]
         assert main(["rebind", str(edit), *words]) == 2

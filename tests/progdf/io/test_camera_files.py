@@ -132,7 +132,7 @@ def test_distortion_is_kept_as_the_cameras_lens_and_not_ignored(tmp_path: Path) 
     assert cameras[1].lens is None
     save_cameras(tmp_path / "kept.json", cameras)
     assert [camera.lens for camera in load_cameras(tmp_path / "kept.json")] == [c.lens for c in cameras]
-    assert cameras[0].resized(32, 20).lens == cameras[0].lens
+    assert cameras[0].resize(32, 20).lens == cameras[0].lens
 
 
 def test_what_lenses_bend_is_told_in_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

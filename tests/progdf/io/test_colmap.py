@@ -118,7 +118,7 @@ def test_a_lens_is_kept_and_bends_rays_as_colmap_bends_them(
     camera = load_cameras(write_model(tmp_path / "m", views(), (kind, numbers)))[0]
     assert camera.lens == lens
     rays = torch.tensor([[0.3, -0.2], [-0.5, 0.1], [0.0, 0.0]]).double()
-    bent = (lens or Lens()).distorted(rays)
+    bent = (lens or Lens()).distort(rays)
     oracle = pycolmap.Camera(camera_id=1, model=kind, width=320, height=200, params=numbers)
     pixels = torch.from_numpy(oracle.img_from_cam(torch.cat([rays, torch.ones(3, 1)], dim=1).numpy()))
     torch.testing.assert_close(bent @ camera.K[:2, :2].double() + camera.K[:2, 2].double(), pixels)

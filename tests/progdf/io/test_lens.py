@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.lens import Lens, straightened
+from progdf.lens import Lens, undistort
 
 BARREL = Lens(k1=-0.18, k2=0.03, p1=0.004, p2=-0.006, k3=0.002)
 K = torch.tensor([[90.0, 0.0, 63.0], [0.0, 85.0, 49.5], [0.0, 0.0, 1.0]])
@@ -32,13 +32,13 @@ def photograph(lens: Lens) -> Tensor:
     seen = pixel_rays()
     rays = seen.clone()
     for _ in range(200):
-        rays = rays - 0.7 * (lens.distorted(rays) - seen)
-    assert float((lens.distorted(rays) - seen).abs().max()) < 1e-9
+        rays = rays - 0.7 * (lens.distort(rays) - seen)
+    assert float((lens.distort(rays) - seen).abs().max()) < 1e-9
     return pattern(rays).float()
 
 
 def test_a_photograph_is_straightened_to_what_a_pinhole_sees() -> None:
-    straight, shown = straightened(photograph(BARREL), K, BARREL)
+    straight, shown = undistort(photograph(BARREL), K, BARREL)
     expected = pattern(pixel_rays()).float()
     assert float(shown.float().mean()) > 0.7
     inner = shown.clone()
@@ -51,7 +51,7 @@ def test_a_photograph_is_straightened_to_what_a_pinhole_sees() -> None:
 
 def test_what_the_photograph_does_not_show_is_told() -> None:
     pincushion = Lens(k1=0.4)
-    straight, shown = straightened(photograph(Lens()), K, pincushion)
+    straight, shown = undistort(photograph(Lens()), K, pincushion)
     for row, column in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
         assert not bool(shown[row, column]), "a corner, which the lens pulls out of the photograph"
     assert bool(shown[HEIGHT // 2, WIDTH // 2])
@@ -59,13 +59,13 @@ def test_what_the_photograph_does_not_show_is_told() -> None:
 
 
 def test_the_edge_of_a_photograph_is_not_darkened() -> None:
-    straight, shown = straightened(torch.ones(HEIGHT, WIDTH, 3), K, Lens(k1=0.1))
+    straight, shown = undistort(torch.ones(HEIGHT, WIDTH, 3), K, Lens(k1=0.1))
     torch.testing.assert_close(straight[shown], torch.ones(int(shown.sum()), 3))
 
 
 def test_no_lens_changes_no_bit() -> None:
     image = photograph(Lens())
-    straight, shown = straightened(image, K, Lens())
+    straight, shown = undistort(image, K, Lens())
     assert bool(shown.all())
     torch.testing.assert_close(straight, image, atol=2e-5, rtol=0)
 
@@ -73,7 +73,7 @@ def test_no_lens_changes_no_bit() -> None:
 def test_where_the_formula_folds_back_nothing_is_shown() -> None:
     folding = Lens(k1=-0.6)
     wide = torch.tensor([[40.0, 0.0, 64.0], [0.0, 40.0, 48.0], [0.0, 0.0, 1.0]])
-    _, shown = straightened(torch.rand(HEIGHT, WIDTH, 3), wide, folding)
+    _, shown = undistort(torch.rand(HEIGHT, WIDTH, 3), wide, folding)
     assert not bool(shown[48, 0])
     assert bool(shown[48, 64])
 

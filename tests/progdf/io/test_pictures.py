@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.images import contact_sheet, laid_on, open_picture, picture_size, write_image
+from progdf.io.images import contact_sheet, flatten_onto, open_picture, picture_size, write_image
 from tests.helpers.refused import refusal
 
 
@@ -116,6 +116,6 @@ def test_what_needs_a_program_to_be_read_is_no_picture(tmp_path: Path) -> None:
 def test_transparency_counts_as_the_paper(tmp_path: Path) -> None:
     Image.new("RGBA", (4, 2), (255, 0, 0, 0)).save(tmp_path / "a.png")
     Image.new("L", (4, 2), 7).save(tmp_path / "b.png")
-    assert laid_on(open_picture(tmp_path / "a.png"), "white").getpixel((0, 0)) == (255, 255, 255)
-    assert laid_on(open_picture(tmp_path / "a.png"), "black", (8, 4)).getpixel((0, 0)) == (0, 0, 0)
-    assert laid_on(open_picture(tmp_path / "b.png"), "white").getpixel((0, 0)) == (7, 7, 7)
+    assert flatten_onto(open_picture(tmp_path / "a.png"), "white").getpixel((0, 0)) == (255, 255, 255)
+    assert flatten_onto(open_picture(tmp_path / "a.png"), "black", (8, 4)).getpixel((0, 0)) == (0, 0, 0)
+    assert flatten_onto(open_picture(tmp_path / "b.png"), "white").getpixel((0, 0)) == (7, 7, 7)

@@ -13,7 +13,7 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
-from progdf.terminal import PrintableFormatter, printable
+from progdf.terminal import PrintableFormatter, escape_text
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.ply_files import scene_of, table_of, with_extra, write
 from tests.helpers.scenes import front_camera, random_gaussians
@@ -27,10 +27,10 @@ def harmless(text: str) -> bool:
 
 
 def test_what_is_nothing_to_look_at_becomes_its_escape() -> None:
-    assert printable(EVIL) == r"a\x1b]0;owned\x07\x1b[2J\r\u202e\x9b"
-    assert printable("two\nlines") == r"two\nlines"
-    assert printable("caf\udce9") == r"caf\udce9", "a file name that is no UTF-8"
-    assert printable("Größe 12 345 × “…” 界") == "Größe 12 345 × “…” 界"
+    assert escape_text(EVIL) == r"a\x1b]0;owned\x07\x1b[2J\r\u202e\x9b"
+    assert escape_text("two\nlines") == r"two\nlines"
+    assert escape_text("caf\udce9") == r"caf\udce9", "a file name that is no UTF-8"
+    assert escape_text("Größe 12 345 × “…” 界") == "Größe 12 345 × “…” 界"
 
 
 def test_an_error_is_one_line_whatever_names_it_tells() -> None:

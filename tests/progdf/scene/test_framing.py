@@ -12,7 +12,7 @@ from torch import Tensor
 from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians, normalize_quats
 from progdf.rasterize.reference import rotation_matrices
-from progdf.scene.bounds import front, is_surrounding, normals_of
+from progdf.scene.bounds import front_direction, is_surrounding, normals_of
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up
 from tests.helpers.scenes import ball, random_gaussians
@@ -72,10 +72,10 @@ def test_cameras_that_agree_tell_the_up_direction(small_bear: Gaussians) -> None
 
 def test_the_front_is_level_and_of_unit_length() -> None:
     for up in [*AXES, torch.nn.functional.normalize(torch.tensor([0.3, -0.9, 0.4]), dim=0)]:
-        assert abs(float(front(up) @ up)) < 1e-6
-        assert abs(float(front(up).norm()) - 1) < 1e-6
-    assert front(torch.tensor([0.0, -1.0, 0.0])).tolist() == [0, 0, -1]
-    assert front(torch.tensor([0.0, 0.0, 1.0])).tolist() == [0, -1, 0]
+        assert abs(float(front_direction(up) @ up)) < 1e-6
+        assert abs(float(front_direction(up).norm()) - 1) < 1e-6
+    assert front_direction(torch.tensor([0.0, -1.0, 0.0])).tolist() == [0, 0, -1]
+    assert front_direction(torch.tensor([0.0, 0.0, 1.0])).tolist() == [0, -1, 0]
 
 
 def walls(ceiling: bool) -> Gaussians:

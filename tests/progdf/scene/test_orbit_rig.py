@@ -12,7 +12,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.scene.bounds import front, scene_sphere
+from progdf.scene.bounds import front_direction, scene_sphere
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import ball
 
@@ -66,7 +66,7 @@ def test_the_rig_looks_at_the_centre_with_up_up_and_begins_at_the_front() -> Non
         assert float((camera.viewmat[:3, :3] @ up)[1]) < 0
         assert float((camera.position - centre) @ up) > 0, "a camera under the ground"
     away = cameras[0].position - centre
-    assert float(away @ front(up)) > 0.8 * float(away.norm()) * math.cos(math.radians(60))
+    assert float(away @ front_direction(up)) > 0.8 * float(away.norm()) * math.cos(math.radians(60))
     assert [camera.name for camera in cameras[:2]] == ["orbit_000", "orbit_001"]
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.region import Region, from_mask, union, without
+from progdf.region import Region, difference, from_mask, union
 from progdf.scene.region_spec import parse_region, split_spec
 from tests.helpers.scenes import random_gaussians
 
@@ -194,7 +194,7 @@ MASKS = st.lists(st.booleans(), min_size=12, max_size=12).map(torch.tensor)
 @given(a=MASKS, b=MASKS)
 def test_set_operations_are_those_of_sets(a: torch.Tensor, b: torch.Tensor) -> None:
     one, two = from_mask("a", a), from_mask("b", b)
-    for operation, expected in ((union, a | b), (without, a & ~b)):
+    for operation, expected in ((union, a | b), (difference, a & ~b)):
         region = operation(one, two)
         assert region.members.tolist() == expected.nonzero()[:, 0].tolist()
         assert torch.equal(region.score, expected.float())
@@ -204,13 +204,13 @@ def test_soft_scores_keep_their_shades() -> None:
     a = Region("a", torch.tensor([0, 1]), torch.tensor([0.9, 0.8, 0.4, 0.0]))
     b = Region("b", torch.tensor([1, 3]), torch.tensor([0.2, 0.75, 0.5, 1.0]))
     assert union(a, b).score.tolist() == pytest.approx([0.9, 0.8, 0.5, 1.0])
-    assert without(a, b).score.tolist() == pytest.approx([0.8, 0.25, 0.4, 0.0])
-    assert without(a, b).members.tolist() == [0]
+    assert difference(a, b).score.tolist() == pytest.approx([0.8, 0.25, 0.4, 0.0])
+    assert difference(a, b).members.tolist() == [0]
 
 
 def test_regions_of_different_scenes_do_not_mix() -> None:
     a, b = (from_mask(name, torch.ones(count, dtype=torch.bool)) for name, count in (("a", 3), ("b", 4)))
-    for operation in (union, without):
+    for operation in (union, difference):
         with pytest.raises(ValueError, match="3 Gaussians, b of 4"):
             operation(a, b)
 

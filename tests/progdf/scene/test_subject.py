@@ -13,7 +13,7 @@ from torch import Tensor
 from progdf.demo_scenes import DemoScene, bear, room
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.scene.subject import fitted_eye, is_room, standpoint, subject_rows
+from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
 from progdf.scene.up_axis import guess_up
 from tests.helpers.paths import SHARED_DATA
 from tests.helpers.scenes import random_gaussians
@@ -129,7 +129,7 @@ def test_a_trained_robot_and_its_hands_fill_the_first_picture_and_the_ground_doe
 
 def test_the_eye_stands_as_near_as_it_can() -> None:
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3) * torch.tensor([3.0, 1.0, 2.0])
-    eye = fitted_eye(corners, 0.0, torch.eye(3), (0.5, 0.5))
+    eye = fit_eye(corners, 0.0, torch.eye(3), (0.5, 0.5))
     torch.testing.assert_close(eye, torch.tensor([0.0, 0.0, 8.0], dtype=torch.float64))
     shown = corners.double() - eye
     assert float((shown[:, :2].abs().amax(dim=1) / -shown[:, 2]).max()) == pytest.approx(0.5)

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from progdf.__main__ import main
-from progdf.cli.options import parsed
+from progdf.cli.options import parse_options
 from progdf.demo_scenes import bear, room
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.up_axis import AXES, axis_direction, find_up, guess_up, saved_up
+from progdf.scene.up_axis import AXES, axis_direction, find_up, guess_up, up_from_json
 from tests.helpers.scenes import ball, random_gaussians
 from tests.helpers.stacks import bear_stack
 from viewer.camera.view_camera import first_camera
@@ -80,7 +80,7 @@ def test_too_few_gaussians_are_upright_by_convention() -> None:
 
 def test_a_saved_up_axis_comes_back_and_nonsense_does_not() -> None:
     up = find_up(bear(3000).gaussians)
-    kept = saved_up(up.saved())
+    kept = up_from_json(up.to_json())
     assert kept is not None
     assert torch.equal(kept, up.direction)
     for nonsense in (
@@ -91,11 +91,11 @@ def test_a_saved_up_axis_comes_back_and_nonsense_does_not() -> None:
         {"direction": [0, "y", 0]},
         {"direction": [1e99] * 3},
     ):
-        assert saved_up(nonsense) is None
+        assert up_from_json(nonsense) is None
 
 
 def test_an_axis_may_begin_with_a_minus_on_the_command_line() -> None:
-    assert parsed(RenderOptions, ["a.ply", "--up", "-z", "-o", "b.png"], "progdf render").up == "-z"
+    assert parse_options(RenderOptions, ["a.ply", "--up", "-z", "-o", "b.png"], "progdf render").up == "-z"
 
 
 def test_check_prints_boxes_to_paste_and_the_up_axis(
@@ -126,7 +126,7 @@ def test_check_prints_boxes_to_paste_and_the_up_axis(
 
 
 def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:
-    options = parsed(RenderOptions, [*arguments, "-o", str(tmp_path / "p.png")], "progdf render")
+    options = parse_options(RenderOptions, [*arguments, "-o", str(tmp_path / "p.png")], "progdf render")
     found = opening.open_stack(options)
     return found.up if found.session is None else found.view.camera.up
 
@@ -144,7 +144,7 @@ def test_an_edit_shows_its_scene_upright_without_being_asked(tmp_path: Path) -> 
 def test_a_session_keeps_the_up_axis_and_up_changes_it(tmp_path: Path) -> None:
     stack = bear_stack(2000)
     scene, _, _ = stack.save(tmp_path)
-    options = parsed(RenderOptions, [str(scene), "-o", "p.png"], "progdf render")
+    options = parse_options(RenderOptions, [str(scene), "-o", "p.png"], "progdf render")
     found = opening.open_stack(options)
     view = replace(found.view, camera=first_camera(found.document.scene, up=(0.0, 0.0, 1.0)))
     session.save(tmp_path / "a.session.json", session.WindowSession(found.document, view))

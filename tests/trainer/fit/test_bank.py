@@ -112,12 +112,12 @@ def test_what_trains_alongside_goes_on_to_the_same_bits() -> None:
     whole, first, second = beside(), beside(), beside()
     run(whole, 0, 30)
     run(first, 0, 15)
-    kept = first.saved()
+    kept = first.capture_state()
     second.restore(replace(kept, tensors={name: tensor.clone() for name, tensor in kept.tensors.items()}))
     second.refill([(at, found) for at, found in recordings if at < 15])
     run(second, 15, 30)
-    for name, tensor in whole.saved().tensors.items():
-        assert torch.equal(tensor, second.saved().tensors[name]), name
+    for name, tensor in whole.capture_state().tensors.items():
+        assert torch.equal(tensor, second.capture_state().tensors[name]), name
 
 
 # ---- runs

@@ -137,7 +137,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         list(solve(original, solver, stages, stopped, stop))
-    again.restore(stopped.saved())
+    again.restore(stopped.capture_state())
     list(solve(original, solver, stages, again, lambda step, left: None))
     assert torch.equal(again.moved, whole.moved)
     assert again.step == whole.step == 10

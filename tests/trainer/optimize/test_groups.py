@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes.edits import AnalyticEdit, grown, swung
+from progdf.demo_scenes.edits import AnalyticEdit, scale_edit, swing_edit
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth
@@ -161,7 +161,7 @@ def arm_pivots(case: Small) -> Tensor:
 def test_a_shift_with_growth_is_found_to_a_hundredth_of_the_part() -> None:
     case = small("arms")
     shift = torch.tensor([0.0, 0.2, 0.1])
-    rows, crops, targets = pictured(case, grown(1.3, arm_pivots(case), shift))
+    rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case), shift))
     found = group_stage(rows, crops, [targets], steps=90)
     assert len(found.parts) == 2
     motion = found.motions[0]
@@ -172,7 +172,7 @@ def test_a_shift_with_growth_is_found_to_a_hundredth_of_the_part() -> None:
 
 def test_a_turn_is_found() -> None:
     case = small("arms")
-    rows, crops, targets = pictured(case, swung(30.0, torch.tensor([1.0, 0.0, 0.0]), arm_pivots(case)))
+    rows, crops, targets = pictured(case, swing_edit(30.0, torch.tensor([1.0, 0.0, 0.0]), arm_pivots(case)))
     motion = group_stage(rows, crops, [targets], steps=90).motions[0]
     expected = torch.tensor([math.radians(30.0), 0.0, 0.0]).expand(2, 3)
     assert float((motion.turn - expected).norm(dim=1).max()) < math.radians(3.0)
@@ -187,12 +187,12 @@ def test_where_nothing_moves_the_parts_stay_exactly() -> None:
 
 def test_the_same_seed_finds_the_same_bits() -> None:
     case = small("arms")
-    rows, crops, targets = pictured(case, grown(1.3, arm_pivots(case)))
-    first, again = (group_stage(rows, crops, [targets], steps=10, seed=4).saved() for _ in range(2))
+    rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case)))
+    first, again = (group_stage(rows, crops, [targets], steps=10, seed=4).capture_state() for _ in range(2))
     assert all(torch.equal(first[name], again[name]) for name in first)
     kept = restore_groups(rows, first)
     assert torch.equal(kept.parts.centers, make_parts(rows, connected_parts(rows[:, :3])).centers)
-    assert torch.equal(kept.saved()["motions"], first["motions"])
+    assert torch.equal(kept.capture_state()["motions"], first["motions"])
 
 
 def test_a_place_three_sizes_away_is_found_by_the_wide_search() -> None:
@@ -201,14 +201,14 @@ def test_a_place_three_sizes_away_is_found_by_the_wide_search() -> None:
     rows = pack(case.scene[case.region.members], with_shN=True)
     size = float(make_parts(rows, connected_parts(rows[:, :3])).sizes.mean())
     shift = torch.tensor([0.0, 3.0 * size, 0.0])
-    rows, crops, targets = pictured(case, grown(1.0, pivots, shift))
+    rows, crops, targets = pictured(case, scale_edit(1.0, pivots, shift))
     motion = group_stage(rows, crops, [targets]).motions[0]
     assert float((motion.shift - shift).norm(dim=1).max()) < 0.1 * size
 
 
 def test_targets_that_are_not_finite_stop_the_search() -> None:
     case = small("arms")
-    rows, crops, targets = pictured(case, grown(1.3, arm_pivots(case)))
+    rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case)))
     parts = make_parts(rows, connected_parts(rows[:, :3]))
     with pytest.raises(FloatingPointError, match="group stage"):
         GroupSearch(rows, parts, crops, 4).find([t * float("nan") for t in targets], parts.still())
@@ -235,7 +235,7 @@ def test_on_the_way_a_part_keeps_its_shape_and_the_ends_are_exact() -> None:
 
 def test_no_member_grows_beyond_the_clamp() -> None:
     case = small("arms")
-    rows, crops, targets = pictured(case, grown(2.5, arm_pivots(case)))
+    rows, crops, targets = pictured(case, scale_edit(2.5, arm_pivots(case)))
     largest = []
     for growth in (1.2, math.inf):
         settings = PgsSettings(20 * learning_rates("geometry", rows.shape[1], 1.0), growth=growth, ramp=0.0)

@@ -40,7 +40,7 @@ def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
     gaussians = load_ply(folder / "scene.ply")
     ids = [scene.label_names.index(part) for part in edit.parts]
     region = from_labels(edit.name, scene.labels, ids)
-    formula = scenes.recolored(torch.tensor([0.1, 0.3, 0.9]))
+    formula = scenes.recolor_edit(torch.tensor([0.1, 0.3, 0.9]))
     strengths = torch.tensor([0.0, 0.5, 1.0])
     rows = torch.stack(
         [pack(formula.apply(gaussians, region.members, float(s))[region.members]) for s in strengths]

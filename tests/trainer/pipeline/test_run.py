@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 import trainer.pipeline.training
-from progdf.cli.options import parsed
+from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory
@@ -280,7 +280,7 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
-    options = resolve_options(parsed(trainer.options.TrainOptions, words, "progdf train"))
+    options = resolve_options(parse_options(trainer.options.TrainOptions, words, "progdf train"))
     assert (options.seed, options.slider, options.name) == (7, "even", "r")
     assert (options.steps, options.views) == (240, 12)
 

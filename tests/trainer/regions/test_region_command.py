@@ -12,7 +12,7 @@ from PIL import Image
 from progdf.__main__ import main
 from progdf.demo_scenes import DemoScene, bear
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import counted
+from progdf.formats.load_report import format_count
 from progdf.formats.ply import save_ply
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.region import from_mask
@@ -54,7 +54,7 @@ def test_what_region_keeps_is_the_same_region_again(
     wanted = parse_region(spec, demo.gaussians)
     assert kept.dtype == np.int64
     assert torch.equal(parse_region(f"file:{out}", demo.gaussians).members, wanted.members)
-    assert f"{counted(len(kept))} of 3 000" in line
+    assert f"{format_count(len(kept))} of 3 000" in line
     mask = np.zeros(3000, np.bool_)
     mask[kept] = True
     np.save(tmp_path / "mask.npy", mask)
@@ -81,7 +81,7 @@ def test_rows_of_another_scene_are_one_line(
 
 
 def test_the_picture_tints_the_region_and_takes_the_color_from_the_rest(demo: DemoScene) -> None:
-    camera = demo.cameras[0].resized(64, 64)
+    camera = demo.cameras[0].resize(64, 64)
     nothing = picture(demo.gaussians, from_mask("", torch.zeros(3000, dtype=torch.bool)), camera)
     assert float((nothing.amax(dim=2) - nothing.amin(dim=2)).max()) < 1e-3, "grey"
     assert float(nothing.min()) > 0.6, "pale"

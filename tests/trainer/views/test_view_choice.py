@@ -197,7 +197,7 @@ def test_a_camera_that_shows_the_region_small_is_left_out_and_said_so() -> None:
     case = small("head")
     near = around(case, [0.0, 90.0, 180.0, 270.0])
     far = replace(near[0], K=near[0].K * torch.tensor([[0.2, 1, 1], [1, 0.2, 1], [1, 1, 1]]), name="far")
-    little = replace(near[1].resized(24, 24), name="little")
+    little = replace(near[1].resize(24, 24), name="little")
     chosen = choose_views(case.scene, case.region, [*near, far, little], 96, WHITE)
     assert [view.camera.name for view in chosen.views] == [*(c.name for c in near), "little"]
     assert chosen.line() == "5 of 6 cameras; 1 see too little of it"

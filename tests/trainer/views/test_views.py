@@ -11,7 +11,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.io.images import write_image
-from progdf.lens import Lens, straightened
+from progdf.lens import Lens, undistort
 from progdf.rasterize import render
 from progdf.region import from_mask
 from progdf.scene.bounds import scene_sphere
@@ -70,7 +70,7 @@ def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: P
     raw = make_editor(f"folder:{tmp_path / 'p'}", case.scene, case.region, [view]).edit(view, 1.0)
     straight = make_editor(f"photographs:{tmp_path / 'p'}", case.scene, case.region, [view]).edit(view, 1.0)
     assert torch.equal(raw, checks)
-    expected, shown = straightened(checks, view.camera.K, lens)
+    expected, shown = undistort(checks, view.camera.K, lens)
     assert torch.equal(straight[shown], expected[shown])
     assert torch.equal(straight[~shown], view.image[~shown]), "what no photograph shows stays as it is"
     assert float((straight - raw).abs().mean()) > 0.01

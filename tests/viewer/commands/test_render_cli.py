@@ -39,7 +39,7 @@ def stack() -> Stack:
 def folder(stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("render")
     stack.save(made)
-    save_cameras(made / "cameras.json", [camera.resized(64, 48) for camera in stack.demo.cameras[:3]])
+    save_cameras(made / "cameras.json", [camera.resize(64, 48) for camera in stack.demo.cameras[:3]])
     return made
 
 
@@ -61,7 +61,7 @@ def edited_by(stack: Stack, camera: Camera, scarf: float, ears: float) -> np.nda
 def test_a_camera_file_and_strengths_give_the_composed_picture(run: Run, stack: Stack) -> None:
     options = ("--set", "scarf=0.7", "--set", "ears=1", "--camera", "cameras.json:1", "--engine", "cpu")
     assert run("render", "bear.ply", "scarf.gdf", "ears.gdf", *options, "-o", "a.png") == 0
-    expected = edited_by(stack, stack.demo.cameras[1].resized(64, 48), 0.7, 1.0)
+    expected = edited_by(stack, stack.demo.cameras[1].resize(64, 48), 0.7, 1.0)
     assert np.abs(pixels("a.png").astype(int) - expected).max() <= 1
 
 
@@ -310,7 +310,7 @@ def test_another_size_shows_the_same_height_undistorted(stack: Stack) -> None:
     assert float(wide.K[0, 0]) == float(wide.K[1, 1]) == float(camera.K[1, 1])
     assert float(wide.K[0, 2]) == camera.width
     half = fit_camera(camera, (camera.width // 2, camera.height // 2))
-    assert torch.allclose(half.K, camera.resized(camera.width // 2, camera.height // 2).K)
+    assert torch.allclose(half.K, camera.resize(camera.width // 2, camera.height // 2).K)
 
 
 def test_an_orbit_keeps_the_framed_pivot_and_distance() -> None:

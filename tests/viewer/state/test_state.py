@@ -34,7 +34,7 @@ def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
             made.extend(snapshot for snapshot in optimize(*wanted, on_step, state))
             break
         except Stop:
-            saved = state.saved()
+            saved = state.capture_state()
             folder.save("pgs", saved.tensors, saved.values)
             state = PgsState(original, seed=5)
             restored = folder.load("pgs")
@@ -60,7 +60,7 @@ def test_saving_waits_until_it_is_a_hundredth_of_the_time(
     folder.begin({})
 
     class Slow:
-        def saved(self) -> Saved:
+        def capture_state(self) -> Saved:
             nonlocal now
             now += 0.5  # seconds that a save takes
             return Saved({}, {})
