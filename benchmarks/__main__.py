@@ -36,7 +36,7 @@ RECORDED = "benchmarks.recorded_runs:recorded_course"
 
 
 @dataclass(frozen=True)
-class Options:
+class BenchOptions:
     """Measure speed against error; each benchmark interleaves what it compares in one process.
 
     Args:
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the named benchmarks, or the ablation. Raises ProgdfError for a name that does not exist."""
     if list(argv[:1]) == ["ablate"]:
         return ablate(argv[1:])
-    options = parse_options(Options, argv, COMMAND)
+    options = parse_options(BenchOptions, argv, COMMAND)
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate'))}")

@@ -30,7 +30,7 @@ AT_SNAPSHOTS = 6
 
 
 @dataclass(frozen=True)
-class KnownCourse:
+class KnownEdit:
     """An edit's true course.
 
     Args:
@@ -74,14 +74,14 @@ class KnownCourse:
         return min((decibels(error) for error in errors), default=decibels(0.0))
 
 
-def known_course(
+def known_edit(
     name: str,
     scene: Gaussians,
     edit: AnalyticEdit,
     members: Tensor,
     cameras: Sequence[Camera],
     snapshots: int,
-) -> KnownCourse:
+) -> KnownEdit:
     """Everything of an edit that a benchmark of fields needs."""
     with_sh = bool((edit.apply(scene, members, 1.0).shN != scene.shN).any())
     start = pack(scene[members], with_sh)
@@ -103,7 +103,7 @@ def known_course(
     )
     weights = visible / visible.mean() + 1e-3
     look = _changed_pixels(scene, members, offsets, seen)
-    return KnownCourse(name, scene, members, strengths, offsets, truth, judge, look, weights, shown)
+    return KnownEdit(name, scene, members, strengths, offsets, truth, judge, look, weights, shown)
 
 
 def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras: Sequence[Camera]) -> Render:

@@ -27,7 +27,7 @@ from progdf.io.atomic import atomic_write
 from progdf.rasterize import set_threads
 from progdf.rasterize.cpu.parallel import threads
 
-from .courses import KnownCourse, edit_of, known_course, milliseconds
+from .courses import KnownEdit, edit_of, known_edit, milliseconds
 from .field_forms import Form, baked_forms
 from .field_network import STEPS, network_forms
 from .field_plot import draw_forms
@@ -40,7 +40,7 @@ CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
 """Members and Gaussians of the scenes on which a slider step is timed."""
 
 
-def tables(recorded: Sequence[KnownCourse] = (), plot: Path | None = None) -> list[Table]:
+def tables(recorded: Sequence[KnownEdit] = (), plot: Path | None = None) -> list[Table]:
     """Error against bytes and time; a slider step against copying as many bytes.
 
     Args:
@@ -50,7 +50,7 @@ def tables(recorded: Sequence[KnownCourse] = (), plot: Path | None = None) -> li
     scene = bear(BEAR)
     edits = bear_edits(scene)
     cameras = [camera.resize(SIDE, SIDE) for camera in scene.cameras]
-    known = [known_course(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS) for name in EDITS]
+    known = [known_edit(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS) for name in EDITS]
     courses = [*known, *recorded]
     forms = [form for course in courses for form in (*baked_forms(course), *network_forms(course))]
     if plot is not None:

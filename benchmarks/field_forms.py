@@ -14,7 +14,7 @@ from progdf.field.keyframes import bending_snapshots
 from progdf.field.rendered import picture_gram, render_trajectories
 from progdf.field.separable import channel_weights
 
-from .courses import KnownCourse, edit_of, step_ms
+from .courses import KnownEdit, edit_of, step_ms
 from .joint_svd import fit_joint
 
 COUNTS = (3, 4, 9)
@@ -59,12 +59,12 @@ class Form:
         return sum(self.curve) / len(self.curve) if self.curve else None
 
 
-def baked_forms(course: KnownCourse) -> list[Form]:
+def baked_forms(course: KnownEdit) -> list[Form]:
     """Keyframes, joint and separable factors of the same bytes, and what `auto` chooses; all judged alike."""
     strengths, offsets, judge, weights = course.strengths, course.offsets, course.judge, course.weights
     found: list[Form] = []
 
-    def measured(kind: str, fit: Callable[[], tuple[BakedField, str]], shared: float = 0.0) -> Form:
+    def measure(kind: str, fit: Callable[[], tuple[BakedField, str]], shared: float = 0.0) -> Form:
         begin = time.perf_counter()
         field, label = fit()
         seconds = shared + time.perf_counter() - begin
@@ -82,7 +82,7 @@ def baked_forms(course: KnownCourse) -> list[Form]:
     looked = time.perf_counter() - begin
     kept = {count: bending_snapshots(strengths, gram, count) for count in {2, 4, 9, *COUNTS}}
     for count in (2, 4, 9):
-        measured(
+        measure(
             "keyframes, float32",
             lambda c=count: (  # type: ignore[misc]
                 fit_keyframes(strengths, offsets, c, kept=kept[c]), f"{c} keyframes, float32"
@@ -95,7 +95,7 @@ def baked_forms(course: KnownCourse) -> list[Form]:
     for count in COUNTS:
         for between in ("linear", "cubic"):
             name = "keyframes, int8" if between == "linear" else "cubic keyframes, int8"
-            measured(
+            measure(
                 name,
                 lambda c=count, b=between, n=name: (  # type: ignore[misc]
                     fit_keyframes(strengths, offsets, c, None, torch.int8, kept[c], b), f"{c} {n}"
@@ -103,7 +103,7 @@ def baked_forms(course: KnownCourse) -> list[Form]:
                 looked,
             )  # fmt: skip
         size = found[-1].bytes_per_member
-        measured(
+        measure(
             "joint SVD",
             lambda c=count: (fit_joint(strengths, offsets, c - 2, weights), f"joint SVD, rank {c - 2}"),  # type: ignore[misc]
         )
@@ -112,13 +112,13 @@ def baked_forms(course: KnownCourse) -> list[Form]:
             candidate = separable_within(courses, strengths, size, judge)
             return candidate.field, candidate.label
 
-        measured("separable", separable, straightened)
+        measure("separable", separable, straightened)
 
     def auto() -> tuple[BakedField, str]:
         best = choose_field(strengths, offsets, course.look, weights, evaluator=judge).best
         return best.field, f"auto at 40 dB: {best.label}"
 
-    measured("auto", auto)
+    measure("auto", auto)
     return found
 
 

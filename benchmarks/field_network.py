@@ -14,7 +14,7 @@ from progdf.field.neural_fit import NeuralFit
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import pack
 
-from .courses import KnownCourse, milliseconds
+from .courses import KnownEdit, milliseconds
 from .field_forms import Form
 
 STEPS = 600
@@ -29,7 +29,7 @@ NETWORKS = (
 PAPER = NeuralSettings("paper", "position")
 
 
-def network_forms(course: KnownCourse) -> list[Form]:
+def network_forms(course: KnownEdit) -> list[Form]:
     """Networks before they are baked; the paper's last, timed but neither trained nor judged."""
     before = pack(course.scene[course.members])
     found = []
@@ -48,7 +48,7 @@ def network_forms(course: KnownCourse) -> list[Form]:
 
 
 def _form(
-    course: KnownCourse,
+    course: KnownEdit,
     network: NeuralField,
     label: str,
     curve: tuple[float, ...],

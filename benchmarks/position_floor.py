@@ -17,7 +17,7 @@ from progdf.field.evaluate import FieldEvaluator
 from progdf.field.separable import channel_weights, check_trajectory, moving_attributes
 from progdf.scene.neighbors import nearest_rows
 
-from .courses import KnownCourse
+from .courses import KnownEdit
 from .table import Table
 
 NEIGHBORS = (1, 2, 4, 8, 16)
@@ -86,7 +86,10 @@ def position_floor(
     nearest, _ = nearest_rows(places, torch.arange(len(places)), max(NEIGHBORS))
     found = {}
     for count in [n for n in NEIGHBORS if n <= nearest.shape[1]]:
-        share = {name: _left(offsets[:, :, c], shown, nearest[:, :count]) for name, c in attributes.items()}
+        share = {
+            name: _unexplained_share(offsets[:, :, c], shown, nearest[:, :count])
+            for name, c in attributes.items()
+        }
         found[count] = share
     best = min(found, key=lambda n: sum(found[n].values()))
     mean = worst = float("nan")
@@ -104,7 +107,7 @@ def _mean_of(offsets: Tensor, nearest: Tensor) -> Tensor:
     return total / nearest.shape[1]
 
 
-def _left(offsets: Tensor, shown: Tensor, nearest: Tensor) -> float:
+def _unexplained_share(offsets: Tensor, shown: Tensor, nearest: Tensor) -> float:
     """Share of the movement about its mean that neighbors do not tell. [T,M,c], [M,1]"""
     wrong = whole = 0.0
     for moved in offsets[1:]:
@@ -114,7 +117,7 @@ def _left(offsets: Tensor, shown: Tensor, nearest: Tensor) -> float:
     return wrong / whole if whole > 0 else 0.0
 
 
-def floor_table(courses: Sequence[KnownCourse]) -> Table:
+def floor_table(courses: Sequence[KnownEdit]) -> Table:
     """What places tell of every edit, beside which a network that sees positions alone may be held."""
     rows = []
     for course in courses:

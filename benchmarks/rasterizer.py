@@ -28,7 +28,7 @@ INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 
 @dataclass(frozen=True)
-class Case:
+class RasterCase:
     """A random cloud in front of a camera.
 
     Args:
@@ -42,7 +42,7 @@ class Case:
     baseline: bool = True
 
 
-CASES = (Case(2_000, 128), Case(20_000, 256), Case(100_000, 512, baseline=False))
+CASES = (RasterCase(2_000, 128), RasterCase(20_000, 256), RasterCase(100_000, 512, baseline=False))
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Duel:
 
 
 @dataclass(frozen=True)
-class Result:
+class RasterTimes:
     """Times of one case in ms, one entry a round, and errors against float64.
 
     Args:
@@ -70,7 +70,7 @@ class Result:
         gradient_errors: largest difference over the largest gradient, by input
     """
 
-    case: Case
+    case: RasterCase
     forward: list[float]
     both: list[float]
     duels: list[Duel]
@@ -83,7 +83,7 @@ class Result:
         return self.duels[0].ratio
 
 
-def cloud(case: Case) -> tuple[list[Tensor], Camera]:
+def cloud(case: RasterCase) -> tuple[list[Tensor], Camera]:
     """Activated means, quats, scales, opacities, rgb, seeded, and a camera that sees most of them.
 
     A Gaussian's standard deviation is about 1.4 pixels, axes differ by a factor of about 2: what a trained
@@ -131,7 +131,7 @@ def _image(engine: str, gaussians: tuple[Tensor, ...], camera: Camera) -> Tensor
     return image
 
 
-def three_sigma(splats: reference.Splats) -> reference.Splats:
+def three_sigma(splats: reference.ReferenceSplats) -> reference.ReferenceSplats:
     """With the published extents: a square of three standard deviations along the longer axis, whole pixels.
 
     They leave out what a Gaussian still adds between there and alpha = 1/255.
@@ -147,7 +147,7 @@ def three_sigma(splats: reference.Splats) -> reference.Splats:
     return replace(splats, extents=radius[:, None].expand(-1, 2))
 
 
-def measure(case: Case, rounds: int = 9, torch_rounds: int = 3) -> Result:
+def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterTimes:
     """Measure one case; engines take turns, and the first round of each is not counted.
 
     Args:
@@ -181,7 +181,7 @@ def measure(case: Case, rounds: int = 9, torch_rounds: int = 3) -> Result:
         for name, found, expected in zip(INPUTS, gradients, exact_gradients, strict=False)
     }
     image_error = float((image - exact).abs().max())
-    return Result(case, forward, both, duels, image_error, errors)
+    return RasterTimes(case, forward, both, duels, image_error, errors)
 
 
 @contextmanager

@@ -11,13 +11,13 @@ from trainer.fit.fit import visibility
 from trainer.pipeline.fit_and_report import load_evaluator
 from trainer.pipeline.reopen import render_run_views, reopen_run
 
-from .courses import KnownCourse
+from .courses import KnownEdit
 
 LOOKED, JUDGED = 3, 2
 """Training views that fields are chosen on, held-out views that they are judged in."""
 
 
-def recorded_course(root: Path) -> KnownCourse:
+def recorded_edit(root: Path) -> KnownEdit:
     """The edit of a run folder; its truth is the recording, straight from one snapshot to the next.
 
     Raises:
@@ -31,7 +31,7 @@ def recorded_course(root: Path) -> KnownCourse:
         for views in (few, setup.held_out[:JUDGED])
     )
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    return KnownCourse(
+    return KnownEdit(
         f"{run.region.name} (recorded)",
         run.scene,
         run.region.members,

@@ -8,7 +8,7 @@ from progdf.cli.options import parse_options
 from trainer.regions.options import RegionOptions, ViewsOptions, join_negative_values
 
 from .options import FitOptions, TrainOptions
-from .presets import under_preset
+from .presets import apply_preset
 
 
 def train(argv: Sequence[str]) -> int:
@@ -34,7 +34,7 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
     options = parse_options(TrainOptions, argv, "progdf train")
     if options.preset == "default":
         return options
-    return parse_options(TrainOptions, argv, "progdf train", under_preset(options, options.preset))
+    return parse_options(TrainOptions, argv, "progdf train", apply_preset(options, options.preset))
 
 
 def region(argv: Sequence[str]) -> int:

@@ -39,7 +39,7 @@ def resolve_options(options: TrainOptions) -> TrainOptions:
             stages=min(options.stages, QUICK_STAGES),
             views=min(options.views or QUICK_VIEWS, QUICK_VIEWS),
         )
-    name = checked_name(options.name or options.out.resolve().name)
+    name = check_name(options.name or options.out.resolve().name)
     check_ranges(
         ("--views", options.views or VIEWS, 3, 96),
         ("--image-size", options.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
@@ -70,7 +70,7 @@ def resolve_options(options: TrainOptions) -> TrainOptions:
     return replace(options, name=name)
 
 
-def checked_name(name: str) -> str:
+def check_name(name: str) -> str:
     """The name of a layer and its file, if it can be one.
 
     Raises:

@@ -63,6 +63,6 @@ PRESETS: Mapping[Preset, Mapping[str, Any]] = {
 }
 
 
-def under_preset(options: TrainOptions, preset: Preset) -> TrainOptions:
+def apply_preset(options: TrainOptions, preset: Preset) -> TrainOptions:
     """The options with a preset's values in the fields that it names; `replace` what should differ."""
     return replace(options, preset=preset, **PRESETS[preset])

@@ -26,7 +26,7 @@ from progdf.io.images import write_image
 from progdf.io.json_values import decode_json
 from progdf.metrics.slider import slider_statistics
 from trainer.editors.base import EditKind
-from trainer.fit.fit import fit_field, without_idle_attributes
+from trainer.fit.fit import drop_idle_attributes, fit_field
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.settings import objective_line, resolve_slider
@@ -91,12 +91,12 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
         try:
             shared = make_ablation_setup(run, own, kind, options.quick)
             for i, variant in enumerate(wanted):
-                if _kept(root, variant, shared) is not None:
+                if _load_outcome(root, variant, shared) is not None:
                     log.say(f"{variant.name}: done before")
                     continue
                 log.say(f"{variant.name} ({i + 1} of {len(wanted)}): {variant.what}")
                 try:
-                    _do(root, variant, shared, quiet)
+                    _run_variant(root, variant, shared, quiet)
                 except KeyboardInterrupt:
                     raise KeyboardInterrupt(
                         f"{i} of {len(wanted)} variants are done and kept in {root}; "
@@ -112,7 +112,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
             log.close()
 
 
-def _do(root: Path, variant: Variant, shared: AblationSetup, quiet: bool) -> None:
+def _run_variant(root: Path, variant: Variant, shared: AblationSetup, quiet: bool) -> None:
     """Train and judge one variant, and keep what became of it."""
     folder = root / variant.name
     folder.mkdir(exist_ok=True)
@@ -123,25 +123,25 @@ def _do(root: Path, variant: Variant, shared: AblationSetup, quiet: bool) -> Non
     outcome = Outcome(variant.name, variant.what, objective=objective)
     log = RunLog(folder / "log.txt", quiet)
     try:
-        trajectory = _recorded(root, variant, shared, options, perceptual, log)
+        trajectory = _record(root, variant, shared, options, perceptual, log)
         seconds = log.seconds["optimise"]
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
-        _keep(folder, replace(outcome, failed=str(error.__cause__)), (), variant, shared)
+        _save_outcome(folder, replace(outcome, failed=str(error.__cause__)), (), variant, shared)
         return
     finally:
         log.close()
-    field, asked = _fitted(variant, trajectory, shared, options)
-    outcome = _judged(replace(outcome, seconds=seconds), field, shared, asked, measure)
+    field, asked = _fit(variant, trajectory, shared, options)
+    outcome = _evaluate(replace(outcome, seconds=seconds), field, shared, asked, measure)
     region, scene = shared.run.region, shared.run.scene
     told = {"name": variant.name, **plain(options)}
     gdf = Gdf(variant.name, region, field, fingerprint(scene), options.editor, told)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
-    _keep(folder, outcome, strip(shared.evaluator, field, shared.columns, _WIDTH), variant, shared)
+    _save_outcome(folder, outcome, strip(shared.evaluator, field, shared.columns, _WIDTH), variant, shared)
 
 
-def _recorded(
+def _record(
     root: Path,
     variant: Variant,
     shared: AblationSetup,
@@ -159,11 +159,11 @@ def _recorded(
     edited = shared.edited if options.stages != 1 else {1.0: shared.edited[1.0]}
     with log.stage("optimise"):
         trajectory, _ = optimize_members(options, shared.setup, edited, shared.kind, perceptual, state, log)
-    trajectory, _ = without_idle_attributes(trajectory, shared.evaluator)
+    trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator)
     return retime_trajectory(trajectory, shared.setup, options, log)
 
 
-def _fitted(
+def _fit(
     variant: Variant, trajectory: Trajectory, shared: AblationSetup, options: TrainOptions
 ) -> tuple[BakedField, Mapping[float, float]]:
     """The variant's field, and where on its slider it was shown which of the editor's strengths."""
@@ -178,7 +178,7 @@ def _fitted(
     return field, {strength: remap.at(s) for s, strength in trajectory.asked}
 
 
-def _judged(
+def _evaluate(
     outcome: Outcome,
     field: BakedField,
     shared: AblationSetup,
@@ -204,7 +204,7 @@ def _judged(
     )
 
 
-def _keep(
+def _save_outcome(
     folder: Path, outcome: Outcome, pictures: Sequence[Tensor], variant: Variant, shared: AblationSetup
 ) -> None:
     """Write what became of a variant; the figures last, as they tell that it is done."""
@@ -213,7 +213,7 @@ def _keep(
     write_json(folder / "outcome.json", {"digest": digest_of(shared, variant), **asdict(outcome)})
 
 
-def _kept(root: Path, variant: Variant, shared: AblationSetup) -> Outcome | None:
+def _load_outcome(root: Path, variant: Variant, shared: AblationSetup) -> Outcome | None:
     """What became of a variant in an earlier call; None where it was not done, or on other ground."""
     try:
         found = decode_json((root / variant.name / "outcome.json").read_bytes())
@@ -226,7 +226,7 @@ def _kept(root: Path, variant: Variant, shared: AblationSetup) -> Outcome | None
 
 def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> Ablation:
     """Table and picture of all that is done."""
-    kept = [_kept(root, variant, shared) for variant in variants]
+    kept = [_load_outcome(root, variant, shared) for variant in variants]
     outcomes = [outcome for outcome in kept if outcome is not None]
     options, setup, evaluator = shared.options, shared.setup, shared.evaluator
     title = f"{options.name}: {options.editor}, part by part"

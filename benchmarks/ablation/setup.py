@@ -83,21 +83,21 @@ def make_ablation_setup(
     setup, strengths = render_run_views(run), run.trajectory.strengths
     options = replace(options, reedit_every=0)
     if quick:
-        strengths = tuple(_thinned(strengths, QUICK_STAGES))
-        train = _thinned(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))
+        strengths = tuple(_thin(strengths, QUICK_STAGES))
+        train = _thin(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))
         setup = replace(setup, train=train)
         options = replace(options, steps=min(options.steps, QUICK_STEPS), stages=len(strengths))
-    edited = {s: _edited(run, setup.train, s) for s in strengths}
+    edited = {s: _read_edited(run, setup.train, s) for s in strengths}
     setup = widen_views(setup, edited)
     columns = columns_of(run.trajectory.asked)
     shown = [strength for _, strength in columns[1:] if strength is not None]
-    few = _thinned(setup.train, 4)
+    few = _thin(setup.train, 4)
     channels = BASE_CHANNELS + 3 * run.scene.shN.shape[1]
 
     def evaluator(views: Sequence[View], pictures: Pictures) -> Evaluator:
         return make_evaluator(run.scene, run.region, views, pictures, setup.background, channels)
 
-    drawn = {s: _edited(run, setup.held_out, s) for s in shown}
+    drawn = {s: _read_edited(run, setup.held_out, s) for s in shown}
     digest = hashlib.sha256(run.region.members.numpy().tobytes())
     for pictures in (*edited.values(), *drawn.values()):
         for picture in pictures:
@@ -112,7 +112,7 @@ def make_ablation_setup(
         edited,
         evaluator(setup.held_out, drawn),
         columns,
-        evaluator(few, {1.0: _edited(run, few, 1.0)}),
+        evaluator(few, {1.0: _read_edited(run, few, 1.0)}),
         visibility(run.scene, run.region.members, setup.train),
         digest.hexdigest(),
     )
@@ -132,11 +132,11 @@ def plain(options: TrainOptions) -> dict[str, Any]:
     return {name: str(v) if isinstance(v, Path) else v for name, v in asdict(options).items()}
 
 
-def _edited(run: FinishedRun, views: Sequence[View], strength: float) -> list[Tensor]:
+def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> list[Tensor]:
     return read_views(run.folder, "edited", [view.camera.name for view in views], strength)
 
 
-def _thinned(values: Sequence[_T], count: int) -> list[_T]:
+def _thin(values: Sequence[_T], count: int) -> list[_T]:
     """At most `count` of them, evenly spread, the last among them."""
     count = min(count, len(values))
     return [values[round((i + 1) * len(values) / count) - 1] for i in range(count)]

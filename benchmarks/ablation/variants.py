@@ -77,12 +77,12 @@ def differing_variants(options: TrainOptions, kind: EditKind, stages: int, sh_de
         *(() if sh_degree > 0 else ("no-sh",)),
         *(() if kind == "geometry" else ("no-groups",)),
     }
-    own = _resolved(options, kind, stages)
+    own = _resolve(options, kind, stages)
     return [
         variant
         for variant in VARIANTS
         if variant.name not in idle
-        and (not variant.changes or _resolved(replace(options, **variant.changes), kind, stages) != own)
+        and (not variant.changes or _resolve(replace(options, **variant.changes), kind, stages) != own)
     ]
 
 
@@ -102,7 +102,7 @@ def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
     return [variant for variant in variants if not names or variant.name in names]
 
 
-def _resolved(options: TrainOptions, kind: EditKind, stages: int) -> TrainOptions:
+def _resolve(options: TrainOptions, kind: EditKind, stages: int) -> TrainOptions:
     """With the kind's own values in place of "auto" and None."""
     weight = PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight
     weight = 0.0 if solves_colors(options, kind) else weight

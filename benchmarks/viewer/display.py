@@ -21,7 +21,7 @@ PATIENCE_S = 120.0
 PROGRAMS = ("Xvfb", "xdotool")
 
 
-def missing() -> str:
+def missing_tools() -> str:
     """What is needed for a window without a screen and is not installed; empty if nothing is."""
     return " and ".join(program for program in PROGRAMS if shutil.which(program) is None)
 
@@ -33,8 +33,10 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
     Raises:
         ProgdfError: Xvfb or xdotool is not installed.
     """
-    if missing():
-        raise ProgdfError(f"{missing()} is not installed; install xvfb and xdotool to measure the window")
+    if missing_tools():
+        raise ProgdfError(
+            f"{missing_tools()} is not installed; install xvfb and xdotool to measure the window"
+        )
     receive, send = os.pipe()
     screen = ("-screen", "0", f"{width}x{height}x24")
     server = subprocess.Popen(

@@ -27,7 +27,7 @@ from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
 from viewer.render import dynamic_resolution as draft
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
 from viewer.state.view_state import ViewState
@@ -114,15 +114,15 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
             for scene in opened:
                 path = Path(folder) / "scene.ply"
                 save_ply(path, scene)
-                turnings += turned(ctx, path)
-                starts += [] if bench_display.missing() else [started(path, way) for way in WAYS]
+                turnings += measure_turning(ctx, path)
+                starts += [] if bench_display.missing_tools() else [measure_starts(path, way) for way in WAYS]
     finally:
         ctx.release()
     return [frames_table(turnings, starts, renderer), coarse_table(turnings, renderer)]
 
 
 @one_thread()
-def turned(
+def measure_turning(
     ctx: moderngl.Context, path: Path, steps: int = STEPS, size: tuple[int, int] = SIZE
 ) -> list[Turning]:
     """A scene's file opened and turned with the mouse, by every way in turns; then again, coarse."""
@@ -132,7 +132,7 @@ def turned(
         mice: dict[str, Mouse] = {}
         opened_s: dict[str, float] = {}
         for way in WAYS:
-            empty = Engine(ctx, nothing, (), way)
+            empty = ViewEngine(ctx, nothing, (), way)
             mice[way] = held.enter_context(Mouse(ctx, empty, nothing, (), ViewState(draft="off"), size))
             _open(mice[way], path, way)
             empty.release()
@@ -145,8 +145,8 @@ def turned(
             mouse.main_view.change(replace(mouse.main_view.work.view, draft="on"))
         coarse = _turn(mice, steps)
         for way, mouse in mice.items():
-            wrong = sum(not np.array_equal(image, _afresh(mouse, view)) for view, image in full[way].kept)
-            errors = [_psnr(image, _afresh(mouse, view)) for view, image in coarse[way].kept]
+            wrong = sum(not np.array_equal(image, _draw_anew(mouse, view)) for view, image in full[way].kept)
+            errors = [_psnr(image, _draw_anew(mouse, view)) for view, image in coarse[way].kept]
             results.append(
                 Turning(
                     mouse.main_view.facts.count,
@@ -164,7 +164,7 @@ def turned(
     return results
 
 
-def started(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
+def measure_starts(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
     """`progdf view --draw` of a scene's file, up to so many times, after one more that fills the caches.
 
     Raises:
@@ -267,7 +267,7 @@ def _open(mouse: Mouse, path: Path, way: str) -> float:
     """Open a file in the window as it is done when one is dropped there; seconds to its first picture."""
     began = time.perf_counter()
     document = documents.load(path)
-    mouse.engine = Engine(mouse.main_view.context, document.scene, (), way)
+    mouse.engine = ViewEngine(mouse.main_view.context, document.scene, (), way)
     mouse.main_view.set_engine(mouse.engine, document.facts())
     mouse.main_view.restart(replace(mouse.main_view.work.view, camera=first_camera(document.scene)))
     mouse.frame()
@@ -283,7 +283,7 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
     for step in range(-WARM_UP, steps):
         if step == 0:
             one_s = sum(turned.frames_ms[-1] for turned in turns.values()) / 1e3
-            steps = affordable(steps, one_s)
+            steps = affordable_steps(steps, one_s)
         elif step >= steps:
             break
         for way, mouse in mice.items():
@@ -297,15 +297,15 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
     return turns
 
 
-def affordable(steps: int, one_s: float) -> int:
+def affordable_steps(steps: int, one_s: float) -> int:
     """How many of `steps` fit into `TURN_S` if one takes so many seconds; at least `LEAST` of them."""
     return min(steps, max(LEAST, int(TURN_S / max(one_s, 1e-9))))
 
 
-def _afresh(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
+def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
     """The picture of `view` in full, by an engine that has drawn nothing before."""
     main_view, engine = mouse.main_view, mouse.engine
-    new = Engine(main_view.context, engine.scene, (), engine.draws_with)
+    new = ViewEngine(main_view.context, engine.scene, (), engine.draws_with)
     main_view.set_engine(new, main_view.facts)
     main_view.change(replace(view, draft="off"))
     mouse.frame()
@@ -326,7 +326,7 @@ def _at_rest(mouse: Mouse) -> int:
     rested, view = mouse.picture(), mouse.main_view.work.view
     mouse.release()
     mouse.settle()
-    return int(np.abs(rested.astype(int) - _afresh(mouse, view)).max())
+    return int(np.abs(rested.astype(int) - _draw_anew(mouse, view)).max())
 
 
 def _psnr(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> float:

@@ -17,7 +17,7 @@ from viewer.app.main_view import MainView
 from viewer.files.document import Document
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.state.view_state import ViewState
 
 SIZE = (640, 480)
@@ -46,7 +46,7 @@ class Mouse:
     def __init__(
         self,
         ctx: moderngl.Context,
-        engine: Engine,
+        engine: ViewEngine,
         scene: Gaussians,
         gdfs: Sequence[Gdf],
         view: ViewState,

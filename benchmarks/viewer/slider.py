@@ -21,7 +21,7 @@ from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
 from viewer.camera.view_camera import first_camera, to_camera
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
 from viewer.render.timings import FrameTimings
@@ -60,7 +60,7 @@ WAYS = {
 
 
 @dataclass(frozen=True)
-class Case:
+class SliderCase:
     """An edit of a scene.
 
     Args:
@@ -76,11 +76,16 @@ class Case:
         return "colour and place" if self.moves else "colour"
 
 
-CASES = (Case(3_000, False), Case(3_000, True), Case(30_000, True), Case(125_000, True))
+CASES = (
+    SliderCase(3_000, False),
+    SliderCase(3_000, True),
+    SliderCase(30_000, True),
+    SliderCase(125_000, True),
+)
 
 
 @dataclass(frozen=True)
-class Result:
+class SliderTimes:
     """What one way took, an entry per step of the slider, and how far its picture is from the CPU engine's.
 
     Args:
@@ -93,7 +98,7 @@ class Result:
         edit_error: largest difference of an attribute from `progdf.compose` (see `Engine.edit_error`)
     """
 
-    case: Case
+    case: SliderCase
     count: int
     way: str
     events_ms: tuple[float, ...]
@@ -121,7 +126,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     opened = scenes_of(scenes)
     ctx = headless_context()
     try:
-        results: list[Result] = []
+        results: list[SliderTimes] = []
         for case in CASES:
             results += rows(ctx, _fitting(opened, case.members), case)
         return [table(results, str(ctx.info["GL_RENDERER"]))]
@@ -133,10 +138,10 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 def rows(
     ctx: moderngl.Context,
     scene: Gaussians,
-    case: Case,
+    case: SliderCase,
     steps: int = STEPS,
     size: tuple[int, int] = SIZE,
-) -> list[Result]:
+) -> list[SliderTimes]:
     """One edit, by every way, a step each in turns."""
     gdf = edit_for(scene, case.members, case.moves)
     case = replace(case, members=len(gdf.region))
@@ -147,7 +152,7 @@ def rows(
     with ExitStack() as held:
         mice: dict[str, Mouse] = {}
         for name, way in WAYS.items():
-            engine = Engine(ctx, scene, [gdf], way.draw, way.edit_pass)
+            engine = ViewEngine(ctx, scene, [gdf], way.draw, way.edit_pass)
             held.callback(engine.release)
             mice[name] = held.enter_context(Mouse(ctx, engine, scene, [gdf], view, size))
             mice[name].grip_slider()
@@ -159,7 +164,7 @@ def rows(
                 events[name].append(mouse.move(*place))
                 parts[name].append(mouse.main_view.canvas.timings)
         return [
-            Result(
+            SliderTimes(
                 case,
                 len(scene),
                 name,
@@ -173,7 +178,7 @@ def rows(
         ]
 
 
-def table(results: Sequence[Result], renderer: str) -> Table:
+def table(results: Sequence[SliderTimes], renderer: str) -> Table:
     """The measurements, named after what OpenGL was drawn by."""
     return Table(
         "viewer",
@@ -201,7 +206,7 @@ def table(results: Sequence[Result], renderer: str) -> Table:
     )
 
 
-def _cells(result: Result) -> tuple[str, ...]:
+def _cells(result: SliderTimes) -> tuple[str, ...]:
     middle, late = np.percentile(result.events_ms, (50, 95))
     return (
         f"{result.count:,}".replace(",", " "),
@@ -230,7 +235,7 @@ def _apart(mouse: Mouse, size: tuple[int, int]) -> float:
     return float(np.abs(stepped - mouse.engine.image(view, size)).max())
 
 
-def _psnr(engine: Engine, view: ViewState, size: tuple[int, int]) -> float:
+def _psnr(engine: ViewEngine, view: ViewState, size: tuple[int, int]) -> float:
     worst = math.inf
     for strength in (0.0, 0.5, 1.0):
         slid = replace(view, layers=(LayerState(0, "edit", strength),))

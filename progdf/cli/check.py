@@ -19,7 +19,7 @@ from .options import parse_options
 
 
 @dataclass(frozen=True)
-class Options:
+class CheckOptions:
     """Report what a scene's file holds and what had to be repaired to load it. Nothing is written.
 
     Args:
@@ -35,7 +35,7 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
-    options = parse_options(Options, argv, "progdf check")
+    options = parse_options(CheckOptions, argv, "progdf check")
     scene, report = load_scene_with_report(options.scene)
     cameras = [] if options.cameras is None else load_cameras(options.cameras)
     up = find_up(scene, cameras, options.up)

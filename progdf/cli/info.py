@@ -29,7 +29,7 @@ TIMELINE_MARK = "progdf_timeline"
 
 
 @dataclass(frozen=True)
-class Options:
+class InfoOptions:
     """Tell what a scene, a .gdf edit, a session or a camera file holds, an edit with its error report.
 
     Args:
@@ -41,7 +41,7 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
-    path = parse_options(Options, argv, "progdf info").file
+    path = parse_options(InfoOptions, argv, "progdf info").file
     for line in describe(path):
         print_line(line)
     return 0

@@ -39,7 +39,7 @@ Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Options:
+class RebindOptions:
     """Carry an edit over to the same scene in another file or format.
 
     Args:
@@ -75,7 +75,7 @@ class Match:
 
 def main(argv: Sequence[str]) -> int:
     """Write the edit for the other file. Raises ProgdfError where the two scenes are not the same."""
-    options = parse_options(Options, argv, "progdf rebind")
+    options = parse_options(RebindOptions, argv, "progdf rebind")
     if options.out.suffix.lower() != ".gdf":
         raise ProgdfError(f"{options.out} is not a .gdf file; give the edit a name that ends in .gdf")
     a, b = load_scene(options.source), load_scene(options.target)

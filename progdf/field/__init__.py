@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from .bake import NeuralForm, bake_network
 from .baked import AttributeBases, BakedField
-from .choose import Choice, choose_field
+from .choose import FieldChoice, choose_field
 from .evaluate import Candidate, FieldEvaluator
 from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
@@ -15,7 +15,7 @@ __all__ = [
     "AttributeBases",
     "BakedField",
     "Candidate",
-    "Choice",
+    "FieldChoice",
     "FieldEvaluator",
     "NeuralField",
     "NeuralForm",

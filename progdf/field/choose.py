@@ -24,7 +24,7 @@ from .separable import channel_weights, check_trajectory, moving_attributes, pri
 
 __all__ = [
     "Candidate",
-    "Choice",
+    "FieldChoice",
     "FieldEvaluator",
     "Kind",
     "choose_field",
@@ -47,7 +47,7 @@ KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 
 
 @dataclass(frozen=True)
-class Choice:
+class FieldChoice:
     """What was chosen and why.
 
     Args:
@@ -73,7 +73,7 @@ def choose_field(
     budget: float | None = None,
     evaluator: FieldEvaluator | None = None,
     recorded: Sequence[float] | None = None,
-) -> Choice:
+) -> FieldChoice:
     """The smallest field whose worst PSNR against the trajectory reaches the target, or the best in a budget.
 
     Args:
@@ -102,7 +102,7 @@ def choose_field(
         found = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
         fits = budget is None or everything.bytes_per_member <= budget
         met = fits and (not math.isfinite(target) or found.worst >= target)
-        return Choice(found, met, (found,), "nothing is left out")
+        return FieldChoice(found, met, (found,), "nothing is left out")
     if kind in ("auto", "separable"):
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
         seen = render_trajectories(offsets, spread, render)
@@ -117,22 +117,22 @@ def choose_field(
     return pick_candidate(tuple(tried), target, budget)
 
 
-def pick_candidate(tried: tuple[Candidate, ...], target: float, budget: float | None) -> Choice:
+def pick_candidate(tried: tuple[Candidate, ...], target: float, budget: float | None) -> FieldChoice:
     """The smallest that reaches the target, else the best; of those that the budget allows, if any."""
     looked = f"{len(tried)} fields"
     allowed = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]
     if not allowed:
         least = min(tried, key=lambda c: (c.field.bytes_per_member, -c.worst))
-        return Choice(least, False, tried, f"the smallest of {looked}; none fits into {budget:g} bytes")
+        return FieldChoice(least, False, tried, f"the smallest of {looked}; none fits into {budget:g} bytes")
     good = [c for c in allowed if c.worst >= target]
     within = "" if budget is None else f" within {budget:g} bytes"
     if good:
         best = min(good, key=lambda c: (c.field.bytes_per_member, -c.worst))
-        return Choice(best, True, tried, f"the smallest of {looked}{within} that reaches {target:g} dB")
+        return FieldChoice(best, True, tried, f"the smallest of {looked}{within} that reaches {target:g} dB")
     best = max(allowed, key=lambda c: (c.worst, -c.field.bytes_per_member))
     if math.isfinite(target):
-        return Choice(best, False, tried, f"the best of {looked}{within}; none reaches {target:g} dB")
-    return Choice(best, True, tried, f"the best of {looked}{within}")
+        return FieldChoice(best, False, tried, f"the best of {looked}{within}; none reaches {target:g} dB")
+    return FieldChoice(best, True, tried, f"the best of {looked}{within}")
 
 
 def separable_within(

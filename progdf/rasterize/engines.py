@@ -15,7 +15,7 @@ Crop = tuple[int, int, int, int]
 """A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
 
 ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu.engine"}
-"""Engine name -> module that is an `Engine`, imported when first used."""
+"""Engine name -> module that is a `RasterEngine`, imported when first used."""
 
 
 class ActivatedGaussians(NamedTuple):
@@ -42,7 +42,7 @@ class RasterView:
     antialiased: bool = False
 
 
-class Engine(Protocol):
+class RasterEngine(Protocol):
     """What draws; shapes have been checked."""
 
     def rasterize(
@@ -57,8 +57,8 @@ class Engine(Protocol):
 
 
 @cache
-def get_engine(name: str) -> Engine:
+def get_engine(name: str) -> RasterEngine:
     """The engine of that name."""
     if name not in ENGINES:
         raise ValueError(f"there is no rasteriser '{name}', expected one of {', '.join(ENGINES)}")
-    return cast(Engine, importlib.import_module(ENGINES[name]))
+    return cast(RasterEngine, importlib.import_module(ENGINES[name]))

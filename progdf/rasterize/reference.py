@@ -29,7 +29,7 @@ TILE = 16
 
 
 @dataclass(frozen=True)
-class Splats:
+class ReferenceSplats:
     """The V Gaussians that a window shows, nearest first.
 
     Args:
@@ -62,7 +62,7 @@ def rasterize(
     return image, transmittance, info
 
 
-def blend(splats: Splats, crop: Crop, background: Tensor) -> tuple[Tensor, Tensor]:
+def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tensor, Tensor]:
     """Blend projected Gaussians tile by tile, front to back.
 
     Returns:
@@ -83,7 +83,7 @@ def blend(splats: Splats, crop: Crop, background: Tensor) -> tuple[Tensor, Tenso
     return window[..., :3] + transmittance[..., None] * background.to(window.dtype), transmittance
 
 
-def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[Splats, RasterInfo]:
+def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceSplats, RasterInfo]:
     """Project, cull and sort."""
     dtype = gaussians.means.dtype
     width, height, sh_degree = view.width, view.height, view.sh_degree
@@ -139,7 +139,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[Splats, Ra
         eye = -rotation.T @ translation
         direction = torch.nn.functional.normalize(means[rows[order]] - eye, dim=1, eps=1e-300)
         rgb = shade(sh_degree, direction, colors[rows[order]])
-    splats = Splats(
+    splats = ReferenceSplats(
         rows[order],
         means2d[order].to(dtype),
         whitening[order].to(dtype),
@@ -152,7 +152,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[Splats, Ra
     return splats, RasterInfo(centres, depths, visible)
 
 
-def tile_weights(splats: Splats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Alphas and blending weights of one 16x16 tile whose first pixel is (x, y).
 
     Returns:

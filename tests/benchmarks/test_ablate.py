@@ -217,7 +217,7 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", noted)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STEPS", 40)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STAGES", 2)
-    monkeypatch.setattr(benchmarks.ablation.ablate, "_keep", _forgets)
+    monkeypatch.setattr(benchmarks.ablation.ablate, "_save_outcome", _forgets)
     monkeypatch.setattr(benchmarks.ablation.ablate, "_publish", _published)
     ablate(AblateOptions(run, only="base", quick=True, threads=1), quiet=True)
     assert (asked[0].steps, asked[0].stages) == (40, 2)

@@ -16,14 +16,14 @@ from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.mouse import Mouse
 from benchmarks.viewer.scenes import copies, edit_for, scenes_of
-from benchmarks.viewer.slider import Case
+from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.window import Dragging, Idle
 from progdf.camera import Camera
 from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from viewer.camera.view_camera import bounds_of, first_camera
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.timings import FrameTimings
 from viewer.state.view_state import LayerState, ViewState
@@ -34,7 +34,7 @@ SIZE = (160, 400)
 @pytest.mark.gl
 def test_the_slider_table_has_a_row_for_each_way_to_draw_with_its_error() -> None:
     ctx = headless_context()
-    results = bench.rows(ctx, bear(600).gaussians, Case(100, True), steps=2, size=SIZE)
+    results = bench.rows(ctx, bear(600).gaussians, SliderCase(100, True), steps=2, size=SIZE)
     ctx.release()
     assert [result.way for result in results] == list(bench.WAYS)
     for result in results:
@@ -56,7 +56,7 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
     path = tmp_path / "bear.ply"
     save_ply(path, bear(600).gaussians)
     ctx = headless_context()
-    turnings = bench_frames.turned(ctx, path, steps=2, size=SIZE)
+    turnings = bench_frames.measure_turning(ctx, path, steps=2, size=SIZE)
     ctx.release()
     assert [turning.way for turning in turnings] == list(bench_frames.WAYS)
     for turning in turnings:
@@ -74,10 +74,10 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
 
 
 def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:
-    assert bench_frames.affordable(20, 0.05) == 20
-    assert bench_frames.affordable(20, bench_frames.TURN_S / 7.5) == 7
-    assert bench_frames.affordable(20, 1e4) == bench_frames.LEAST
-    assert bench_frames.affordable(2, 1e4) == 2
+    assert bench_frames.affordable_steps(20, 0.05) == 20
+    assert bench_frames.affordable_steps(20, bench_frames.TURN_S / 7.5) == 7
+    assert bench_frames.affordable_steps(20, 1e4) == bench_frames.LEAST
+    assert bench_frames.affordable_steps(2, 1e4) == 2
 
 
 @pytest.mark.gl
@@ -88,7 +88,7 @@ def test_slow_turns_end_early_and_still_have_their_pictures(
     save_ply(path, bear(600).gaussians)
     monkeypatch.setattr(bench_frames, "TURN_S", 0.0)
     ctx = headless_context()
-    turnings = bench_frames.turned(ctx, path, steps=20, size=SIZE)
+    turnings = bench_frames.measure_turning(ctx, path, steps=20, size=SIZE)
     ctx.release()
     for turning in turnings:
         assert len(turning.frames_ms) == len(turning.coarse_ms) == bench_frames.LEAST
@@ -101,16 +101,16 @@ def test_a_frame_in_the_order_of_the_last_one_is_found(
 ) -> None:
     path = tmp_path / "bear.ply"
     save_ply(path, bear(600).gaussians)
-    draw = Engine._update_picture
+    draw = ViewEngine._update_picture
 
-    def stale(engine: Engine, view: ViewState, camera: Camera, *others: Any) -> FrameTimings:
+    def stale(engine: ViewEngine, view: ViewState, camera: Camera, *others: Any) -> FrameTimings:
         if engine._ordered_for is not None:
             engine._ordered_for = camera.viewmat.numpy().tobytes()
         return draw(engine, view, camera, *others)
 
-    monkeypatch.setattr(Engine, "_update_picture", stale)
+    monkeypatch.setattr(ViewEngine, "_update_picture", stale)
     ctx = headless_context()
-    turnings = bench_frames.turned(ctx, path, steps=2, size=SIZE)
+    turnings = bench_frames.measure_turning(ctx, path, steps=2, size=SIZE)
     ctx.release()
     assert {turning.way: turning.wrong > 0 for turning in turnings} == {"gl": True, "cpu": False}
 
@@ -120,7 +120,7 @@ def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
     scene = bear(600).gaussians
     gdf = edit_for(scene, 50, moves=False)
     ctx = headless_context()
-    engine = Engine(ctx, scene, [gdf], "cpu")
+    engine = ViewEngine(ctx, scene, [gdf], "cpu")
     view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.3),), draft="off")
     with Mouse(ctx, engine, scene, [gdf], view, SIZE) as mouse:
         mouse.grip_slider()
@@ -196,7 +196,7 @@ def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path
     if not (shutil.which("Xvfb") and shutil.which("xdotool")):
         pytest.skip("Xvfb and xdotool are not installed")
     save_ply(tmp_path / "bear.ply", bear(600).gaussians)
-    start = bench_frames.started(tmp_path / "bear.ply", "gl", times=1, size=SIZE)
+    start = bench_frames.measure_starts(tmp_path / "bear.ply", "gl", times=1, size=SIZE)
     assert 0.0 < start.imports_s < start.first_s
     assert start.memory_mb > 50.0
 

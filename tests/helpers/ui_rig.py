@@ -18,7 +18,7 @@ from viewer.camera.view_camera import first_camera
 from viewer.files.document import Document
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
@@ -164,7 +164,7 @@ def rig(
     """
     stack = stack or bear()
     context = headless_context()
-    engine = Engine(context, stack.scene, stack.gdfs, draw, edit_pass)
+    engine = ViewEngine(context, stack.scene, stack.gdfs, draw, edit_pass)
     facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
     main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
     try:

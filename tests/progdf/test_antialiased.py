@@ -23,7 +23,7 @@ from tests.helpers.stacks import Stack, bear_stack
 from trainer.views.crops import crop_scene
 from trainer.views.view import make_view
 from viewer.camera.view_camera import first_camera, to_camera
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
@@ -139,7 +139,7 @@ def test_the_window_draws_it_as_the_rasteriser_does(ctx: moderngl.Context, stack
     view = ViewState(
         camera=first_camera(stack.scene, stack.demo.cameras), layers=(LayerState(0, "scarf", 0.7),)
     )
-    engine = Engine(ctx, stack.scene, stack.gdfs, draw)  # type: ignore[arg-type]
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw)  # type: ignore[arg-type]
     try:
         found = torch.from_numpy(engine.image(view, SIZE))
     finally:

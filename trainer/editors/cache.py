@@ -65,7 +65,7 @@ class KeptPictures:
             return _eight_bits(paint(source))
         note = path.with_suffix(".json")
         wanted = {"source": digest(source), "editor": dict(recipe)}
-        if _note(note) == wanted:
+        if _read_note(note) == wanted:
             try:
                 return read_picture(path, size=(source.shape[1], source.shape[0]))
             except ProgdfError:
@@ -92,7 +92,7 @@ def _eight_bits(image: Tensor) -> Tensor:
     return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
 
 
-def _note(path: Path) -> object:
+def _read_note(path: Path) -> object:
     try:
         return decode_json(path.read_bytes())
     except (OSError, ValueError):

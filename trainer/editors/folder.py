@@ -69,12 +69,12 @@ class FolderEditor:
             return view.image
         if strength not in self.folders:
             raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
-        picture, shown = self._seen(self.folders[strength], view)
+        picture, shown = self._read_undistorted(self.folders[strength], view)
         if self.originals is not None:
-            picture = (view.image + picture - self._seen(self.originals, view)[0]).clamp(0.0, 1.0)
+            picture = (view.image + picture - self._read_undistorted(self.originals, view)[0]).clamp(0.0, 1.0)
         return torch.where(shown[..., None], picture, view.image)
 
-    def _seen(self, where: Path, view: View) -> tuple[Tensor, Tensor]:
+    def _read_undistorted(self, where: Path, view: View) -> tuple[Tensor, Tensor]:
         """A picture at its view's size, straight, and which of its pixels were taken. [H,W,3], [H,W] bool"""
         camera = view.camera
         picture = read_picture(_picture(where, camera.name, self.bent), size=(camera.width, camera.height))
@@ -110,10 +110,10 @@ def folder(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> FolderEditor:
     """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
-    return _editor_of(folder_of(what), views)
+    return _make_editor(folder_of(what), views)
 
 
-def _editor_of(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
+def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
     folders: dict[float, Path] = {}
     for child in sorted(root.iterdir()):
         strength = _strength(child.name)
@@ -138,7 +138,7 @@ def photographs(
     if originals is not None:
         for view in views:
             _picture(originals, view.camera.name, bent=True)
-    return replace(_editor_of(edited, views, bent=True), originals=originals)
+    return replace(_make_editor(edited, views, bent=True), originals=originals)
 
 
 def _strength(name: str) -> float | None:

@@ -40,7 +40,7 @@ _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Request:
     """One sentence for one model, nothing left open."""
 
     prompt: str
@@ -76,13 +76,13 @@ class InstructEditor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        return self._painted(view, view.image, strength, "" if strength == 1.0 else f"{strength:g}")
+        return self._paint(view, view.image, strength, "" if strength == 1.0 else f"{strength:g}")
 
     def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
         """See `Painter.edit_again`."""
-        return self._painted(view, current, strength, f"step_{step:05d}")
+        return self._paint(view, current, strength, f"step_{step:05d}")
 
-    def _painted(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:
+    def _paint(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:
         if self.stages and strength not in self.stages:
             raise ValueError(f"this editor pictures strength {list(self.stages)}, not {strength:g}")
         # guidance 1 is none, and pipelines skip it altogether below
@@ -97,7 +97,7 @@ def instruct(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    model, kind, asked = _understood(what, settings)
+    model, kind, asked = _resolve_request(what, settings)
     prompt = asked.prompt
 
     @cache
@@ -115,7 +115,7 @@ def instruct(
     }
     dial = settings.dial and asked.guidance > 1.0
     return InstructEditor(
-        lambda picture, guidance: _painted(pipeline(), asked, picture, guidance),
+        lambda picture, guidance: _run_pipeline(pipeline(), asked, picture, guidance),
         asked.guidance,
         recipe,
         KeptPictures(settings.kept),
@@ -129,7 +129,7 @@ def check_instruct(what: str, settings: EditorSettings) -> None:
     Raises:
         ProgdfError: nothing is said, a package or weights are missing or cut short, an option is not known.
     """
-    model, kind, _ = _understood(what, settings)
+    model, kind, _ = _resolve_request(what, settings)
     try:
         folder = folder_of_model(model, "model_index.json")
         parts = json.loads((folder / "model_index.json").read_bytes())
@@ -143,14 +143,14 @@ def check_instruct(what: str, settings: EditorSettings) -> None:
         raise _missing(model) from error
 
 
-def _understood(what: str, settings: EditorSettings) -> tuple[str, str, _Asked]:
+def _resolve_request(what: str, settings: EditorSettings) -> tuple[str, str, _Request]:
     """The model, its pipeline's class, and what it will be asked."""
     prompt = what.strip().strip("\"'").strip()
     if not prompt:
         raise ProgdfError('instruct: says nothing; write instruct:"turn him into Batman"')
     model = settings.model or DEFAULT_MODEL
     kind = pipeline_class(model)
-    return model, kind, _asked(prompt, model, kind, settings)
+    return model, kind, _make_request(prompt, model, kind, settings)
 
 
 def pipeline_class(model: str) -> str:
@@ -206,7 +206,7 @@ def load_pipeline(model: str, kind: str) -> Any:
     return pipeline.to("cuda" if gpu else "cpu")
 
 
-def _painted(pipeline: Any, asked: _Asked, view: Tensor, guidance: float) -> Tensor:
+def _run_pipeline(pipeline: Any, asked: _Request, view: Tensor, guidance: float) -> Tensor:
     """One picture through a pipeline, back at its own size. [H,W,3] -> [H,W,3]"""
     source = to_picture(view)
     scale = asked.size / max(source.size)
@@ -220,12 +220,12 @@ def _painted(pipeline: Any, asked: _Asked, view: Tensor, guidance: float) -> Ten
     return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)
 
 
-def _asked(prompt: str, model: str, kind: str, settings: EditorSettings) -> _Asked:
+def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) -> _Request:
     """The settings, with the model's own values where nothing was said."""
     adapter = ADAPTERS[kind]
     if settings.image_guidance is not None and "image_guidance" not in adapter.words:
         raise ProgdfError(f"{model} knows no --image-guidance; leave it out, or use --model {DEFAULT_MODEL}")
-    return _Asked(
+    return _Request(
         prompt,
         adapter,
         steps=adapter.steps if settings.steps is None else settings.steps,

@@ -1,7 +1,7 @@
 """Editors made of a colour function: exact, the same in every view, and with a dial of their own.
 
 They edit the region's own colour, unmixed from what shares a pixel with it, and mix it back (see
-`View.blended`): soft edges keep the right share of either side.
+`View.blend`): soft edges keep the right share of either side.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ColorEditor:
         shown = view.mask > 0
         inside = view.inside.clone()
         inside[shown] = self.change(view.inside[shown], strength)
-        return view.blended(inside)
+        return view.blend(inside)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class StripesEditor:
     stages: tuple[float, ...] = ()
     confined: bool = True
 
-    def painted(self, rgb: Tensor, strength: float) -> Tensor:
+    def paint(self, rgb: Tensor, strength: float) -> Tensor:
         """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
         plainer = torch.lerp(rgb, self.typical.expand_as(rgb), (_COVER * self.pattern)[:, None])
         under = color.recolor_fully(plainer, self.target, self.typical)
@@ -78,10 +78,10 @@ class StripesEditor:
         if strength == 0.0:
             return view.image
         scene, members, camera = self.scene, self.members, view.camera
-        painted = self.painted(seen_colors(scene[members], camera), strength)
+        painted = self.paint(seen_colors(scene[members], camera), strength)
         colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
         premultiplied = render_colors(scene, colors, camera, torch.zeros(3))
-        return view.blended((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
+        return view.blend((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
 
 
 def recolor(

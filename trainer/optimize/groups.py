@@ -57,7 +57,7 @@ class Groups:
         before: Sequence[Tensor] = render_all(crops, original)
         staged = []
         for stage, motion in zip(stages, self.motions, strict=True):
-            place = partial(self._placed, original, motion)
+            place = partial(self._place, original, motion)
             found = render_all(crops, original + place(torch.zeros_like(original)))
             whole, _ = visible_way(stage.targets, before)
             rest, left = visible_way(stage.targets, found)
@@ -66,7 +66,7 @@ class Groups:
             before = stage.targets
         return staged
 
-    def _placed(self, original: Tensor, motion: Motion, offsets: Tensor) -> Tensor:
+    def _place(self, original: Tensor, motion: Motion, offsets: Tensor) -> Tensor:
         return carry_offsets(original, offsets, self.parts, motion)
 
     def lines(self) -> list[str]:
@@ -117,7 +117,7 @@ def group_stage(
             if on_step is not None:
                 on_step(begun + step, loss)
 
-        start = motions[-1] if motions else parts.still()
+        start = motions[-1] if motions else parts.rest_motion()
         motions.append(search.find(pictures, start, step_done))
     return Groups(parts, tuple(motions))
 
@@ -143,7 +143,7 @@ def group_path(
     Returns:
         (step, stage, ends_stage, offsets [M,C] float16) in order, as `trajectory.record` takes them
     """
-    motion, own, begun = groups.parts.still(), torch.zeros_like(original), 0
+    motion, own, begun = groups.parts.rest_motion(), torch.zeros_like(original), 0
     each = max(2, count // len(ends))
     found = []
     for stage, (end, step, next_motion) in enumerate(zip(ends, steps, groups.motions, strict=True)):

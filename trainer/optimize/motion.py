@@ -49,7 +49,7 @@ class Parts:
     def __len__(self) -> int:
         return len(self.centers)
 
-    def still(self) -> Motion:
+    def rest_motion(self) -> Motion:
         """No part has moved."""
         nothing = torch.zeros_like(self.centers)
         return Motion(nothing, nothing[:, 0], nothing)
@@ -73,7 +73,7 @@ def move_rows(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
     means, log_scales, quats = _split(rows)
     turn, size = _quaternion(motion.turn)[part], motion.log_scale[part, None]
     arm = means - parts.centers[part]
-    means = parts.centers[part] + motion.shift[part] + size.exp() * _turned(arm, turn)
+    means = parts.centers[part] + motion.shift[part] + size.exp() * _rotate(arm, turn)
     return torch.cat([means, log_scales + size, _product(turn, quats), rows[:, _MOVING.stop :]], dim=1)
 
 
@@ -101,7 +101,7 @@ def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
     means, log_scales, quats = _split(original[:, moving] + offsets[:, moving])
     back, size = _quaternion(-motion.turn)[part], motion.log_scale[part, None]
     arm = means - parts.centers[part] - motion.shift[part]
-    own = [parts.centers[part] + _turned(arm, back) * (-size).exp(), log_scales - size, _product(back, quats)]
+    own = [parts.centers[part] + _rotate(arm, back) * (-size).exp(), log_scales - size, _product(back, quats)]
     return torch.cat([torch.cat(own, dim=1) - original[:, moving], offsets[:, moving.stop :]], dim=1)
 
 
@@ -135,7 +135,7 @@ def _rotation_vector(quaternion: Tensor) -> Tensor:
     return torch.where(sine > 1e-9, quaternion[:, 1:] * angle / sine.clamp_min(1e-9), 2.0 * quaternion[:, 1:])
 
 
-def _turned(vectors: Tensor, turn: Tensor) -> Tensor:
+def _rotate(vectors: Tensor, turn: Tensor) -> Tensor:
     """Vectors turned by unit quaternions. [M,3], [M,4] -> [M,3]"""
     axis = turn[:, 1:]
     twice = 2.0 * torch.linalg.cross(axis, vectors)

@@ -22,7 +22,7 @@ from .objective import TermMeans
 _ROWS = ("moved", "previous", "average", "first", "second")
 
 
-class _Values(msgspec.Struct):
+class _StateValues(msgspec.Struct):
     """What `PgsState.capture_state` gives beside tensors."""
 
     step: int
@@ -131,7 +131,7 @@ class PgsState:
 
     def restore(self, saved: Saved) -> None:
         """See `state.Resumable`."""
-        tensors, values = saved.tensors, convert_json(saved.values, _Values)
+        tensors, values = saved.tensors, convert_json(saved.values, _StateValues)
         with torch.no_grad():
             for name in _ROWS:
                 getattr(self, name).copy_(tensors[name])

@@ -46,7 +46,7 @@ def connected_parts(means: Tensor, least: float = 0.02) -> Tensor:
     counts = torch.bincount(cell_of, minlength=len(occupied))
     sums = torch.zeros(len(occupied), 3, dtype=torch.float64)
     centroids = sums.index_add(0, cell_of, points) / counts[:, None]
-    return _strays_joined(_joined(centroids, reach), centroids, counts, max(8.0, least * len(points)))[
+    return _join_strays(_join_cells(centroids, reach), centroids, counts, max(8.0, least * len(points)))[
         cell_of
     ]
 
@@ -60,7 +60,7 @@ def _spacing(points: Tensor) -> float:
     return float(nearest_rows(points, rows, nearest)[1][:, -1].median())
 
 
-def _joined(centroids: Tensor, reach: float) -> Tensor:
+def _join_cells(centroids: Tensor, reach: float) -> Tensor:
     """Which cells are joined, by however long a chain of cells within reach of each other. [C,3] -> [C]"""
     count = len(centroids)
     first, second = cKDTree(centroids.numpy()).query_pairs(reach, output_type="ndarray").T
@@ -68,7 +68,7 @@ def _joined(centroids: Tensor, reach: float) -> Tensor:
     return torch.from_numpy(connected_components(links, directed=False)[1]).long()
 
 
-def _strays_joined(labels: Tensor, centroids: Tensor, counts: Tensor, least: float) -> Tensor:
+def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float) -> Tensor:
     """Parts numbered by size, the largest 0; cells of those below `least` go with the nearest other cell."""
     roots, part = torch.unique(labels, return_inverse=True)
     sizes = torch.zeros(len(roots), dtype=torch.int64).index_add(0, part, counts)

@@ -63,7 +63,7 @@ def retime(
     if slider == "auto":
         raise ValueError("'auto' says no slider; see settings.resolve_slider")
     if slider == "time":
-        return replace(trajectory, s=_placed(0.0, 1.0, trajectory.steps.double()).float())
+        return replace(trajectory, s=_place_between(0.0, 1.0, trajectory.steps.double()).float())
     if slider == "stages":
         knots, pins = [0, *trajectory.stage_ends], [0.0, *trajectory.strengths]
     else:
@@ -75,14 +75,14 @@ def retime(
         for a, b, low, high in zip(knots, knots[1:], pins, pins[1:], strict=False)
     ]
     for nodes, low, high in segments:
-        s[nodes] = _placed(low, high, _cumulative(chords[nodes.start : nodes.stop - 1]))
+        s[nodes] = _place_between(low, high, _cumulative(chords[nodes.start : nodes.stop - 1]))
     for _ in range(passes - 1):
         before = s.clone()
         for nodes, low, high in segments:
             count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
             progress = _cumulative(_chords([blend_images(pictures, before, float(x)) for x in even]))
-            s[nodes] = _placed(low, high, interpolate(s[nodes], even, progress))
+            s[nodes] = _place_between(low, high, interpolate(s[nodes], even, progress))
     return replace(trajectory, s=s.float())
 
 
@@ -155,7 +155,7 @@ def _cumulative(lengths: Tensor) -> Tensor:
     return torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / lengths.sum()])
 
 
-def _placed(low: float, high: float, progress: Tensor) -> Tensor:
+def _place_between(low: float, high: float, progress: Tensor) -> Tensor:
     """Slider values from `low` to `high`, both exact, strictly ascending as `progress` does. [n] -> [n]"""
     gaps = progress.diff()
     gaps = gaps / float(gaps.sum()) * (high - low)

@@ -26,7 +26,7 @@ from trainer.optimize.losses import Perceptual
 from trainer.optimize.settings import resolve_slider
 from trainer.options import TrainOptions
 from trainer.plan import Plan
-from trainer.report.measures import clip_course, expected_measures, figures, measure
+from trainer.report.measures import clip_curve, expected_measures, figures, measure
 from trainer.report.report import report_picture
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import RunLog
@@ -120,7 +120,7 @@ def finish_run(
         else:
             log.say(f"no field reached --target-psnr {target:g}; the best was kept")
     with log.stage("report"):
-        clip = clip_course(evaluator, setup.held_out, field, plan.texts)
+        clip = clip_curve(evaluator, setup.held_out, field, plan.texts)
         if clip.reason and plan.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
@@ -150,10 +150,10 @@ def finish_run(
         "agreement": about.get("agreement"),
         "followed": about.get("followed", 0),
         "up": about.get("up"),
-        "time": {**(_earlier(folder, "time") if log.refits else {}), **log.rounded_seconds()},
+        "time": {**(_earlier_figures(folder, "time") if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.memory.peak(),
         "memory_by_stage_mb": {
-            **(_earlier(folder, "memory_by_stage_mb") if log.refits else {}),
+            **(_earlier_figures(folder, "memory_by_stage_mb") if log.refits else {}),
             **log.memory.by_stage,
         },
         "options": about["options"],
@@ -208,7 +208,7 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     return endpoint, change
 
 
-def _earlier(folder: RunFolder, part: str) -> dict[str, float]:
+def _earlier_figures(folder: RunFolder, part: str) -> dict[str, float]:
     """Figures of the stages that this command did not run again."""
     try:
         stages = decode_json(folder.report.read_bytes())[part]

@@ -15,7 +15,7 @@ from trainer.optimize.pgs import ParameterSnapshot
 from trainer.store.state import Saved, StateFolder
 
 
-class _Values(msgspec.Struct):
+class _RecordingValues(msgspec.Struct):
     """What is saved of a recording beside its offsets."""
 
     step: int
@@ -75,7 +75,7 @@ class Recordings:
         self.made = [self._read(kept) for kept in found if kept]
 
     def _read(self, kept: Saved) -> SavedSnapshot:
-        values, offsets = convert_json(kept.values, _Values), kept.tensors["offsets"]
+        values, offsets = convert_json(kept.values, _RecordingValues), kept.tensors["offsets"]
         if offsets.shape != self._shape or offsets.dtype != torch.float16:
             raise ValueError("a recording is of other members")
         return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)

@@ -66,7 +66,7 @@ class Reedit:
         targets = []
         for view, now in zip(setup.train, renders, strict=True):
             made = self._editor.edit_again(view, strength, now, due)
-            targets.append(crop(quantize_image(view.confined(made) if self._confined else made), view.box))
+            targets.append(crop(quantize_image(view.confine(made) if self._confined else made), view.box))
         return targets
 
 

@@ -19,7 +19,7 @@ from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json
 from progdf.region import Region
 from trainer.editors.base import EditKind
-from trainer.option_checks import checked_name
+from trainer.option_checks import check_name
 from trainer.options import TrainOptions
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.run_folder import RunFolder
@@ -83,7 +83,7 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
         options_of(about)
         name = convert_json(kept.options["name"], str)
         try:
-            checked_name(name)
+            check_name(name)
         except ProgdfError:
             raise ValueError("its name is none") from None
         members, score = extra["members"], extra["score"]

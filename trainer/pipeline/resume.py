@@ -48,7 +48,7 @@ def load_region(options: TrainOptions) -> Region | None:
     saved = state.load(REGION) if options.resume and state.identity() is not None else None
     if saved is None:
         return None
-    with state.restoring(REGION):
+    with state.restore_part(REGION):
         return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"])
 
 
@@ -173,7 +173,7 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
     try:
         return convert_json(found, _Identity)
     except ValueError as error:
-        raise folder.state.damaged(folder.state.path / "run.json", error) from None
+        raise folder.state.damage_error(folder.state.path / "run.json", error) from None
 
 
 def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOptions, remedy: str) -> None:
@@ -198,7 +198,7 @@ def _saved_step(folder: RunFolder) -> int:
     saved = folder.state.load("training")
     if saved is None:
         return 0
-    with folder.state.restoring("training"):
+    with folder.state.restore_part("training"):
         return int(saved.values["pgs"]["step"])
 
 

@@ -19,7 +19,7 @@ from progdf.scene.region_spec import parse_region
 from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, make_editor
 from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor
-from trainer.fit.fit import without_idle_attributes
+from trainer.fit.fit import drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.own_path import choose_path
 from trainer.fit.slider_uniformity import equalized_strengths
@@ -243,7 +243,7 @@ def _record(
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
             evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
-            trajectory, costs = without_idle_attributes(trajectory, evaluator)
+            trajectory, costs = drop_idle_attributes(trajectory, evaluator)
         recorded = len(trajectory)
         way = ""
         if not CONSTANTS[options.preset].raw and options.field != "neural" and len(edited) == 1:

@@ -158,7 +158,7 @@ def optimize_members(
         count = len(unseen_members.places)
         if solver is not None:
             log.say(f"{count} members that no view shows follow their neighbours")
-        elif no_worse(unseen_members, end, original, crops, stages):
+        elif is_no_worse(unseen_members, end, original, crops, stages):
             snapshots = [
                 (step, stage, last, unseen_members.propagate(made)) for step, stage, last, made in snapshots
             ]
@@ -176,7 +176,7 @@ def optimize_members(
     return record(snapshots, end, list(edited)), losses
 
 
-def no_worse(
+def is_no_worse(
     unseen_members: UnseenMembers,
     end: Tensor,
     original: Tensor,

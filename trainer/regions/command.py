@@ -96,7 +96,7 @@ def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[i
     if options.camera is not None:
         return [replace(read_camera(options.camera), lens=None)]
     if options.orbit is None:
-        return [_fitted(scene, up, azimuth, elevation, None, size) for azimuth, elevation in _SIDES]
+        return [_fit_camera(scene, up, azimuth, elevation, None, size) for azimuth, elevation in _SIDES]
     words = options.orbit.split(",")
     try:
         numbers = [float(word) for word in words]
@@ -110,10 +110,10 @@ def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[i
     away = numbers[2] if len(numbers) == 3 else None
     if away is not None and not 0 < away <= 1e9:
         raise ProgdfError(f"--orbit {options.orbit}: the distance must be above 0 and up to 1e9")
-    return [_fitted(scene, up, numbers[0], numbers[1], away, size)]
+    return [_fit_camera(scene, up, numbers[0], numbers[1], away, size)]
 
 
-def _fitted(
+def _fit_camera(
     scene: Gaussians, up: Tensor, azimuth: float, elevation: float, away: float | None, size: tuple[int, int]
 ) -> Camera:
     """A camera that what the scene is about fills, from this direction; as `progdf render --orbit`."""

@@ -31,7 +31,7 @@ _AROUND, _FILLED, _ROUNDS = 12, 0.75, 3
 """A hole is what has three quarters members among its 12 nearest, in up to three rounds."""
 
 
-def without_strays(
+def drop_strays(
     scene: Gaussians,
     member: Tensor,
     views: Tensor,
@@ -51,7 +51,7 @@ def without_strays(
         [N] bool
     """
     twice = member & ((views < 2) | (views_inside >= 2))
-    _tell(
+    _report(
         say,
         int(member.sum()) - int(twice.sum()),
         "inside one mask only, where two views see it, left to what surrounds them",
@@ -69,11 +69,11 @@ def without_strays(
     result[rows[kept]] = True
     dropped = int((~kept).sum())
     pieces = int((weight >= _PIECE * weight.max()).sum())
-    _tell(say, dropped, f"apart from the {format_count(pieces, 'largest connected surface')}, left out")
+    _report(say, dropped, f"apart from the {format_count(pieces, 'largest connected surface')}, left out")
     return result
 
 
-def holes_of(
+def find_holes(
     scene: Gaussians, member: Tensor, views_outside: Tensor, say: Callable[[str], None] | None = None
 ) -> Tensor:
     """The Gaussians to add, as members surround them and no two views see them outside the masks.
@@ -101,7 +101,7 @@ def holes_of(
     for _ in range(_ROUNDS):
         filled[rows[filled[near].double().mean(dim=1) >= _FILLED]] = True
     holes = (filled & ~member).nonzero()[:, 0]
-    _tell(say, len(holes), "in holes of it, added")
+    _report(say, len(holes), "in holes of it, added")
     return holes
 
 
@@ -118,6 +118,6 @@ def _pieces(points: Tensor) -> np.ndarray:
     return pieces
 
 
-def _tell(say: Callable[[str], None] | None, count: int, what: str) -> None:
+def _report(say: Callable[[str], None] | None, count: int, what: str) -> None:
     if say is not None and count:
         say(f"the masks: {format_count(count)} {what}")

@@ -120,24 +120,24 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         count = sum(mask is not None for mask in masks)
         if settings.say is not None and count < len(masks):
             settings.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
-        return _lifted(scene, cameras, masks, f"{kind}:{rest}", settings)
+        return _lift(scene, cameras, masks, f"{kind}:{rest}", settings)
 
     def from_text(rest: str, scene: Gaussians) -> Region:
         prompt = _prompt(rest)
         folder = settings.kept() / _slug(prompt)
         cameras = _segmented_cameras(scene, settings)
-        masks = _segmented(scene, cameras, prompt, folder, settings)
-        found = _found_masks(masks, prompt, settings)
+        masks = _segment(scene, cameras, prompt, folder, settings)
+        found = _masks_with_pixels(masks, prompt, settings)
         if settings.cameras is None:
             # Around the scene a thing may be a few pixels wide: look again from where it fills the picture;
             # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
-            nearer = _near_cameras(scene, _lifted(scene, cameras, found, prompt, settings), settings)
-            masks = [*masks, *_segmented(scene, nearer, prompt, folder, settings)]
-            cameras, found = [*cameras, *nearer], _found_masks(masks, prompt, settings)
+            nearer = _near_cameras(scene, _lift(scene, cameras, found, prompt, settings), settings)
+            masks = [*masks, *_segment(scene, nearer, prompt, folder, settings)]
+            cameras, found = [*cameras, *nearer], _masks_with_pixels(masks, prompt, settings)
         # with these the folder is one for masks:DIR, of the same region
         telling = [camera for camera, mask in zip(cameras, found, strict=True) if mask is not None]
         save_cameras(folder / "cameras.json", telling)
-        return _lifted(scene, cameras, found, f"text:{prompt}", settings)
+        return _lift(scene, cameras, found, f"text:{prompt}", settings)
 
     return {
         "masks": lambda rest, scene: from_folder(rest, scene, bent=False),
@@ -184,7 +184,7 @@ def _prompt(rest: str) -> str:
     return prompt
 
 
-def _lifted(
+def _lift(
     scene: Gaussians,
     cameras: Sequence[Camera],
     masks: Sequence[Tensor | None],
@@ -196,7 +196,7 @@ def _lifted(
         (fit_size(c, LIFTED_AT), mask) for c, mask in zip(cameras, masks, strict=True) if mask is not None
     ]
     small = with_near_plane([camera for camera, _ in given], scene)
-    scaled = [_scaled(mask, camera) for camera, mask in given]
+    scaled = [_scale_mask(mask, camera) for camera, mask in given]
     region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold, settings.say)
     if not len(region):
         raise ProgdfError(
@@ -206,7 +206,7 @@ def _lifted(
     return region
 
 
-def _scaled(mask: Tensor, camera: Camera) -> Tensor:
+def _scale_mask(mask: Tensor, camera: Camera) -> Tensor:
     """The mask in the camera's size, averaged. [H,W] -> [h,w]"""
     size = (camera.height, camera.width)
     if tuple(mask.shape) == size:
@@ -214,7 +214,7 @@ def _scaled(mask: Tensor, camera: Camera) -> Tensor:
     return torch.nn.functional.interpolate(mask.float()[None, None], size=size, mode="area")[0, 0]
 
 
-def _found_masks(masks: Sequence[Tensor], prompt: str, settings: RegionSettings) -> list[Tensor | None]:
+def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, settings: RegionSettings) -> list[Tensor | None]:
     """The masks in which the prompt was found: where it was not, it may still be."""
     found = [mask if bool(mask.any()) else None for mask in masks]
     if all(mask is None for mask in found):
@@ -225,7 +225,7 @@ def _found_masks(masks: Sequence[Tensor], prompt: str, settings: RegionSettings)
     return found
 
 
-def _segmented(
+def _segment(
     scene: Gaussians, cameras: Sequence[Camera], prompt: str, folder: Path, settings: RegionSettings
 ) -> list[Tensor]:
     """The prompt's mask in every view; read where it is kept, of the same picture by the same networks."""

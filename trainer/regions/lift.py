@@ -15,7 +15,7 @@ from progdf.rasterize import alpha_weights
 from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.region import Region
 
-from .few_masks import FEW, holes_of, without_strays
+from .few_masks import FEW, drop_strays, find_holes
 from .surface import surface_vote
 
 Rule = Literal["share", "count", "paper"]
@@ -123,14 +123,14 @@ def lift_masks(
     least = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)
     scores = score(evidence, rule)
-    rows = undecided(evidence, least).nonzero()[:, 0]
+    rows = undecided_rows(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
     few = 2 <= len(masks) <= FEW
     if few:
         # what rough borders cut through, and what one of two masks holds, is as its surroundings are
         mixed = (scores > min(_DOUBTFUL[0], least)) & (scores < least)
         single = member & (evidence.views >= 2) & (evidence.views_inside < 2)
-        member = without_strays(scene, member, evidence.views, evidence.views_inside, say)
+        member = drop_strays(scene, member, evidence.views, evidence.views_inside, say)
         scores = torch.where(member, scores, scores.clamp_max(_below(least)))
         open_ = (mixed | single).index_fill(0, rows, True)
         rows = open_.nonzero()[:, 0]
@@ -141,7 +141,7 @@ def lift_masks(
         scores[rows] = torch.where(vote > 0, least + (1 - least) * vote, below)
         member[rows] = vote > 0
     if few:
-        holes = holes_of(scene, member, evidence.views - evidence.views_inside, say)
+        holes = find_holes(scene, member, evidence.views - evidence.views_inside, say)
         member[holes] = True
         scores[holes] = scores[holes].clamp_min(least)
     return Region(name, member.nonzero()[:, 0], scores.clamp(0.0, 1.0))
@@ -152,7 +152,7 @@ def _below(least: float) -> float:
     return float(torch.nextafter(torch.tensor(least), torch.tensor(0.0)))
 
 
-def undecided(evidence: Evidence, least: float) -> Tensor:
+def undecided_rows(evidence: Evidence, least: float) -> Tensor:
     """Which Gaussians the views tell nothing sure of: hidden, or half hidden and of mixed share. [N] bool"""
     share = score(evidence, "share")
     mixed = (share > min(_DOUBTFUL[0], 1 - least)) & (share < max(_DOUBTFUL[1], least))

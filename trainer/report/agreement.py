@@ -80,7 +80,7 @@ class ViewChange:
     change: Tensor
     counts: Tensor
 
-    def shown(self, colors: Tensor) -> Tensor:
+    def render(self, colors: Tensor) -> Tensor:
         """The picture that changes of the members' colours make, where it counts. [M,3] -> [h,w,3]"""
         scene, camera = self.scene, self.scene.camera
         image: Tensor = rasterize(
@@ -101,10 +101,10 @@ class ViewChange:
         )[0]
         return image * self.counts
 
-    def gathered(self, picture: Tensor, members: int) -> Tensor:
-        """The transpose of `shown`: what each member gets of a picture. [h,w,3] -> [M,3]"""
+    def gather(self, picture: Tensor, members: int) -> Tensor:
+        """The transpose of `render`: what each member gets of a picture. [h,w,3] -> [M,3]"""
         colors = torch.zeros(members, 3, requires_grad=True)
-        (gradient,) = torch.autograd.grad(self.shown(colors), colors, picture)
+        (gradient,) = torch.autograd.grad(self.render(colors), colors, picture)
         return gradient
 
 
@@ -122,7 +122,7 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
     with torch.no_grad():
         for view, edited in zip(setup.held_out, held_out, strict=True):
             one = view_change(setup, view, edited)
-            lost += float((one.change - one.shown(colors)).square().sum())
+            lost += float((one.change - one.render(colors)).square().sum())
             change += float(one.change.square().sum())
             count += 3 * float(one.counts.sum())
     if lost <= 0 or count == 0:
@@ -133,17 +133,17 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
 def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     """Least squares by conjugate gradients on the normal equations (CGLS, Björck 1996). -> [M,3]"""
 
-    def gathered(pictures: Sequence[Tensor]) -> Tensor:
-        parts = [one.gathered(p, members) for one, p in zip(seen, pictures, strict=True)]
+    def gather(pictures: Sequence[Tensor]) -> Tensor:
+        parts = [one.gather(p, members) for one, p in zip(seen, pictures, strict=True)]
         return torch.stack(parts).sum(dim=0)
 
     colors = torch.zeros(members, 3)
     left = [one.change for one in seen]
-    direction = slope = gathered(left)
+    direction = slope = gather(left)
     damping = None
     for _ in range(_ROUNDS):
         with torch.no_grad():
-            shown = [one.shown(direction) for one in seen]
+            shown = [one.render(direction) for one in seen]
         length, curve = float(direction.square().sum()), sum(float(p.square().sum()) for p in shown)
         if curve <= 0:
             break
@@ -151,7 +151,7 @@ def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
         step = float(slope.square().sum()) / (curve + damping * length)
         colors = colors + step * direction
         left = [picture - step * p for picture, p in zip(left, shown, strict=True)]
-        before, slope = float(slope.square().sum()), gathered(left) - damping * colors
+        before, slope = float(slope.square().sum()), gather(left) - damping * colors
         direction = slope + float(slope.square().sum()) / before * direction
     return colors
 

@@ -29,7 +29,7 @@ class ErrorCurve:
     lpips: tuple[float, ...]
 
 
-def courses(
+def error_curves(
     evaluator: Evaluator,
     fields: Mapping[str, BakedField],
     strengths: Sequence[float],
@@ -79,4 +79,6 @@ def against_editor(
         perceptual: LPIPS, or its stand-in
     """
     strength = dict(asked)
-    return courses(evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual)
+    return error_curves(
+        evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
+    )

@@ -19,7 +19,7 @@ from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
 from trainer.plan import Texts
-from trainer.report.curves import ErrorCurve, against_editor, courses
+from trainer.report.curves import ErrorCurve, against_editor, error_curves
 from trainer.views.view import View
 
 from .clip import Clip, direction, load_clip
@@ -102,7 +102,9 @@ def measure(
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
     slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
-    recorded = courses(evaluator, fields, samples, lambda s: evaluator.pictures(trajectory.at(s)), perceptual)
+    recorded = error_curves(
+        evaluator, fields, samples, lambda s: evaluator.pictures(trajectory.at(s)), perceptual
+    )
     recorded = {n: replace(c, s=tuple(remap.at(s) for s in c.s)) for n, c in recorded.items()}
     asked = tuple((remap.at(s), strength) for s, strength in trajectory.asked)
     drawn = against_editor(evaluator, {**fields, "slider": shown}, asked, perceptual)
@@ -122,7 +124,7 @@ def expected_measures(trajectory: Trajectory) -> int:
     return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
 
 
-def clip_course(evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
+def clip_curve(evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
     """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
 
     Args:
@@ -143,7 +145,7 @@ def clip_course(evaluator: Evaluator, views: Sequence[View], field: BakedField, 
         return Direction(reason="--text-before and --text-after say the same to CLIP")
     original = clip.pictures([view.image for view in views])
     course = [
-        _mean(direction(original, _seen(clip, evaluator, views, field.offsets(s)), before, after))
+        _mean(direction(original, _clip_features(clip, evaluator, views, field.offsets(s)), before, after))
         if s
         else None
         for s in CLIP_STRENGTHS
@@ -196,8 +198,8 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             **({"clip_model": measured.clip.model} if similarity else {"clip_reason": measured.clip.reason}),
         },
         "curves": {
-            "against_trajectory": {name: _listed(found) for name, found in measured.trajectory.items()},
-            "against_editor": {name: _listed(found) for name, found in measured.editor.items()},
+            "against_trajectory": {name: _to_lists(found) for name, found in measured.trajectory.items()},
+            "against_editor": {name: _to_lists(found) for name, found in measured.editor.items()},
             "change": {
                 "from_original": [_four(distance) for distance in slider.distances],
                 "per_step": [_four(step) for step in slider.steps],
@@ -207,7 +209,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
     }
 
 
-def _seen(clip: Clip, evaluator: Evaluator, views: Sequence[View], offsets: Tensor) -> Tensor:
+def _clip_features(clip: Clip, evaluator: Evaluator, views: Sequence[View], offsets: Tensor) -> Tensor:
     """CLIP's features of the whole views with these offsets. [n,D]"""
     whole = []
     for view, scene, picture in zip(views, evaluator.crops, evaluator.pictures(offsets), strict=True):
@@ -223,7 +225,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return _four(sum(known) / len(known)) if known else None
 
 
-def _listed(course: ErrorCurve) -> dict[str, list[float]]:
+def _to_lists(course: ErrorCurve) -> dict[str, list[float]]:
     return {
         "s": [_four(s) for s in course.s],
         "psnr": [round(value, 2) for value in course.psnr],

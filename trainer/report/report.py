@@ -58,8 +58,8 @@ def report_picture(evaluator: Evaluator, measured: Measured, losses: Losses, tit
     rows = [_against_trajectory(measured)]
     if len(evaluator.edited) > 1:
         rows.append(_against_editor(measured))
-    rows.append(_feel(measured, losses))
-    return _stacked(sheet, rows)
+    rows.append(_uniformity_plots(measured, losses))
+    return _stack_plots(sheet, rows)
 
 
 def best_view(evaluator: Evaluator) -> int:
@@ -110,7 +110,7 @@ def _against_trajectory(measured: Measured) -> list[Plot]:
     s = [measured.remap.at(s) for s in sample_strengths()]
     fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
     curves: dict[str, Points] = {
-        f"{_words(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
+        f"{_label(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
         for name, found in fields.items()
     }
     return [
@@ -151,7 +151,7 @@ def _against_editor(measured: Measured) -> list[Plot]:
     ]
 
 
-def _feel(measured: Measured, losses: Losses) -> list[Plot]:
+def _uniformity_plots(measured: Measured, losses: Losses) -> list[Plot]:
     slider = measured.slider
     plots = [
         Plot(
@@ -192,7 +192,7 @@ def _clip(found: Direction) -> Plot:
 def _lines(
     courses: Mapping[str, ErrorCurve], value: Callable[[ErrorCurve], Sequence[float]]
 ) -> dict[str, Points]:
-    return {_words(name): (course.s, value(course)) for name, course in courses.items()}
+    return {_label(name): (course.s, value(course)) for name, course in courses.items()}
 
 
 def _distance(measured: Measured) -> str:
@@ -205,7 +205,7 @@ def column_heading(s: float, asked: float | None) -> str:
     return f"s = {round(s, 2):g}{own}"
 
 
-def _words(name: str) -> str:
+def _label(name: str) -> str:
     return name.replace("keyframes", "") + " keyframes" if name.startswith("keyframes") else name
 
 
@@ -213,7 +213,7 @@ def _even(count: int) -> list[float]:
     return [i / max(1, count - 1) for i in range(count)]
 
 
-def _stacked(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:
+def _stack_plots(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:
     """The sheet with rows of plots below it."""
     page = Image.new("RGB", (sheet.width, sheet.height + len(rows) * _PLOT_HEIGHT), PAPER)
     page.paste(sheet, (0, 0))

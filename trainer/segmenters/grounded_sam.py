@@ -55,7 +55,7 @@ class GroundedSam:
 
     def boxes(self, picture: Any, prompt: str) -> Tensor:
         """x0, y0, x1, y1 in pixels of all that is found in a PIL image. [B,4]"""
-        inputs = self.detector_processor(images=picture, text=as_asked(prompt), return_tensors="pt")
+        inputs = self.detector_processor(images=picture, text=normalize_prompt(prompt), return_tensors="pt")
         with torch.no_grad():
             answer = self.detector(**inputs)
         found = self.detector_processor.post_process_grounded_object_detection(
@@ -69,7 +69,7 @@ class GroundedSam:
         return boxes
 
 
-def as_asked(prompt: str) -> str:
+def normalize_prompt(prompt: str) -> str:
     """A prompt as GroundingDINO was trained on: lower case, ending in a full stop."""
     words = " ".join(prompt.lower().split()).rstrip(". ")
     return f"{words}."
@@ -91,14 +91,12 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
         )
         from transformers.utils import logging as speaks
     except ImportError as error:
-        raise _without_transformers(error) from error
+        raise _import_failure(error) from error
     # it warns on stderr of every optional package that it can do without
     speaks.set_verbosity(logging.ERROR)
     speaks.disable_progress_bar()
 
-    def loaded(
-        model: str, kind: str, option: str, usual: str, network: Any, processor: Any
-    ) -> tuple[Any, Any]:
+    def load(model: str, kind: str, option: str, usual: str, network: Any, processor: Any) -> tuple[Any, Any]:
         try:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
             return (
@@ -110,7 +108,7 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
         except BROKEN as error:
             raise ProgdfError(_missing(model, option)) from error
 
-    finder = loaded(
+    finder = load(
         settings.detector,
         "grounding-dino",
         "--detector",
@@ -118,7 +116,7 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
         GroundingDinoForObjectDetection,
         GroundingDinoProcessor,
     )
-    sam_model = loaded(settings.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
+    sam_model = load(settings.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
     return GroundedSam(*finder, *sam_model, settings.box_threshold)
 
 
@@ -131,7 +129,7 @@ def check_grounded_sam(settings: SegmenterSettings) -> None:
     try:
         from transformers import AutoConfig
     except ImportError as error:
-        raise _without_transformers(error) from error
+        raise _import_failure(error) from error
     for model, kind, option, usual in (
         (settings.detector, "grounding-dino", "--detector", DETECTOR),
         (settings.sam_model, "sam", "--sam-model", SAM_MODEL),
@@ -148,7 +146,7 @@ def _check_kind(config: Any, model: str, kind: str, option: str, usual: str) -> 
         raise ProgdfError(f"{model} is a {config.model_type} model, no {kind}; give {option} {usual}")
 
 
-def _without_transformers(error: ImportError) -> ProgdfError:
+def _import_failure(error: ImportError) -> ProgdfError:
     return ProgdfError(f"text: needs the package transformers ({error}); pip install progdf-studio[segment]")
 
 

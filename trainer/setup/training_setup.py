@@ -134,7 +134,7 @@ def edit_views(
     def edit(asked: tuple[float, int]) -> Tensor:
         strength, i = asked
         made = editor.edit(views[i], strength)
-        picture = quantize_image(views[i].confined(made) if confined else made)
+        picture = quantize_image(views[i].confine(made) if confined else made)
         write_image(paths[strength][i], picture)
         return picture
 

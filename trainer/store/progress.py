@@ -81,9 +81,9 @@ class RunLog:
         """One line."""
         self.note(text)
         if self._bar:
-            self._console.print(f"[dim]{time.perf_counter() - self._start:6.1f} s[/dim]  {_escaped(text)}")
+            self._console.print(f"[dim]{time.perf_counter() - self._start:6.1f} s[/dim]  {_escape(text)}")
         else:
-            self._console.print(_escaped(text), soft_wrap=True)
+            self._console.print(_escape(text), soft_wrap=True)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -146,5 +146,5 @@ class RunLog:
         return self._earlier + time.perf_counter() - self._start
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return escape_text(text).replace("[", "\\[")

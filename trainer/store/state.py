@@ -87,7 +87,7 @@ class StateFolder:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:
-            raise self.damaged(self._run, error) from error
+            raise self.damage_error(self._run, error) from error
 
     def begin(self, identity: Mapping[str, Any]) -> None:
         """Drop what is saved and start anew as the run that `identity`, JSON values, describes.
@@ -134,15 +134,15 @@ class StateFolder:
             tensors, metadata = read_tensors(path)
             return Saved(tensors, convert_json(decode_json(metadata["values"]), dict[str, Any]))
         except (OSError, KeyError, ValueError) as error:
-            raise self.damaged(path, error) from error
+            raise self.damage_error(path, error) from error
 
     @contextmanager
-    def restoring(self, part: str) -> Iterator[None]:
+    def restore_part(self, part: str) -> Iterator[None]:
         """Take over what was saved of a part; values that do not fit make one line, see `load`."""
         try:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
-            raise self.damaged(self._file(part, None), type(error).__name__) from error
+            raise self.damage_error(self._file(part, None), type(error).__name__) from error
 
     def clear(self) -> None:
         """Remove everything, run.json first: a rest of it is no run. Nothing behind a link is touched."""
@@ -160,7 +160,7 @@ class StateFolder:
         self.clear()
         shutil.rmtree(self.path, ignore_errors=True)  # not if it is a link
 
-    def damaged(self, path: Path, reason: object) -> ProgdfError:
+    def damage_error(self, path: Path, reason: object) -> ProgdfError:
         """The line for a file of the state that is not what was saved."""
         return ProgdfError(f"{path} is damaged ({reason}); delete {self.path} and train again")
 
@@ -192,7 +192,7 @@ class PeriodicSave:
         saved = self._folder.load(self._part)
         if saved is None:
             return False
-        with self._folder.restoring(self._part):
+        with self._folder.restore_part(self._part):
             for name, member in self._members.items():
                 tensors = {
                     key.removeprefix(f"{name}/"): tensor

@@ -38,7 +38,7 @@ _LEAST_COVER = 0.25
 
 
 @dataclass(frozen=True)
-class Choice:
+class ViewChoice:
     """The views an edit works on.
 
     Args:
@@ -70,7 +70,7 @@ class Choice:
 
 def choose_views(
     scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int, background: Tensor
-) -> Choice:
+) -> ViewChoice:
     """Up to `count` views that show all of the region from as many sides as the cameras do.
 
     Args:
@@ -91,7 +91,7 @@ def choose_views(
     if len(looked) > most:
         toward = _toward(places, [cameras[i] for i in looked])
         looked = [looked[k] for k in _greedy(_Shown(framed[looked].float(), toward, _reach(most)), most)]
-    cover, weights = _looked_through(scene, region, rows, [cameras[i] for i in looked])
+    cover, weights = _measure_visibility(scene, region, rows, [cameras[i] for i in looked])
     seeing = cover > 0
     if not bool(seeing.any()):
         raise ProgdfError(
@@ -101,9 +101,9 @@ def choose_views(
     enough = cover >= _LEAST_COVER * cover[seeing].median()
     good = enough.nonzero()[:, 0].tolist()
     toward = _toward(places, [cameras[looked[k]] for k in good])
-    shown = _Shown(_visible(weights[good]), toward, _reach(count))
+    shown = _Shown(_relative_visibility(weights[good]), toward, _reach(count))
     taken = _greedy(shown, count) if len(good) > count else list(range(len(good)))
-    return Choice(
+    return ViewChoice(
         tuple(make_view(scene, region, cameras[looked[good[k]]], background) for k in taken),
         _likeness(shown, taken),
         len(cameras),
@@ -112,7 +112,7 @@ def choose_views(
     )
 
 
-def split_views(choice: Choice, held_out: int) -> tuple[list[View], list[View]]:
+def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[View]]:
     """Views to train with, and up to `held_out` that the others resemble most, spread over all sides.
 
     At most a third is held out; where that is none, the same views serve for both.
@@ -141,7 +141,7 @@ class _Shown:
     toward: Tensor
     reach: float
 
-    def served_by(self, camera: int) -> Tensor:
+    def coverage_by(self, camera: int) -> Tensor:
         """How far one camera serves what each shows of each member. [V,S] 0..1"""
         cosine = (self.toward * self.toward[camera]).sum(dim=2)
         near = torch.exp(-(1 - cosine) / (1 - math.cos(self.reach)))
@@ -156,14 +156,14 @@ def _greedy(shown: _Shown, count: int) -> list[int]:
         gain = (shown.visible * (1 - served)).sum(dim=1)
         best = int(torch.where(left, gain, -1.0).argmax())
         left[best] = False
-        served = torch.maximum(served, shown.served_by(best))
+        served = torch.maximum(served, shown.coverage_by(best))
     return (~left).nonzero()[:, 0].tolist()
 
 
 def _likeness(shown: _Shown, taken: Sequence[int]) -> Tensor:
     some = _Shown(shown.visible[taken], shown.toward[taken], shown.reach)
     columns = [
-        (some.visible * some.served_by(k)).sum(dim=1) / some.visible.sum(dim=1).clamp_min(1e-12)
+        (some.visible * some.coverage_by(k)).sum(dim=1) / some.visible.sum(dim=1).clamp_min(1e-12)
         for k in range(len(taken))
     ]
     return torch.stack(columns, dim=1)
@@ -199,7 +199,7 @@ def _toward(places: Tensor, cameras: Sequence[Camera]) -> Tensor:
     return torch.nn.functional.normalize(eyes[:, None] - places, dim=2)
 
 
-def _looked_through(
+def _measure_visibility(
     scene: Gaussians, region: Region, rows: Tensor, cameras: Sequence[Camera]
 ) -> tuple[Tensor, Tensor]:
     """The region's share of each picture [V], and each sample's blended weight in it [V,S]."""
@@ -213,7 +213,7 @@ def _looked_through(
     return cover, weights
 
 
-def _visible(weights: Tensor) -> Tensor:
+def _relative_visibility(weights: Tensor) -> Tensor:
     """How well each sample shows, 1 where it shows as in the median view that shows it. [V,S] -> 0..1"""
     typical = torch.where(weights > 0, weights, torch.nan).nanmedian(dim=0).values.nan_to_num(1.0)
     return (weights / typical.clamp_min(1e-9)).clamp_max(1.0)

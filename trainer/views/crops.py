@@ -217,10 +217,10 @@ def crop_scene(
         background,
         scene.antialiased,
     )
-    return _live(replace(whole, still=True)) if still else whole
+    return _keep_live_tiles(replace(whole, still=True)) if still else whole
 
 
-def _live(view: CropScene) -> CropScene:
+def _keep_live_tiles(view: CropScene) -> CropScene:
     """The view with all that no member contributes to taken from the original picture."""
     member = torch.zeros_like(view.opacities)
     member[view.rows] = 1.0

@@ -53,7 +53,7 @@ class View:
     inside: Tensor
     box: Crop
 
-    def blended(self, edited_inside: Tensor) -> Tensor:
+    def blend(self, edited_inside: Tensor) -> Tensor:
         """The view with another colour in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]
 
         Exact at soft edges: what shines through from behind or past the region stays what it was, so a border
@@ -62,7 +62,7 @@ class View:
         change = torch.where(self.mask[..., None] > 1e-4, edited_inside - self.inside, 0.0)
         return (self.image + self.mask[..., None] * change).clamp(0.0, 1.0)
 
-    def confined(self, edited: Tensor) -> Tensor:
+    def confine(self, edited: Tensor) -> Tensor:
         """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]
 
         A pixel that shows the region to a fifth is taken as its editor left it: it is mixed already.

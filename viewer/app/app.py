@@ -9,7 +9,7 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from viewer.files.document import Document
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
@@ -40,7 +40,7 @@ def run(
         size: of the window, at 1×
         session: the file it was opened from and is saved to
         snapshots: kept states
-        draw, edit_pass: what draws and what edits, see `Engine`
+        draw, edit_pass: what draws and what edits, see `ViewEngine`
 
     Returns:
         The exit status, 0.
@@ -105,7 +105,7 @@ class App:
         self.main_view.draw_splash(self.context.screen)
         self.window.present()
         while not self.is_closed:
-            waits = [wait for wait in self._waits() if wait is not None]
+            waits = [wait for wait in self._wait_times() if wait is not None]
             if not self.main_view.opening:  # else events wait in the window system, so that no letter is lost
                 self.window.wait(min(waits, default=None))
             if self.failure is not None:
@@ -138,7 +138,7 @@ class App:
             else:
                 self.file_actions.handle(request)
 
-    def _waits(self) -> tuple[float | None, ...]:
+    def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
         choosing = self.file_actions.poll_dialog()  # first: what was chosen wakes the main view
         return choosing, self.main_view.next_frame_delay(), self.file_actions.autosave(time.perf_counter())
@@ -175,8 +175,8 @@ class App:
             self.window.rename(title)
             self._title = title
 
-    def _engine(self, document: Document) -> Engine:
-        return Engine(self.context, document.scene, document.gdfs, self._draw, self._edit_pass)
+    def _engine(self, document: Document) -> ViewEngine:
+        return ViewEngine(self.context, document.scene, document.gdfs, self._draw, self._edit_pass)
 
     def leave(self) -> None:
         """Close the window, without a question."""

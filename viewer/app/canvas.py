@@ -10,7 +10,7 @@ from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_view import Comparer
 from viewer.pictures.thumbnails import Thumbnails
 from viewer.render import dynamic_resolution, highlight
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.renderers import Image
 from viewer.render.timings import FrameTimings
 from viewer.state.recordings import RecordingFile
@@ -29,7 +29,7 @@ class Canvas:
     """
 
     def __init__(
-        self, context: moderngl.Context, engine: Engine, found: Sequence[RecordingFile] = ()
+        self, context: moderngl.Context, engine: ViewEngine, found: Sequence[RecordingFile] = ()
     ) -> None:
         self.comparer = Comparer(engine, context, found)
         self._thumbnails = Thumbnails(context, engine)

@@ -136,7 +136,7 @@ class FileActions:
             return None
         kept, before = workspace.worth_saving(self._app.main_view.work), self._autosave.path
         try:
-            wait = self._autosave.wait(now, kept, self._beside, self._write)
+            wait = self._autosave.wait(now, kept, self._autosave_base, self._write)
         except (ProgdfError, OSError) as error:
             self._app.main_view.show_message(f"Autosave failed: {error}", error=True)
             return None
@@ -162,7 +162,7 @@ class FileActions:
         if kind == "gdf":
             self._edits.add(path)
         elif self.has_unsaved:
-            self._app.main_view.ask(self._leaving(f"open_file:{path}"))
+            self._app.main_view.ask(self._closing_question(f"open_file:{path}"))
             return
         elif kind == "session":
             self._open_session(path)
@@ -186,7 +186,7 @@ class FileActions:
         # what was never saved, or was discarded, never takes the place of a session unasked
         self.path = beside if beside.is_file() and not discarded else None
         if not discarded:
-            self._autosave.goes_on(path)
+            self._autosave.continue_from(path)
             main_view.show_message(f"Restored the unsaved work of {beside.name}")
 
     def offer_autosave(self) -> None:
@@ -236,7 +236,7 @@ class FileActions:
 
     def _save_where(self, then: str, ask: bool) -> None:
         if self.path is None or ask:
-            self._app.main_view.ask(Dialog("save", str(self._beside()), then))
+            self._app.main_view.ask(Dialog("save", str(self._autosave_base()), then))
             return
         self._save_to(str(self.path), then)
 
@@ -269,12 +269,12 @@ class FileActions:
 
     def _leave(self) -> None:
         if self.has_unsaved:
-            self._app.main_view.ask(self._leaving("quit"))
+            self._app.main_view.ask(self._closing_question("quit"))
         else:
             self._app.leave()
 
-    def _leaving(self, then: str) -> Dialog:
-        return Dialog("leave", str(self._beside()), then)
+    def _closing_question(self, then: str) -> Dialog:
+        return Dialog("leave", str(self._autosave_base()), then)
 
     def _report_errors(self, act: Callable[[], None]) -> None:
         """Do it; what goes wrong is a line in the window."""
@@ -285,7 +285,7 @@ class FileActions:
         """The session's file, or what it is called where it never had one."""
         return self.path or session.default_path(self._app.document)
 
-    def _beside(self) -> Path:
+    def _autosave_base(self) -> Path:
         """The session's file; where it never had one, a name that nothing has."""
         return self.path or autosaves.free_session(self._session_name(), self._autosave.path)
 

@@ -20,7 +20,7 @@ from viewer.files import exports as saved_files
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
-from viewer.render.engine import Engine, drawn_size
+from viewer.render.engine import ViewEngine, drawn_size
 from viewer.state import playback, workspace
 from viewer.state.actions import perform
 from viewer.state.snapshots import SliderSnapshot
@@ -53,7 +53,7 @@ class MainView:
     def __init__(
         self,
         context: moderngl.Context,
-        engine: Engine,
+        engine: ViewEngine,
         facts: SceneFacts,
         view: ViewState,
         scale: float = 1.0,
@@ -88,7 +88,7 @@ class MainView:
         self.ui.close()
         self.canvas.release()
 
-    def set_engine(self, engine: Engine, facts: SceneFacts) -> None:
+    def set_engine(self, engine: ViewEngine, facts: SceneFacts) -> None:
         """Draw with another engine from now on (the scene or its edits have changed)."""
         self.canvas.release()
         self.engine, self.facts = engine, facts
@@ -110,7 +110,7 @@ class MainView:
         self.ui.make_current()
         if not self._resting and (inputs.has_pending_input() or self.opening):
             return 0.0
-        waits = [FLIGHT_S] if inputs.flying(self._keys) else []
+        waits = [FLIGHT_S] if inputs.is_flying(self._keys) else []
         if imgui.get_io().want_text_input:
             waits.append(BLINK_S)
         if self.work.message is not None:
@@ -165,7 +165,7 @@ class MainView:
         imgui.new_frame()
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
-        if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.repeating(keys):
+        if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.is_repeating(keys):
             self.work = workspace.record_undo(self.work)
         if self.work != before:
             self.wake()
@@ -201,7 +201,7 @@ class MainView:
         for action in inputs.requested_actions(self._keys):
             if not asks or action in ("picture", "window_picture"):
                 self._perform(action)
-        if inputs.flying(self._keys):
+        if inputs.is_flying(self._keys):
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
@@ -235,7 +235,7 @@ class MainView:
         """Whether a hand is on something that moves the picture, or a film plays."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
-        return inputs.flying(self._keys) or inputs.repeating(self._keys) or self.work.player.playing
+        return inputs.is_flying(self._keys) or inputs.is_repeating(self._keys) or self.work.player.playing
 
     def _draw_overlays(self) -> None:
         """What stands over the picture; where some of it goes away, another frame follows."""

@@ -10,7 +10,7 @@ from progdf.camera import Camera
 from viewer.camera import controls, inputs
 from viewer.camera.view_camera import ViewCamera, to_camera
 from viewer.panel import brush
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.picking import layer_at, seen_at, surface_point
 from viewer.state import layers as stack
 from viewer.state import paint, workspace
@@ -53,7 +53,7 @@ class PointerContext:
         now: seconds on the main view's clock
     """
 
-    engine: Engine
+    engine: ViewEngine
     facts: SceneFacts
     shown: ViewState
     area: Area

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from .up_axis import Vec3
-from .view_camera import FARTHEST, ViewCamera, along, axes, eye, look_from, unit
+from .view_camera import FARTHEST, ViewCamera, add_scaled, axes, eye, look_from, unit
 
 DEGREES_PER_PIXEL = 0.3
 ZOOM_PER_STEP = 0.12  # of the distance, per wheel step
@@ -30,7 +30,9 @@ def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
     """Turn the head where the eye stands (fly mode): right looks right, down looks down."""
     turned = orbit(camera, dx, dy)
     position = eye(camera)
-    return _keep_finite(replace(turned, pivot=along(position, (-camera.distance, axes(turned).back))), camera)
+    return _keep_finite(
+        replace(turned, pivot=add_scaled(position, (-camera.distance, axes(turned).back))), camera
+    )
 
 
 def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
@@ -41,7 +43,7 @@ def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
     """
     per_pixel = 2.0 * camera.distance * math.tan(math.radians(camera.fov_y) / 2) / max(height, 1.0)
     picture = axes(camera)
-    pivot = along(camera.pivot, (-dx * per_pixel, picture.right), (dy * per_pixel, picture.up))
+    pivot = add_scaled(camera.pivot, (-dx * per_pixel, picture.right), (dy * per_pixel, picture.up))
     return _keep_finite(replace(camera, pivot=pivot), camera)
 
 
@@ -52,7 +54,7 @@ def zoom(camera: ViewCamera, steps: float, radius: float) -> ViewCamera:
         radius: of the scene, world units; bounds the distance
     """
     factor = math.exp(max(-50.0, min(50.0, -ZOOM_PER_STEP * steps))) if math.isfinite(steps) else 1.0
-    return _keep_finite(replace(camera, distance=_within(camera.distance * factor, radius)), camera)
+    return _keep_finite(replace(camera, distance=_clamp_distance(camera.distance * factor, radius)), camera)
 
 
 def dolly(camera: ViewCamera, dy: float, radius: float) -> ViewCamera:
@@ -99,13 +101,13 @@ def fly(
         (length * wish[1], unit(camera.up, (0.0, 1.0, 0.0))),
         (-length * wish[2], picture.back),
     )
-    return _keep_finite(replace(camera, pivot=along(camera.pivot, *steps)), camera)
+    return _keep_finite(replace(camera, pivot=add_scaled(camera.pivot, *steps)), camera)
 
 
 def pivot_on(camera: ViewCamera, point: Vec3, radius: float) -> ViewCamera:
     """Double click: the eye stays, the view turns to `point`, which becomes the pivot."""
     turned = look_from(camera, eye(camera), point)
-    return _keep_finite(replace(turned, distance=_within(turned.distance, radius)), camera)
+    return _keep_finite(replace(turned, distance=_clamp_distance(turned.distance, radius)), camera)
 
 
 def toggle_fly(camera: ViewCamera) -> ViewCamera:
@@ -113,7 +115,7 @@ def toggle_fly(camera: ViewCamera) -> ViewCamera:
     return replace(camera, mode="orbit" if camera.mode == "fly" else "fly")
 
 
-def _within(distance: float, radius: float) -> float:
+def _clamp_distance(distance: float, radius: float) -> float:
     return max(CLOSEST * radius, min(WIDEST * radius, distance))
 
 

@@ -84,7 +84,7 @@ def requested_actions(keys: Keys) -> list[str]:
     ]
 
 
-def repeating(keys: Keys) -> bool:
+def is_repeating(keys: Keys) -> bool:
     """Whether a key that repeats is held: what it does is not over yet."""
     return any(key.repeats and key.chord.rpartition("+")[2] in keys.held for key in controls.KEYS)
 
@@ -126,7 +126,7 @@ def cancels_drag(keys: Keys, drag: str | None) -> bool:
     return escape or bool(imgui.is_mouse_clicked(buttons.right.value))
 
 
-def flying(keys: Keys) -> bool:
+def is_flying(keys: Keys) -> bool:
     """Whether flight keys are held, and not as parts of a chord or of a text."""
     io = imgui.get_io()
     return bool(keys.fly) and not (io.want_text_input or io.key_ctrl or io.key_super)

@@ -31,7 +31,7 @@ def value(points: Sequence[Point], frame: float) -> float:
     Args:
         points: at least one, by rising frames
     """
-    i, share = _between([point[0] for point in points], frame)
+    i, share = _find_segment([point[0] for point in points], frame)
     _, easing, start = points[i]
     if share == 0.0 or easing == "hold":
         return start
@@ -55,7 +55,7 @@ def camera(keys: Sequence[tuple[int, str, ViewCamera]], frame: float) -> ViewCam
         keys: frame, easing, camera; at least one, by rising frames
     """
     frames = [key[0] for key in keys]
-    i, share = _between(frames, frame)
+    i, share = _find_segment(frames, frame)
     here = keys[i][2]
     if share == 0.0 or keys[i][1] == "hold":
         return here
@@ -96,7 +96,7 @@ def _slerp(placed: ViewCamera, here: ViewCamera, there: ViewCamera, share: float
     """`placed` with an orientation between two others; its up axis is what is up in the picture then."""
     between = quaternion.normalize(quaternion.slerp(_orientation(here), _orientation(there), share))
     _, up, back = matrix33.create_from_quaternion(between)
-    return turntable.facing(replace(placed, up=_vec3(up)), _vec3(back))
+    return turntable.look_along(replace(placed, up=_vec3(up)), _vec3(back))
 
 
 def _orientation(camera: ViewCamera) -> NDArray[np.float64]:
@@ -111,7 +111,7 @@ def _vec3(row: NDArray[np.float64]) -> Vec3:
     return float(row[0]), float(row[1]), float(row[2])
 
 
-def _between(frames: Sequence[int], frame: float) -> tuple[int, float]:
+def _find_segment(frames: Sequence[int], frame: float) -> tuple[int, float]:
     """Which point comes before a frame, and how much of the way to the next one lies behind, 0..1."""
     if frame <= frames[0]:
         return 0, 0.0

@@ -91,7 +91,7 @@ def cross(a: Vec3, b: Vec3) -> Vec3:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def along(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
+def add_scaled(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
     """origin + Σ length · direction"""
     x, y, z = origin
     for length, direction in steps:
@@ -117,7 +117,7 @@ def front(up: Vec3) -> Vec3:
     largest = max(range(3), key=lambda i: abs(up[i]))
     sign = math.copysign(1.0, up[largest])
     facing: Vec3 = ((0.0, 0.0, sign), (0.0, 0.0, sign), (0.0, -sign, 0.0))[largest]
-    return unit(along(facing, (-dot(facing, up), up)), (1.0, 0.0, 0.0))
+    return unit(add_scaled(facing, (-dot(facing, up), up)), (1.0, 0.0, 0.0))
 
 
 def axes(camera: ViewCamera) -> Axes:
@@ -132,18 +132,18 @@ def axes(camera: ViewCamera) -> Axes:
         math.cos(elevation),
         math.sin(elevation),
     )
-    level = along((0.0, 0.0, 0.0), (cos_a, ahead), (sin_a, side))
+    level = add_scaled((0.0, 0.0, 0.0), (cos_a, ahead), (sin_a, side))
     zero = (0.0, 0.0, 0.0)
     return Axes(
-        right=along(zero, (cos_a, side), (-sin_a, ahead)),
-        up=along(zero, (cos_e, up), (-sin_e, level)),
-        back=along(zero, (sin_e, up), (cos_e, level)),
+        right=add_scaled(zero, (cos_a, side), (-sin_a, ahead)),
+        up=add_scaled(zero, (cos_e, up), (-sin_e, level)),
+        back=add_scaled(zero, (sin_e, up), (cos_e, level)),
     )
 
 
 def eye(camera: ViewCamera) -> Vec3:
     """The eye's position in world units."""
-    return along(camera.pivot, (camera.distance, axes(camera).back))
+    return add_scaled(camera.pivot, (camera.distance, axes(camera).back))
 
 
 def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
@@ -163,13 +163,13 @@ def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
     )
 
 
-def facing(camera: ViewCamera, back: Vec3) -> ViewCamera:
+def look_along(camera: ViewCamera, back: Vec3) -> ViewCamera:
     """The same pivot and distance, seen along −`back` (any length): azimuth and elevation that give it."""
     up = unit(camera.up, (0.0, 1.0, 0.0))
     direction = unit(back, axes(camera).back)
     ahead = front(up)
     height = max(-1.0, min(1.0, dot(direction, up)))
-    level = along(direction, (-height, up))
+    level = add_scaled(direction, (-height, up))
     azimuth = camera.azimuth  # straight up or down: the azimuth is free, so it stays
     if dot(level, level) > 1e-18:
         azimuth = math.degrees(math.atan2(dot(level, cross(up, ahead)), dot(level, ahead)))
@@ -181,13 +181,13 @@ def facing(camera: ViewCamera, back: Vec3) -> ViewCamera:
 def with_up(camera: ViewCamera, up: Vec3) -> ViewCamera:
     """Another up axis, the eye and the pivot where they are (the picture only rolls upright)."""
     back = axes(camera).back
-    return facing(replace(camera, up=unit(up, camera.up)), back)
+    return look_along(replace(camera, up=unit(up, camera.up)), back)
 
 
 def look_from(camera: ViewCamera, position: Vec3, pivot: Vec3) -> ViewCamera:
     """The eye at `position`, looking at `pivot`; the direction stays where the two coincide."""
     back = (position[0] - pivot[0], position[1] - pivot[1], position[2] - pivot[2])
-    turned = facing(replace(camera, pivot=pivot), back)
+    turned = look_along(replace(camera, pivot=pivot), back)
     return replace(turned, distance=max(math.dist(position, pivot), 1e-9))
 
 
@@ -230,7 +230,7 @@ def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera
     depth = dot((x, y, z), picture.back) - float((shown.means.double() @ frame_axes[2]).median())
     if not (math.isfinite(x + y + z) and 0.0 < depth < FARTHEST):
         return frame(camera, bounds_of(shown), aspect)
-    return replace(camera, pivot=along((x, y, z), (-depth, picture.back)), distance=depth)
+    return replace(camera, pivot=add_scaled((x, y, z), (-depth, picture.back)), distance=depth)
 
 
 def fit_subject(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
@@ -286,7 +286,7 @@ def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:
     world = torch.linalg.inv(seen.viewmat.double()).tolist()
     position: Vec3 = (world[0][3], world[1][3], world[2][3])
     ahead: Vec3 = (world[0][2], world[1][2], world[2][2])
-    depth = dot(along(bounds.centre, (-1.0, position)), ahead)
+    depth = dot(add_scaled(bounds.centre, (-1.0, position)), ahead)
     depth = depth if depth > 1e-3 * bounds.radius else bounds.radius
     fov_y = math.degrees(2.0 * math.atan(seen.height / (2.0 * float(seen.K[1, 1]))))
-    return look_from(replace(camera, fov_y=fov_y), position, along(position, (depth, ahead)))
+    return look_from(replace(camera, fov_y=fov_y), position, add_scaled(position, (depth, ahead)))

@@ -73,7 +73,7 @@ def known_edit(name: str, gdfs: Sequence[Named], option: str) -> str:
     if not gdfs:
         raise ProgdfError(f"{option} {name}: no .gdf file was given; name one after the scene")
     names = ", ".join(gdf.name for gdf in gdfs)
-    raise ProgdfError(f"{option} {name}: there is no edit of that name; there {_are(gdfs)} {names}")
+    raise ProgdfError(f"{option} {name}: there is no edit of that name; there {_list_names(gdfs)} {names}")
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -204,5 +204,5 @@ def _example(gdfs: Sequence[Named]) -> str:
     return gdfs[0].name if gdfs else "NAME"
 
 
-def _are(gdfs: Sequence[Named]) -> str:
+def _list_names(gdfs: Sequence[Named]) -> str:
     return "is" if len(gdfs) == 1 else "are"

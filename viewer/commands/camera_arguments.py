@@ -18,7 +18,7 @@ from .options import RenderOptions
 DEFAULT_SIZE = (640, 480)
 
 
-def asked_camera(
+def choose_camera(
     options: RenderOptions,
     scene: Gaussians,
     gdfs: Sequence[Gdf],

@@ -31,7 +31,9 @@ from .options import ExportOptions, ViewOptions
 @one_thread()
 def view(argv: Sequence[str]) -> int:
     """`progdf view`: open the window and stay until it is closed."""
-    options = parse_options(ViewOptions, arguments.join_arguments(opening.without_name(argv)), "progdf view")
+    options = parse_options(
+        ViewOptions, arguments.join_arguments(opening.drop_option_name(argv)), "progdf view"
+    )
     found = opening.open_stack(options)
     from viewer.app.app import run  # imgui and glfw, which render and export do without
 
@@ -51,7 +53,7 @@ def view(argv: Sequence[str]) -> int:
 def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
     options = parse_options(
-        ExportOptions, arguments.join_arguments(opening.without_name(argv)), "progdf export"
+        ExportOptions, arguments.join_arguments(opening.drop_option_name(argv)), "progdf export"
     )
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")

@@ -82,7 +82,7 @@ def open_stack(options: StackOptions, unset: float = 0.0) -> OpenStack:
     layers = stack_of(
         found.gdfs, options.set, options.gain, options.solo, options.overshoot, options.paint, unset
     )
-    return OpenStack(found, replace(view, layers=layers), asked_up=_asked_up(options))
+    return OpenStack(found, replace(view, layers=layers), asked_up=_up_option(options))
 
 
 def is_session(path: Path) -> bool:
@@ -90,7 +90,7 @@ def is_session(path: Path) -> bool:
     return path.is_file() and kind_of(path) == "session"
 
 
-def without_name(argv: Sequence[str]) -> list[str]:
+def drop_option_name(argv: Sequence[str]) -> list[str]:
     """`--session FILE` and `--session=FILE` as the FILE in the scene's place."""
     found: list[str] = []
     first: list[str] = []
@@ -128,17 +128,17 @@ def _session(options: StackOptions) -> OpenStack:
                 f"{what} with the session {options.scene.name}, which says it too; leave it out"
             )
     kept = session.open_session(options.scene)
-    found = OpenStack(kept.document, kept.view, options.scene, kept.snapshots, _asked_up(options))
+    found = OpenStack(kept.document, kept.view, options.scene, kept.snapshots, _up_option(options))
     settings = [
         f"{found.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in options.set)
     ]
     strengths = arguments.strengths_of(kept.view.layers, settings, stack.largest_strength(kept.view))
     layers = (replace(l, strength=strengths.get(l.name, l.strength)) for l in kept.view.layers)
     view = replace(kept.view, layers=tuple(layers), blend=options.blend or kept.view.blend)
-    if _asked_up(options) != "auto":  # else the session's own
+    if _up_option(options) != "auto":  # else the session's own
         view = replace(view, camera=with_up(view.camera, found.up))
     return replace(found, view=view)
 
 
-def _asked_up(options: StackOptions) -> str:
+def _up_option(options: StackOptions) -> str:
     return options.up if isinstance(options, PictureOptions) else "auto"

@@ -19,14 +19,14 @@ from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
 from viewer.state import recordings, timeline
 from viewer.state.view_state import Comparison, Timeline, ViewState
 
 from . import arguments, opening
-from .camera_arguments import asked_camera
+from .camera_arguments import choose_camera
 from .opening import OpenStack
 from .options import RenderOptions
 
@@ -38,7 +38,7 @@ ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
     options = parse_options(
-        RenderOptions, arguments.join_arguments(opening.without_name(argv)), "progdf render"
+        RenderOptions, arguments.join_arguments(opening.drop_option_name(argv)), "progdf render"
     )
     _check_output(options)
     size = None if options.size is None else arguments.parse_size(options.size)
@@ -48,20 +48,20 @@ def render(argv: Sequence[str]) -> int:
     scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
     view = replace(view, compare=_comparison(options, view.compare))
     saved = None if found.session is None else view.camera
-    camera = asked_camera(options, scene, gdfs, size, saved, found.up)
+    camera = choose_camera(options, scene, gdfs, size, saved, found.up)
     if options.timeline is not None:
         keys, count = _keys(options, found), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
             print_line(timeline_film.write(options.out, keys, view, camera, engine, count))
         return 0
-    swept = _swept(options, found)
+    swept = _swept_layers(options, found)
     with _engine(scene, gdfs, options) as engine:
         if swept:
-            _moving(options, swept, view, camera, engine)
+            _render_film(options, swept, view, camera, engine)
             told = ""
         else:
-            told = _still(options, found, view, camera, engine)
-        drawn_by = _drawn_by(engine)
+            told = _render_still(options, found, view, camera, engine)
+        drawn_by = _describe_engine(engine)
     each = "each " if options.sheet is not None else ""
     print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
     if told:
@@ -73,8 +73,8 @@ def render(argv: Sequence[str]) -> int:
     return 0
 
 
-def _moving(
-    options: RenderOptions, swept: Sequence[str], view: ViewState, camera: Camera, engine: Engine
+def _render_film(
+    options: RenderOptions, swept: Sequence[str], view: ViewState, camera: Camera, engine: ViewEngine
 ) -> None:
     """An animation of one slider, or a contact sheet of one or two."""
 
@@ -92,7 +92,9 @@ def _moving(
             Image.fromarray(film.contact_sheet(swept[0], picture, view)).save(temporary_file)
 
 
-def _still(options: RenderOptions, found: OpenStack, view: ViewState, camera: Camera, engine: Engine) -> str:
+def _render_still(
+    options: RenderOptions, found: OpenStack, view: ViewState, camera: Camera, engine: ViewEngine
+) -> str:
     """One picture, compared as `view` asks; gives what to say about the comparison."""
     where = found.document.recordings()
     missing = recordings.obstacle(where)
@@ -146,19 +148,19 @@ def _count(sheet: str | None) -> int:
     return int(sheet)
 
 
-def _swept(options: RenderOptions, found: OpenStack) -> list[str]:
+def _swept_layers(options: RenderOptions, found: OpenStack) -> list[str]:
     """Names of the layers whose sliders move in the picture: none, one or two."""
     if options.sweep is not None:
-        return [_showing(found.layer(options.sweep), found.view, "--sweep")]
+        return [_check_visible(found.layer(options.sweep), found.view, "--sweep")]
     if options.sheet is None:
         return []
-    names = [_showing(found.layer(name), found.view, "--sheet") for name in options.sheet.split(",")]
+    names = [_check_visible(found.layer(name), found.view, "--sheet") for name in options.sheet.split(",")]
     if len(names) > 2 or len(set(names)) < len(names):
         raise ProgdfError(f"--sheet {options.sheet} does not name one or two different edits; name those")
     return names
 
 
-def _showing(name: str, view: ViewState, option: str) -> str:
+def _check_visible(name: str, view: ViewState, option: str) -> str:
     """`name`, when there is such an edit and no other that is alone hides it."""
     arguments.known_edit(name, view.layers, option)
     alone = [layer.name for layer in view.layers if layer.solo]
@@ -168,7 +170,7 @@ def _showing(name: str, view: ViewState, option: str) -> str:
 
 
 @contextmanager
-def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> Iterator[Engine]:
+def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> Iterator[ViewEngine]:
     """An engine for pictures without a window; "auto" does without OpenGL where there is none."""
     ctx = None
     if options.engine != "cpu":
@@ -177,7 +179,7 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> It
         except ProgdfError:
             if options.engine == "gl":
                 raise
-    engine = Engine(ctx, scene, gdfs, options.engine, options.edit_pass)
+    engine = ViewEngine(ctx, scene, gdfs, options.engine, options.edit_pass)
     try:
         yield engine
     finally:
@@ -186,7 +188,7 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> It
             ctx.release()
 
 
-def _drawn_by(engine: Engine) -> str:
+def _describe_engine(engine: ViewEngine) -> str:
     """The engine in words, with its edit pass if that had a part in the picture, or why it had none."""
     edits = engine.edits()
     return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.description}"

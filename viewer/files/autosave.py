@@ -61,7 +61,7 @@ class SessionAutosave:
         """There is nothing unsaved."""
         self._due = None
 
-    def goes_on(self, path: Path) -> None:
+    def continue_from(self, path: Path) -> None:
         """The work of an autosave was opened: the file is this window's from now on."""
         self.path, self._due, self._kept = path, None, None
 

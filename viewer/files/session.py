@@ -83,7 +83,7 @@ def prune(session: WindowSession) -> WindowSession:
     used = sorted({layer.gdf for layers in stacks for layer in layers})
     places = {gdf: i for i, gdf in enumerate(used)}
 
-    def moved(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
+    def renumber(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
         return tuple(replace(layer, gdf=places[layer.gdf]) for layer in layers)
 
     opened = session.document
@@ -101,11 +101,13 @@ def prune(session: WindowSession) -> WindowSession:
         ),
         replace(
             view,
-            layers=moved(view.layers),
+            layers=renumber(view.layers),
             timeline=replace(view.timeline, keys=keys),
             unfolded=tuple(places[gdf] for gdf in view.unfolded if gdf in places),
         ),
-        tuple(replace(kept, edit=replace(kept.edit, layers=moved(kept.edit.layers))) for kept in snapshots),
+        tuple(
+            replace(kept, edit=replace(kept.edit, layers=renumber(kept.edit.layers))) for kept in snapshots
+        ),
     )
 
 
@@ -123,10 +125,10 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapsh
         _check("view.background", view.background, 0.0, 1.0)
         _check("view.compare.divider", [view.compare.divider], 0.0, 1.0)
         _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)
-        _among("view.compare.mode", view.compare.mode, MODES)
-        _among("view.compare.against", view.compare.against, AGAINST)
-        _among("view.draft", view.draft, RESOLUTION_MODES)
-        _among("view.brush.mode", view.brush.mode, paint.MODES)
+        _check_known("view.compare.mode", view.compare.mode, MODES)
+        _check_known("view.compare.against", view.compare.against, AGAINST)
+        _check_known("view.draft", view.draft, RESOLUTION_MODES)
+        _check_known("view.brush.mode", view.brush.mode, paint.MODES)
         _check("view.brush.radius", [view.brush.radius], paint.SMALLEST_PX, paint.LARGEST_PX)
         _check("view.brush.softness", [view.brush.softness], 0.0, 1.0)
         timeline_file.check(view.timeline, "view.timeline.keys")
@@ -139,7 +141,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapsh
 
 
 def _check_edit(where: str, edit: Edit, count: int) -> None:
-    _among(f"{where}.blend", edit.blend, BLENDS)
+    _check_known(f"{where}.blend", edit.blend, BLENDS)
     for i, layer in enumerate(edit.layers):
         at = f"{where}.layers[{i}]"
         if not 0 <= layer.gdf < count:
@@ -155,7 +157,7 @@ def _check_camera(where: str, camera: ViewCamera) -> None:
     _check(f"{where}.elevation", [camera.elevation], -90.0, 90.0)
     _check(f"{where}.fov_y", [camera.fov_y], 1.0, 179.0)
     _check(f"{where}.up", camera.up, -FARTHEST, FARTHEST)
-    _among(f"{where}.mode", camera.mode, ("orbit", "fly"))
+    _check_known(f"{where}.mode", camera.mode, ("orbit", "fly"))
 
 
 def _check(where: str, values: Sequence[float], least: float, most: float) -> None:
@@ -164,6 +166,6 @@ def _check(where: str, values: Sequence[float], least: float, most: float) -> No
             raise JsonFormError(f"{where} is {value:g}, outside {least:g} to {most:g}")
 
 
-def _among(where: str, value: Any, known: Sequence[str]) -> None:
+def _check_known(where: str, value: Any, known: Sequence[str]) -> None:
     if value not in known:
         raise JsonFormError(f"{where} is '{value}', none of {', '.join(known)}")

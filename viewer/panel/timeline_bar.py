@@ -26,15 +26,15 @@ _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 def height(player: Player, area: Area, ui: UiContext) -> float:
     """How much of the picture it covers, window pixels."""
-    return _tall(area, ui) if player.shown else 0.0
+    return _bar_height(area, ui) if player.shown else 0.0
 
 
-def _roomy(area: Area, ui: UiContext) -> bool:
+def _is_wide(area: Area, ui: UiContext) -> bool:
     return area.width >= ROOMY_PX * ui.scale
 
 
-def _tall(area: Area, ui: UiContext) -> float:
-    return (HEIGHT_PX if _roomy(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
+def _bar_height(area: Area, ui: UiContext) -> float:
+    return (HEIGHT_PX if _is_wide(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
 
 
 def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple[str, ...]:
@@ -43,7 +43,7 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
     Returns:
         What was asked for: actions of the workspace.
     """
-    tall, roomy = _tall(area, ui), _roomy(area, ui)
+    tall, roomy = _bar_height(area, ui), _is_wide(area, ui)
     imgui.set_next_window_pos(imgui.ImVec2(0.0, area.height - tall))
     imgui.set_next_window_size(imgui.ImVec2(area.width, tall))
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))

@@ -20,7 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from progdf.metrics.image import psnr
 from viewer.gl.present import Presenter
-from viewer.render.engine import Engine, drawn_size
+from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.renderers import Image
 from viewer.render.timings import FrameTimings
 from viewer.state import recordings
@@ -40,7 +40,7 @@ class Comparer:
     """
 
     def __init__(
-        self, engine: Engine, ctx: moderngl.Context | None, found: Sequence[RecordingFile] = ()
+        self, engine: ViewEngine, ctx: moderngl.Context | None, found: Sequence[RecordingFile] = ()
     ) -> None:
         self.engine = engine
         self.psnr = math.nan
@@ -48,7 +48,7 @@ class Comparer:
         self.recordings = tuple(found) or (RecordingFile(),) * len(engine.gdfs)
         """Where the edits were recorded; one that turned out to be broken is none."""
         self._ctx = ctx
-        self._other: Engine | None = None
+        self._other: ViewEngine | None = None
         self._against = ""  # what `_other` draws, of `AGAINST`
         self._presenter: Presenter | None = None
         self._texture: moderngl.Texture | None = None
@@ -62,7 +62,7 @@ class Comparer:
         if view.compare.mode == "off":
             return False
         apart = view.compare.mode == "difference" and self._shown != view.compare.amplify
-        return apart or self._second(view).needs_draw(self._beside(view), drawn)
+        return apart or self._second(view).needs_draw(self._other_view(view), drawn)
 
     def draw(
         self,
@@ -91,7 +91,7 @@ class Comparer:
         if view.compare.mode == "off":
             return self.engine.image(view, size, camera)
         edited = self.engine.image(view, size, camera)
-        other = self._second(view).image(self._beside(view), size, camera)
+        other = self._second(view).image(self._other_view(view), size, camera)
         self.psnr = _psnr(other, edited)
         if view.compare.mode == "split":
             at = column(view.compare, edited.shape[1])
@@ -115,7 +115,7 @@ class Comparer:
             if held is not None:
                 held.release()
 
-    def _second(self, view: ViewState) -> Engine:
+    def _second(self, view: ViewState) -> ViewEngine:
         """What draws the other side of `view`."""
         if self._other is None or self._against != self.against(view):
             gdfs = self._load_recorded() if self.against(view) == "recorded" else ()
@@ -123,7 +123,7 @@ class Comparer:
                 self._other.release()
             self._against = self.against(view)  # reading a recording may have shown that it is none
             ways = self.engine.draws_with, self.engine.edits_with
-            self._other = Engine(self._ctx, self.engine.scene, gdfs, *ways)
+            self._other = ViewEngine(self._ctx, self.engine.scene, gdfs, *ways)
         return self._other
 
     def _load_recorded(self) -> tuple[Gdf, ...]:
@@ -139,7 +139,7 @@ class Comparer:
         self.recordings = tuple(read)
         return tuple(gdfs)
 
-    def _beside(self, view: ViewState) -> ViewState:
+    def _other_view(self, view: ViewState) -> ViewState:
         """What the other side of `view` shows."""
         recorded = self.against(view) == "recorded"
         return recordings.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
@@ -148,7 +148,7 @@ class Comparer:
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
         at, new = column(view.compare, size[0]), self.needs_draw(view, size, pixels)
-        other, beside = self._second(view), self._beside(view)
+        other, beside = self._second(view), self._other_view(view)
         edited = self.engine.draw(view, framebuffer, size, pixels)
         framebuffer.scissor = (0, 0, at, size[1])
         try:
@@ -159,7 +159,7 @@ class Comparer:
             self.psnr = _psnr(other.image(beside, size), self.engine.image(view, size))
         elif new:
             self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors
-        return _together(edited, original)
+        return _add_timings(edited, original)
 
     def _draw_difference(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]
@@ -173,7 +173,7 @@ class Comparer:
                 self._texture = self._ctx.texture(size, 3, dtype="f4")
             self._texture.write(apart)
             self._shown = view.compare.amplify
-            timings = _together(self.engine.timings, self._second(view).timings)
+            timings = _add_timings(self.engine.timings, self._second(view).timings)
         else:
             timings = FrameTimings(drawn=self.engine.timings.drawn)
         self._presenter = self._presenter or Presenter(self._ctx)
@@ -193,7 +193,7 @@ def _psnr(other: Image, edited: Image) -> float:
     return psnr(*seen)
 
 
-def _together(edited: FrameTimings, original: FrameTimings) -> FrameTimings:
+def _add_timings(edited: FrameTimings, original: FrameTimings) -> FrameTimings:
     """The time that both took, the figures of the edited one."""
     return replace(
         edited,

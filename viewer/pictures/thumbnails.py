@@ -10,7 +10,7 @@ import numpy as np
 
 from progdf.errors import ProgdfError
 from viewer.camera.view_camera import ViewCamera
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.state.snapshots import SliderSnapshot, restore
 from viewer.state.view_state import Comparison, ViewState
 
@@ -28,7 +28,7 @@ class Thumbnails:
         engine: draws them; stays the caller's
     """
 
-    def __init__(self, ctx: moderngl.Context, engine: Engine) -> None:
+    def __init__(self, ctx: moderngl.Context, engine: ViewEngine) -> None:
         self._ctx, self._engine = ctx, engine
         self._made: dict[tuple[object, ViewCamera], moderngl.Texture] = {}
 

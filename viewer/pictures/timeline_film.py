@@ -14,7 +14,7 @@ from progdf.errors import ProgdfError
 from progdf.io import images as pictures
 from progdf.io.atomic import atomic_write
 from viewer.camera.view_camera import to_camera
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.state import timeline
 from viewer.state.view_state import Timeline, ViewState
 
@@ -36,7 +36,7 @@ def check_output(out: Path) -> None:
 
 
 def frames(
-    shown: Timeline, view: ViewState, still: Camera, engine: Engine, numbers: Iterable[int]
+    shown: Timeline, view: ViewState, still: Camera, engine: ViewEngine, numbers: Iterable[int]
 ) -> Iterator[film.Pixels]:
     """The pictures of some frames. [H,W,3] each
 
@@ -60,7 +60,7 @@ def sheet_frames(shown: Timeline, count: int) -> list[int]:
     return sorted({round(i * shown.length / steps) for i in range(count)})
 
 
-def sheet(shown: Timeline, view: ViewState, still: Camera, engine: Engine, count: int) -> film.Pixels:
+def sheet(shown: Timeline, view: ViewState, still: Camera, engine: ViewEngine, count: int) -> film.Pixels:
     """A contact sheet of `count` frames, row by row, each with its number and its time. [H,W,3]"""
     numbers = sheet_frames(shown, count)
     drawn = [
@@ -75,7 +75,9 @@ def sheet(shown: Timeline, view: ViewState, still: Camera, engine: Engine, count
     return film.to_pixels(page.numpy())
 
 
-def write(out: Path, shown: Timeline, view: ViewState, still: Camera, engine: Engine, count: int = 0) -> str:
+def write(
+    out: Path, shown: Timeline, view: ViewState, still: Camera, engine: ViewEngine, count: int = 0
+) -> str:
     """Write the film: .gif, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
 
     Returns:

@@ -61,7 +61,7 @@ class _Picture:
     highlight: Highlight | None = None
 
 
-class Engine:
+class ViewEngine:
     """Draws one scene under its edits.
 
     Args:

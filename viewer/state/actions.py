@@ -132,10 +132,10 @@ def _rename(workspace: Workspace, index: str) -> Workspace:
 
 
 def _lock(workspace: Workspace, _: str) -> Workspace:
-    def turned(view: ViewState, index: int) -> ViewState:
+    def toggle(view: ViewState, index: int) -> ViewState:
         return stack.change_layer(view, index, lambda layer: replace(layer, locked=not layer.locked))
 
-    return _change_focused(workspace, turned)
+    return _change_focused(workspace, toggle)
 
 
 def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
@@ -146,23 +146,23 @@ def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
 def _fill_paint(workspace: Workspace, facts: SceneFacts, weight: float) -> Workspace:
     """The focused layer painted evenly, unless it is locked."""
 
-    def even(view: ViewState, index: int) -> ViewState:
+    def fill(view: ViewState, index: int) -> ViewState:
         count = facts.rows[view.layers[index].gdf].count
         return stack.with_paint(view, index, paint.encode(np.full(count, weight, np.float32)))
 
-    return _change_focused(workspace, even)
+    return _change_focused(workspace, fill)
 
 
 def _feather(workspace: Workspace, facts: SceneFacts) -> Workspace:
     """The edges of the focused layer's paint softened a little; again softens them more."""
 
-    def softened(view: ViewState, index: int) -> ViewState:
+    def soften(view: ViewState, index: int) -> ViewState:
         layer = view.layers[index]
         row = facts.rows[layer.gdf]
         width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
         return stack.with_paint(view, index, paint.feather(layer.paint, row.points, width))
 
-    return _change_focused(workspace, softened)
+    return _change_focused(workspace, soften)
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:

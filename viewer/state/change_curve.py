@@ -43,10 +43,10 @@ def curve_of(scene: Gaussians, gdf: Gdf) -> Curve:
     """The curve of one edit, drawn when it is first asked for."""
 
     @cache
-    def measured() -> Sequence[float]:
+    def measure() -> Sequence[float]:
         return visible_changes(scene, gdf)
 
-    return measured
+    return measure
 
 
 def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:

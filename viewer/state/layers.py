@@ -59,13 +59,13 @@ def slider_value(layer: LayerState, slider: str) -> float:
 def nudge(view: ViewState, index: int, slider: str, by: float) -> ViewState:
     """One layer's slider a step further."""
 
-    def further(layer: LayerState) -> LayerState:
+    def step(layer: LayerState) -> LayerState:
         # rounded, so that steps forth and back end on the number they began with
         return with_slider_value(
             layer, slider, round(slider_value(layer, slider) + by, 6), largest_strength(view)
         )
 
-    return change_layer(view, index, further)
+    return change_layer(view, index, step)
 
 
 def move_layer(view: ViewState, index: int, to: int) -> ViewState:

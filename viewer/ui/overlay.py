@@ -66,8 +66,8 @@ def figures(
 def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
     """A small table at the upper left: names, and figures aligned at the right."""
     size, pad, gap = SMALL_PX * ui.scale, 8.0 * ui.scale, 14.0 * ui.scale
-    names = max((_wide(name, size, ui) for name, _ in lines), default=0.0)
-    figures = max((_wide(figure, size, ui) for _, figure in lines), default=0.0)
+    names = max((_text_width(name, size, ui) for name, _ in lines), default=0.0)
+    figures = max((_text_width(figure, size, ui) for _, figure in lines), default=0.0)
     step = size * 1.35
     left = top = 10.0 * ui.scale
     right = left + names + figures + gap + 2 * pad
@@ -79,13 +79,13 @@ def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
     for i, (name, figure) in enumerate(lines):
         y = top + pad + i * step
         _text(left + pad, y, name, size, PALETTE.dim, ui)
-        _text(right - pad - _wide(figure, size, ui), y, figure, size, PALETTE.text, ui)
+        _text(right - pad - _text_width(figure, size, ui), y, figure, size, PALETTE.text, ui)
 
 
 def banner(text: str, area: Area, ui: UiContext, row: int = 0) -> None:
     """A word at the top centre of the picture, or so many rows below."""
     size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
-    wide = _wide(text, size, ui)
+    wide = _text_width(text, size, ui)
     x, y = (area.width - wide) / 2, (14.0 + 32.0 * row) * ui.scale
     corners = imgui.ImVec2(x - 1.5 * pad, y - pad / 2), imgui.ImVec2(x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
@@ -131,7 +131,7 @@ _FLOATING = (
 )
 
 
-def _wide(text: str, size: float, ui: UiContext) -> float:
+def _text_width(text: str, size: float, ui: UiContext) -> float:
     imgui.push_font(ui.fonts.regular, size / ui.scale)
     wide = float(imgui.calc_text_size(text).x)
     imgui.pop_font()

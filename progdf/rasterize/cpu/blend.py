@@ -100,7 +100,7 @@ def _blend_tile(
 
 @kernel(cache=True)
 def blend(
-    first: int, step: int, scratch: spans.Scratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     background: Array, out: Picture,
 ) -> None:  # fmt: skip
     """Blend every `step`-th tile from the first on into the picture. background: [3] float32"""

@@ -127,7 +127,7 @@ def _blend_tile_backward(
 
 @kernel(cache=True)
 def blend_backward(
-    first: int, step: int, scratch: spans.Scratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     background: Array, out: Picture, gradients: Picture, wanted: Array, sums: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same first arguments.

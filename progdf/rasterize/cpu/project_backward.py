@@ -119,7 +119,7 @@ def _set(rows: Array, i: int, value: Vec) -> None:
     rows[i, 0], rows[i, 1], rows[i, 2] = value
 
 
-class Scratch(NamedTuple):
+class GradientScratch(NamedTuple):
     """What a thread works in: see `shading.shade_backward`; sums of a Gaussian's intersections, [9]."""
 
     basis: Array
@@ -127,15 +127,15 @@ class Scratch(NamedTuple):
     total: Array
 
 
-def new_scratch() -> Scratch:
+def new_scratch() -> GradientScratch:
     """For one thread."""
-    return Scratch(np.empty(16), np.zeros((16, 3)), np.empty(SUMS))
+    return GradientScratch(np.empty(16), np.zeros((16, 3)), np.empty(SUMS))
 
 
 @kernel(contract=True, cache=True)
 def project_backward(
     begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, wanted: Array,
-    gradients: Scene, by_camera: Array, scratch: Scratch,
+    gradients: Scene, by_camera: Array, scratch: GradientScratch,
 ) -> None:  # fmt: skip
     """Gradients of `project`, which has the same first arguments.
 

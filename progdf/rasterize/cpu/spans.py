@@ -52,7 +52,7 @@ EIGHT: Number = np.float32(WIDTH)
 _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(factor) for factor in _POLYNOMIAL)
 
 
-class Scratch(NamedTuple):
+class TileScratch(NamedTuple):
     """What a thread works in, tile by tile.
 
     Args:
@@ -66,10 +66,10 @@ class Scratch(NamedTuple):
     bounds: Array
 
 
-def new_scratch() -> Scratch:
+def new_scratch() -> TileScratch:
     """Room for six planes and a batch."""
     batch = np.empty(BATCH * int(SPLAT), np.float32)
-    return Scratch(np.empty(6 * int(PLANE), np.float32), batch, np.empty(4, np.int64))
+    return TileScratch(np.empty(6 * int(PLANE), np.float32), batch, np.empty(4, np.int64))
 
 
 @kernel(fast=True, inline=True)

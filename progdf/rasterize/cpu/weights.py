@@ -86,7 +86,7 @@ def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
 
 @kernel(cache=True)
 def accumulate_weights(
-    first: int, step: int, scratch: spans.Scratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     mask: Array, sums: Array,
 ) -> None:  # fmt: skip
     """Add up the weights of every (splat, tile) intersection in every `step`-th tile from the first on.
@@ -171,7 +171,7 @@ def _list_tile(
 
 @kernel(cache=True)
 def list_weights(
-    first: int, step: int, scratch: spans.Scratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     rows: Array, write: bool, places: Array, out: Runs,
 ) -> None:  # fmt: skip
     """List what the splats weigh, in every `step`-th tile from the first on.

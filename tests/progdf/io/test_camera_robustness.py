@@ -23,7 +23,7 @@ from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, bounds_of, first_camera, to_camera
 from viewer.files.document import Document
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.renderers import Image
 from viewer.state import workspace
@@ -74,7 +74,7 @@ def pictured(
     camera: ViewCamera | None = None,
     size: tuple[int, int] = SIZE,
 ) -> Image:
-    engine = Engine(ctx, scene, draw=draw)
+    engine = ViewEngine(ctx, scene, draw=draw)
     try:
         view = ViewState(camera=camera or first_camera(scene), background=BACKGROUND)
         return engine.image(view, size)

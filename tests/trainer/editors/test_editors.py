@@ -65,7 +65,7 @@ def test_what_shares_a_pixel_with_the_region_is_not_edited() -> None:
         inside=torch.tensor([[[0.6, 0.2, 0.0]]]),
     )
     blue = torch.tensor([0.1, 0.2, 0.9])
-    assert torch.allclose(view.blended(blue.expand(1, 1, 3)), 0.5 * blue + 0.5, atol=1e-6)
+    assert torch.allclose(view.blend(blue.expand(1, 1, 3)), 0.5 * blue + 0.5, atol=1e-6)
 
 
 def test_mask_and_inside_rebuild_the_view_with_the_region_taken_out() -> None:
@@ -85,7 +85,7 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     editor = make_editor("stripes:#20a040", matt, case.region, views)
     assert isinstance(editor, StripesEditor)
     rows = case.region.members
-    painted = editor.painted(sh0_to_rgb(matt.sh0[rows]).clamp_min(0), 1.0)
+    painted = editor.paint(sh0_to_rgb(matt.sh0[rows]).clamp_min(0), 1.0)
     scene = replace(matt, sh0=matt.sh0.index_copy(0, rows, rgb_to_sh0(painted)))
     for view in views:
         expected = render(scene, view.camera).clamp(0, 1)

@@ -133,7 +133,7 @@ def test_half_way_a_part_has_half_the_shift_half_the_turn_and_half_the_growth_in
         torch.full((2,), math.log(4.0)),
         torch.tensor([[0.0, math.pi / 2, 0.0]]).expand(2, 3),
     )
-    half = interpolate_motion(parts.still(), end, 0.5)
+    half = interpolate_motion(parts.rest_motion(), end, 0.5)
     assert torch.allclose(half.shift, torch.full((2, 3), 0.5))
     assert torch.allclose(half.log_scale.exp(), torch.full((2,), 2.0))
     assert torch.allclose(half.turn[0], torch.tensor([0.0, math.pi / 4, 0.0]), atol=1e-6)
@@ -211,7 +211,7 @@ def test_targets_that_are_not_finite_stop_the_search() -> None:
     rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case)))
     parts = make_parts(rows, connected_parts(rows[:, :3]))
     with pytest.raises(FloatingPointError, match="group stage"):
-        GroupSearch(rows, parts, crops, 4).find([t * float("nan") for t in targets], parts.still())
+        GroupSearch(rows, parts, crops, 4).find([t * float("nan") for t in targets], parts.rest_motion())
 
 
 def test_on_the_way_a_part_keeps_its_shape_and_the_ends_are_exact() -> None:

@@ -12,7 +12,7 @@ from progdf.sh import rgb_to_sh0
 from trainer.editors.base import EditKind
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
-from trainer.pipeline.training import no_worse
+from trainer.pipeline.training import is_no_worse
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View, make_view
@@ -124,6 +124,6 @@ def test_following_that_makes_the_loss_worse_is_undone() -> None:
     sources = places.roll(3)[:, None]
     wrong = UnseenMembers(places, sources, torch.ones(len(places), 1))
     stages = [TargetStage(1.0, targets, 1)]
-    assert not no_worse(wrong, end, original, crops, stages)
+    assert not is_no_worse(wrong, end, original, crops, stages)
     right = UnseenMembers(places, places[:, None], torch.ones(len(places), 1))
-    assert no_worse(right, end, original, crops, stages)
+    assert is_no_worse(right, end, original, crops, stages)

@@ -14,7 +14,7 @@ from trainer.optimize.objective import LossWeights
 from trainer.optimize.settings import idle_options, loss_weights, pgs_settings, stage_count
 from trainer.option_checks import resolve_options
 from trainer.options import Preset, TrainOptions
-from trainer.presets import PRESETS, under_preset
+from trainer.presets import PRESETS, apply_preset
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
 
@@ -35,7 +35,7 @@ def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
         **{name: value for name, value in PRESETS[preset].items() if plain[name] != value},
         "preset": preset,
     }
-    assert found == asdict(under_preset(asked(), preset)), "Python has the same"
+    assert found == asdict(apply_preset(asked(), preset)), "Python has the same"
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])

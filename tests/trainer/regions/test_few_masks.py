@@ -8,7 +8,7 @@ import torch
 
 from progdf.gaussians import Gaussians
 from tests.helpers.scenes import random_gaussians
-from trainer.regions.few_masks import holes_of, without_strays
+from trainer.regions.few_masks import drop_strays, find_holes
 
 
 def grids(*places: tuple[float, int]) -> Gaussians:
@@ -26,7 +26,7 @@ def test_what_one_of_two_masks_holds_is_no_member() -> None:
     views, inside = torch.full((100,), 3.0), torch.full((100,), 2.0)
     inside[40:60] = 1.0
     said: list[str] = []
-    kept = without_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, said.append)
+    kept = drop_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, said.append)
     assert kept.nonzero()[:, 0].tolist() == [*range(40), *range(60, 100)]
     assert said == [
         "the masks: 20 Gaussians inside one mask only, where two views see it, left to what surrounds them"
@@ -38,7 +38,7 @@ def test_a_tree_behind_that_one_view_sees_is_left_out_though_it_is_larger() -> N
     near = torch.arange(500) < 100
     views = torch.where(near, 3.0, 1.0)
     said: list[str] = []
-    kept = without_strays(scene, torch.ones(500, dtype=torch.bool), views, views, said.append)
+    kept = drop_strays(scene, torch.ones(500, dtype=torch.bool), views, views, said.append)
     assert torch.equal(kept, near)
     assert said == ["the masks: 400 Gaussians apart from the 1 largest connected surface, left out"]
 
@@ -46,7 +46,7 @@ def test_a_tree_behind_that_one_view_sees_is_left_out_though_it_is_larger() -> N
 def test_two_hands_are_both_kept() -> None:
     scene = grids((0.0, 10), (5.0, 8))
     views = torch.full((164,), 2.0)
-    assert bool(without_strays(scene, torch.ones(164, dtype=torch.bool), views, views).all())
+    assert bool(drop_strays(scene, torch.ones(164, dtype=torch.bool), views, views).all())
 
 
 def test_a_hole_is_filled_unless_two_views_see_through_it() -> None:
@@ -54,15 +54,15 @@ def test_a_hole_is_filled_unless_two_views_see_through_it() -> None:
     member = torch.ones(144, dtype=torch.bool)
     member[65], member[78] = False, False
     outside = torch.zeros(144)
-    assert holes_of(scene, member, outside).tolist() == [65, 78]
+    assert find_holes(scene, member, outside).tolist() == [65, 78]
     outside[78] = 2.0
     said: list[str] = []
-    assert holes_of(scene, member, outside, said.append).tolist() == [65]
+    assert find_holes(scene, member, outside, said.append).tolist() == [65]
     assert said == ["the masks: 1 Gaussian in holes of it, added"]
 
 
 def test_no_member_at_all_stays_none() -> None:
     scene = grids((0.0, 4))
     nobody, views = torch.zeros(16, dtype=torch.bool), torch.zeros(16)
-    assert not bool(without_strays(scene, nobody, views, views).any())
-    assert not len(holes_of(scene, nobody, views))
+    assert not bool(drop_strays(scene, nobody, views, views).any())
+    assert not len(find_holes(scene, nobody, views))

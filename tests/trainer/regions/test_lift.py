@@ -219,5 +219,5 @@ def test_the_undecided_are_the_hidden_and_the_half_hidden_of_mixed_share() -> No
         torch.ones(6),
         torch.ones(6),
     )
-    assert lift.undecided(evidence, 0.7).tolist() == [True, True, False, False, True, False]
-    assert lift.undecided(evidence, 0.8).tolist() == [True, True, False, False, True, True]
+    assert lift.undecided_rows(evidence, 0.7).tolist() == [True, True, False, False, True, False]
+    assert lift.undecided_rows(evidence, 0.8).tolist() == [True, True, False, False, True, True]

@@ -30,7 +30,7 @@ from trainer.pipeline.run import train
 from trainer.regions.from_pictures import RegionSettings, region_kinds
 from trainer.segmenters import SEGMENTERS, SegmenterSettings
 from trainer.segmenters.folder import read_masks
-from trainer.segmenters.grounded_sam import as_asked
+from trainer.segmenters.grounded_sam import normalize_prompt
 
 SIZE, VIEWS = 96, 6
 DEMO = bear(1500)
@@ -243,8 +243,8 @@ def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked
 
 
 def test_prompts_are_asked_as_the_detector_was_trained() -> None:
-    assert as_asked("  The man's  Shirt ") == "the man's shirt."
-    assert as_asked("a cat. a dog.") == "a cat. a dog."
+    assert normalize_prompt("  The man's  Shirt ") == "the man's shirt."
+    assert normalize_prompt("a cat. a dog.") == "a cat. a dog."
 
 
 # --------------------------------------------------------------------------------------- the real networks

@@ -50,7 +50,7 @@ def stripes_of_its_own(period: float, seed: int) -> list[Tensor]:
         )
         striped = ((x * math.cos(angle) + y * math.sin(angle)) / period + phase) % 1 < 0.5
         pictures.append(
-            view.blended(torch.where(striped[..., None], torch.tensor([0.1, 0.6, 0.2]), view.inside))
+            view.blend(torch.where(striped[..., None], torch.tensor([0.1, 0.6, 0.2]), view.inside))
         )
     return pictures
 
@@ -75,15 +75,14 @@ def test_another_hue_in_every_view_disagrees() -> None:
     pictures = []
     for view in body().views:
         hue = torch.rand(3, generator=rng)
-        pictures.append(view.blended(torch.lerp(view.inside, hue.expand_as(view.inside), 0.6)))
+        pictures.append(view.blend(torch.lerp(view.inside, hue.expand_as(view.inside), 0.6)))
     assert not judged(pictures).agree
 
 
 def test_differences_too_faint_to_see_are_no_disagreement() -> None:
     rng = torch.Generator().manual_seed(3)
     pictures = [
-        view.blended((view.inside + 0.02 * torch.randn(3, generator=rng)).clamp(0, 1))
-        for view in body().views
+        view.blend((view.inside + 0.02 * torch.randn(3, generator=rng)).clamp(0, 1)) for view in body().views
     ]
     found = judged(pictures)
     assert found.psnr > 28
@@ -130,10 +129,10 @@ class LinearSight:
     matrix: Tensor
     change: Tensor
 
-    def shown(self, colors: Tensor) -> Tensor:
+    def render(self, colors: Tensor) -> Tensor:
         return self.matrix @ colors
 
-    def gathered(self, picture: Tensor, members: int) -> Tensor:
+    def gather(self, picture: Tensor, members: int) -> Tensor:
         return self.matrix.T @ picture
 
 

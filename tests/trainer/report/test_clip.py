@@ -26,7 +26,7 @@ from trainer.pipeline.refit import refit
 from trainer.pipeline.run import train
 from trainer.plan import Texts, make_plan
 from trainer.report.clip import Clip, direction, load_clip, square_picture
-from trainer.report.measures import clip_course
+from trainer.report.measures import clip_curve
 
 pytest.importorskip("transformers")
 
@@ -157,7 +157,7 @@ def test_why_nothing_is_measured_is_told(saved: Path) -> None:
     evaluator = make_evaluator(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
 
     def reason(before: str, after: str, model: str = str(saved)) -> str:
-        found = clip_course(
+        found = clip_curve(
             evaluator,
             bear.views,
             BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14),

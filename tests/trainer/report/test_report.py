@@ -18,9 +18,9 @@ from progdf.field.trajectory import Trajectory
 from progdf.gaussians import pack
 from tests.helpers.trained import WHITE, Small, small
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.fit.fit import without_idle_attributes
+from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import GradientL1
-from trainer.report.curves import courses
+from trainer.report.curves import error_curves
 from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
 from trainer.store.memory import PeakMemory
@@ -48,7 +48,7 @@ def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None
     bear = small(count=3)
     evaluator, field = _judged(bear), _darker(bear)
     truth = {s: evaluator.pictures(field.offsets(s)) for s in (0.3, 0.8)}
-    found = courses(evaluator, {"slider": field}, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
+    found = error_curves(evaluator, {"slider": field}, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
     assert found.s == (0.3, 0.8)
     assert found.psnr == (99.0, 99.0)
     assert found.ssim == pytest.approx((1.0, 1.0), abs=1e-5)  # single precision
@@ -60,7 +60,7 @@ def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
     evaluator = _judged(bear)
     fields = {"near": _darker(bear, 0.55), "far": _darker(bear, 0.2)}
     truth = evaluator.pictures(_darker(bear).offsets(1.0))
-    found = courses(evaluator, fields, (1.0,), lambda _: truth, GradientL1())
+    found = error_curves(evaluator, fields, (1.0,), lambda _: truth, GradientL1())
     assert found["near"].psnr[0] > found["far"].psnr[0] + 6
     assert found["near"].ssim[0] > found["far"].ssim[0]
     assert found["near"].lpips[0] < found["far"].lpips[0]
@@ -203,7 +203,7 @@ def test_attributes_that_show_little_each_are_not_all_left_out_where_together_th
     )
     pixels = [torch.ones(1, 1, dtype=torch.bool)]
     evaluator = Judging(torch.zeros(2, 14), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])
-    kept, costs = without_idle_attributes(trajectory, evaluator)
+    kept, costs = drop_idle_attributes(trajectory, evaluator)
     assert costs == {"quats": 0.07, "means": 0.07}
     moving = moving_attributes(kept.end)
     assert ("means" in moving) != ("quats" in moving)

@@ -22,7 +22,7 @@ from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainOptions
 from trainer.setup.training_setup import make_training_setup
-from trainer.views.choose import Choice, choose_views, in_frame, sample_members, split_views
+from trainer.views.choose import ViewChoice, choose_views, in_frame, sample_members, split_views
 
 
 def test_a_camera_that_looks_away_is_left_out() -> None:
@@ -85,7 +85,7 @@ def crowded(case: Small) -> list[Camera]:
     return around(case, [0.1 * i for i in range(40)], "still") + around(case, [12.0 * i for i in range(30)])
 
 
-def choice_of(case: Small) -> Choice:
+def choice_of(case: Small) -> ViewChoice:
     cameras = [view.camera for view in case.views]
     return choose_views(case.scene, case.region, cameras, len(cameras), WHITE)
 
@@ -169,7 +169,7 @@ def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
 def picked(likeness: Tensor, held_out: int) -> list[int]:
     """Which of the views are held out that are so much alike."""
     views = tuple(replace(small().views[0], box=(i, 0, 64, 64)) for i in range(len(likeness)))
-    train, held = split_views(Choice(views, likeness, len(views), 0, 0), held_out)
+    train, held = split_views(ViewChoice(views, likeness, len(views), 0, 0), held_out)
     assert [view.box[0] for view in train] == [
         i for i in range(len(views)) if i not in {v.box[0] for v in held}
     ]
@@ -189,7 +189,7 @@ def test_views_that_show_what_the_others_show_are_held_out_one_from_each_side() 
 def test_no_more_than_a_third_is_held_out_and_no_view_twice() -> None:
     assert picked(torch.ones(6, 6), 5) == [0, 1]
     few = tuple(small().views[:2])
-    train, held = split_views(Choice(few, torch.eye(2), 2, 0, 0), 1)
+    train, held = split_views(ViewChoice(few, torch.eye(2), 2, 0, 0), 1)
     assert train == held == list(few)
 
 

@@ -126,19 +126,19 @@ def test_an_original_photograph_that_is_missing_is_refused_before_training(tmp_p
 
 def test_what_is_put_in_place_of_the_inside_is_mixed_as_the_original_was() -> None:
     view = small().views[0]
-    assert float((view.blended(view.inside) - view.image).abs().max()) < 1e-6, "nothing changed"
+    assert float((view.blend(view.inside) - view.image).abs().max()) < 1e-6, "nothing changed"
     green = torch.tensor([0.1, 0.8, 0.2]).expand_as(view.image)
     expected = view.image + view.mask[..., None] * (green - view.inside)
     soft = (view.mask > 0.02) & (view.mask < 0.98)
     assert int(soft.sum()) > 20
-    torch.testing.assert_close(view.blended(green)[soft], expected.clamp(0, 1)[soft])
-    assert torch.equal(view.blended(green)[view.mask == 0], view.image[view.mask == 0])
+    torch.testing.assert_close(view.blend(green)[soft], expected.clamp(0, 1)[soft])
+    assert torch.equal(view.blend(green)[view.mask == 0], view.image[view.mask == 0])
 
 
 def test_outside_the_region_an_edit_is_put_back_and_from_a_fifth_on_it_is_taken() -> None:
     view = replace(small().views[0], mask=torch.tensor([0.0, 0.1, 0.2, 1.0]).repeat_interleave(18)[:, None])
     edited = 1 - view.image
-    found = view.confined(edited)
+    found = view.confine(edited)
     assert torch.equal(found[:18], view.image[:18])
     torch.testing.assert_close(found[18:36], torch.full_like(found[18:36], 0.5))
     torch.testing.assert_close(found[36:], edited[36:])

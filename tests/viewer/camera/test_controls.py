@@ -127,7 +127,7 @@ def test_looking_around_keeps_the_eye_in_its_place(camera: ViewCamera, dx: float
 
 def test_dragging_right_brings_what_was_at_the_left_to_the_middle() -> None:
     camera = ViewCamera(elevation=0.0)
-    left = turntable.along(camera.pivot, (-1.0, axes(camera).right), (1.0, axes(camera).back))
+    left = turntable.add_scaled(camera.pivot, (-1.0, axes(camera).right), (1.0, axes(camera).back))
     before = to_camera(camera, 400, 400).viewmat @ torch.tensor([*left, 1.0])
     after = to_camera(controls.orbit(camera, 60, 0), 400, 400).viewmat @ torch.tensor([*left, 1.0])
     assert before[0] < after[0]
@@ -198,7 +198,7 @@ def test_flying_ahead_moves_the_eye_along_the_view_at_the_scenes_pace() -> None:
     camera = ViewCamera(distance=2.0)
     for radius in (1e-3, 1e4):
         flown = controls.fly(camera, 0, 0, 1, seconds=0.05, radius=radius)
-        step = turntable.along(eye(flown), (-1.0, eye(camera)))
+        step = turntable.add_scaled(eye(flown), (-1.0, eye(camera)))
         assert dot(step, axes(camera).back) == pytest.approx(-0.05 * 0.6 * radius, rel=1e-6)
 
 

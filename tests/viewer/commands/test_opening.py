@@ -19,7 +19,7 @@ from tests.helpers.ui_rig import bear
 from viewer.files import document, session
 from viewer.files.session import WindowSession
 from viewer.pictures import film
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.state import timeline
 from viewer.state.view_state import Comparison, LayerState, Timeline, ViewState
 
@@ -70,7 +70,10 @@ def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) ->
         shown = replace(view, layers=layers)
         session.save(here / "work.session.json", WindowSession(opened, shown))
         assert run("export", "--session", "work.session.json", "-o", "edited.ply") == 0
-        expected, found = Engine(None, opened.scene, opened.gdfs).gaussians(shown), load_ply("edited.ply")
+        expected, found = (
+            ViewEngine(None, opened.scene, opened.gdfs).gaussians(shown),
+            load_ply("edited.ply"),
+        )
         for name in ATTRIBUTES:
             was, now = getattr(expected, name), getattr(found, name)
             was = normalize_quats(was) if name == "quats" else was
@@ -104,7 +107,7 @@ def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: 
         layers = tuple(
             replace(layer, strength=1.0 if layer.gdf == 0 else layer.strength) for layer in view.layers
         )
-        expected = Engine(None, opened.scene, opened.gdfs).gaussians(replace(shown, layers=layers))
+        expected = ViewEngine(None, opened.scene, opened.gdfs).gaussians(replace(shown, layers=layers))
         assert torch.allclose(load_ply(f"{name}.ply").means, expected.means, atol=1e-6)
     assert not torch.equal(load_ply("own.ply").sh0, load_ply("sum.ply").sh0)
 
@@ -165,7 +168,7 @@ def test_the_sessions_own_timeline_can_be_filmed(here: Path) -> None:
     given = ("render", "--session", "work.session.json", "--timeline", "work.session.json", *SMALL)
     assert run(*given, "-o", "frames") == 0
     assert len(list(Path("frames").iterdir())) == 9
-    expected = Engine(None, bear().scene, bear().gdfs).image(
+    expected = ViewEngine(None, bear().scene, bear().gdfs).image(
         timeline.state_at(view.timeline, 5, view), (64, 48)
     )
     found = np.asarray(Image.open("frames/frame_0005.png")).astype(int)

@@ -170,9 +170,9 @@ def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: P
     session.save(saved, WindowSession(opened_document(saved.parent), view))
     out, size = tmp_path / "a.png", ("--size", "64x48", "--engine", "cpu")
     assert main(["render", "--session", str(saved), *size, "-o", str(out)]) == 0
-    from viewer.render.engine import Engine
+    from viewer.render.engine import ViewEngine
 
-    engine = Engine(None, bear().scene, bear().gdfs)
+    engine = ViewEngine(None, bear().scene, bear().gdfs)
     expected = np.round(engine.image(view, (64, 48)).clip(0, 1) * 255)
     assert np.abs(np.asarray(Image.open(out)).astype(int) - expected).max() <= 1
     moved = replace(view, layers=(replace(view.layers[0], strength=0.0), view.layers[1]))

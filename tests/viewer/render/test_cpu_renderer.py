@@ -25,7 +25,7 @@ from viewer.camera.view_camera import first_camera, to_camera
 from viewer.gl.screen import read_rgb
 from viewer.render import cpu_renderer as cpu_renderer
 from viewer.render.dirty_rectangles import MOST_RECTANGLES, area, dirty_rectangles
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
@@ -83,7 +83,7 @@ def wandering(scene: Gaussians) -> Gdf:
 
 def test_a_random_session_of_sliders_gives_the_bits_of_whole_pictures(stack: Stack) -> None:
     edits = (*stack.gdfs, wandering(stack.scene))
-    kept = Engine(None, stack.scene, edits)
+    kept = ViewEngine(None, stack.scene, edits)
     rng = np.random.default_rng(3)
     view = view_of(stack, 0.0, 0.0, 0.0)
     shares = []
@@ -98,7 +98,7 @@ def test_a_random_session_of_sliders_gives_the_bits_of_whole_pictures(stack: Sta
             view = replace(view, blend="sum" if view.blend == "normalised" else "normalised")
         image = kept.image(view, SIZE)
         shares.append(kept.timings.share)
-        fresh = Engine(None, kept.gaussians(view))
+        fresh = ViewEngine(None, kept.gaussians(view))
         assert np.array_equal(image, fresh.image(replace(view, layers=()), SIZE)), step
     assert sum(0.0 < share < 0.8 for share in shares) >= 15, "hardly any picture was drawn in part"
 
@@ -108,7 +108,7 @@ def _camera(view: ViewState) -> Camera:
 
 
 def test_a_picture_that_was_handed_out_stays_as_it_is(stack: Stack) -> None:
-    engine = Engine(None, stack.scene, stack.gdfs)
+    engine = ViewEngine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.1), SIZE)
     image = engine.image(view_of(stack, 0.4), SIZE)
     before = image.copy()
@@ -122,7 +122,7 @@ def test_where_many_are_touched_the_picture_is_drawn_as_a_whole(
     stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cpu_renderer, "MANY", 3)
-    engine, fresh = Engine(None, stack.scene, stack.gdfs), Engine(None, stack.scene, stack.gdfs)
+    engine, fresh = ViewEngine(None, stack.scene, stack.gdfs), ViewEngine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.2), SIZE)
     changed = engine.image(view_of(stack, 0.7), SIZE)
     assert engine.timings.share == 1.0
@@ -130,17 +130,17 @@ def test_where_many_are_touched_the_picture_is_drawn_as_a_whole(
 
 
 def test_several_changes_before_a_picture_are_all_drawn(stack: Stack) -> None:
-    engine = Engine(None, stack.scene, stack.gdfs)
+    engine = ViewEngine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.5, 0.5), SIZE)
     engine.gaussians(view_of(stack, 0.9, 0.5))  # composes, draws nothing
     view = view_of(stack, 0.9, 0.1)
-    fresh = Engine(None, stack.scene, stack.gdfs)
+    fresh = ViewEngine(None, stack.scene, stack.gdfs)
     assert np.array_equal(engine.image(view, SIZE), fresh.image(view, SIZE))
     assert 0.0 < engine.timings.share < 0.8
 
 
 def test_the_share_is_small_where_few_are_touched(stack: Stack) -> None:
-    engine = Engine(None, stack.scene, stack.gdfs)
+    engine = ViewEngine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.5), SIZE)
     assert engine.timings.share == 1.0
     engine.image(view_of(stack, 0.6), SIZE)
@@ -152,7 +152,7 @@ def test_the_share_is_small_where_few_are_touched(stack: Stack) -> None:
 @pytest.mark.gl
 def test_the_screen_follows_the_touched_part(ctx: moderngl.Context, stack: Stack) -> None:
     screen = ctx.framebuffer([ctx.texture(SIZE, 4)])
-    engine, fresh = (Engine(ctx, stack.scene, stack.gdfs, draw="cpu") for _ in range(2))
+    engine, fresh = (ViewEngine(ctx, stack.scene, stack.gdfs, draw="cpu") for _ in range(2))
     for scarf, ears in ((0.0, 0.0), (0.5, 0.0), (1.0, 0.3), (1.0, 0.9), (0.0, 0.9)):
         engine.image(view_of(stack, scarf, 0.5 * ears), SIZE)  # a picture that never reaches the screen
         engine.draw(view_of(stack, scarf, ears), screen, SIZE)

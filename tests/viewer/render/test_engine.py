@@ -23,7 +23,7 @@ from viewer.gl import edit_pass
 from viewer.gl.screen import read_rgb
 from viewer.render import engine as engine_module
 from viewer.render.attribute_updates import GpuEditing
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context, is_software
 from viewer.render.timings import FrameTimings
 from viewer.state.paint import encode
@@ -46,17 +46,17 @@ def ctx() -> Iterator[moderngl.Context]:
 
 
 @pytest.fixture(params=["gl", "cpu", "gl, edited by the GPU"])
-def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
     draw, comma, _ = request.param.partition(",")
-    made = Engine(ctx, stack.scene, stack.gdfs, draw, edit_pass="gpu" if comma else "cpu")
+    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw, edit_pass="gpu" if comma else "cpu")
     yield made
     made.release()
 
 
 @pytest.fixture(params=["cpu", "gpu"])
-def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
     """OpenGL, with what edits."""
-    made = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
+    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
     yield made
     made.release()
 
@@ -76,7 +76,7 @@ class Count:
 
 
 @pytest.mark.gl
-def test_the_picture_is_the_composed_scene_drawn(engine: Engine, stack: Stack) -> None:
+def test_the_picture_is_the_composed_scene_drawn(engine: ViewEngine, stack: Stack) -> None:
     view = view_of(stack, 0.7, 0.4)
     layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
     expected = render(compose_layers(stack.scene, layers), to_camera(view.camera, *SIZE)).numpy()
@@ -87,7 +87,7 @@ def test_the_picture_is_the_composed_scene_drawn(engine: Engine, stack: Stack) -
 
 
 @pytest.mark.gl
-def test_strength_zero_is_the_original_bit_for_bit(engine: Engine, stack: Stack) -> None:
+def test_strength_zero_is_the_original_bit_for_bit(engine: ViewEngine, stack: Stack) -> None:
     original = engine.image(replace(view_of(stack), layers=()), SIZE).copy()
     engine.image(view_of(stack, 0.8, 1.0), SIZE)
     assert np.array_equal(engine.image(view_of(stack), SIZE), original)
@@ -101,19 +101,19 @@ def test_strength_zero_is_the_original_bit_for_bit(engine: Engine, stack: Stack)
     )
 )
 def test_the_picture_does_not_depend_on_the_way_to_it(
-    gl_engine: Engine, ctx: moderngl.Context, stack: Stack, path: list[tuple[float, float]]
+    gl_engine: ViewEngine, ctx: moderngl.Context, stack: Stack, path: list[tuple[float, float]]
 ) -> None:
     for scarf, ears in path:
         gl_engine.image(view_of(stack, scarf, ears), SIZE)
     there = gl_engine.image(view_of(stack, 0.3, 0.6), SIZE).copy()
-    fresh = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=gl_engine.edits_with)
+    fresh = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=gl_engine.edits_with)
     assert np.array_equal(there, fresh.image(view_of(stack, 0.3, 0.6), SIZE))
     fresh.release()
 
 
 @pytest.mark.gl
 def test_both_ways_to_draw_give_the_same_picture(ctx: moderngl.Context, stack: Stack) -> None:
-    by_gl, by_cpu = (Engine(ctx, stack.scene, stack.gdfs, draw=draw) for draw in ("gl", "cpu"))
+    by_gl, by_cpu = (ViewEngine(ctx, stack.scene, stack.gdfs, draw=draw) for draw in ("gl", "cpu"))
     for view in (view_of(stack, 1.0, 0.0), view_of(stack, 0.0, 0.5), view_of(stack, 0.2, 1.0)):
         difference = np.abs(by_gl.image(view, SIZE) - by_cpu.image(view, SIZE))
         assert float(difference.max()) <= 0.0101
@@ -128,7 +128,7 @@ def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
     ctx: moderngl.Context, stack: Stack, blend: str
 ) -> None:
     by_gpu, by_cpu = (
-        Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=where) for where in ("gpu", "cpu")
+        ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=where) for where in ("gpu", "cpu")
     )
     assert (by_gpu.edits_with, by_cpu.edits_with) == ("gpu", "cpu")
     weights = np.linspace(0.0, 1.0, len(stack.gdfs[EARS].region), dtype=np.float32)
@@ -151,7 +151,7 @@ def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
 
 @pytest.mark.gl
 def test_beside_the_edit_pass_the_cpu_composes_means_only(ctx: moderngl.Context, stack: Stack) -> None:
-    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
     assert isinstance(engine._editing, GpuEditing)
     engine.image(view_of(stack, 0.4, 0.4), SIZE)
     engine.image(view_of(stack, 0.7, 0.7), SIZE)
@@ -166,7 +166,7 @@ def test_beside_the_edit_pass_the_cpu_composes_means_only(ctx: moderngl.Context,
 def test_the_error_is_measured_once_for_every_stack(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
     measured = Count(monkeypatch, engine._editing, "error")
     for strength, calls in ((0.4, 1), (0.4, 1), (0.5, 2)):
         engine.image(view_of(stack, strength), SIZE)
@@ -180,12 +180,12 @@ def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
-    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
     assert engine.edits_with == "cpu"
     found = engine.edits()
     assert found is not None
     assert "too large" in found.obstacle
-    expected = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="cpu")
+    expected = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="cpu")
     view = view_of(stack, 0.6, 0.6)
     assert np.array_equal(engine.image(view, SIZE), expected.image(view, SIZE))
     engine.release()
@@ -194,17 +194,19 @@ def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why
 
 @pytest.mark.gl
 def test_the_edit_pass_is_left_to_hardware_and_needs_opengl(ctx: moderngl.Context, stack: Stack) -> None:
-    engine = Engine(ctx, stack.scene, stack.gdfs, draw="gl")
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
     assert engine.edits_with == ("cpu" if is_software(ctx) else "gpu")
     engine.release()
     with pytest.raises(ProgdfError, match="the CPU draws here, so the GPU cannot edit"):
-        Engine(ctx, stack.scene, stack.gdfs, draw="cpu", edit_pass="gpu")
+        ViewEngine(ctx, stack.scene, stack.gdfs, draw="cpu", edit_pass="gpu")
     with pytest.raises(ValueError, match="edit_pass is 'fast'"):
-        Engine(ctx, stack.scene, draw="gl", edit_pass="fast")
+        ViewEngine(ctx, stack.scene, draw="gl", edit_pass="fast")
 
 
 @pytest.mark.gl
-def test_the_same_state_draws_nothing(engine: Engine, stack: Stack, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_state_draws_nothing(
+    engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     view = view_of(stack, 0.5)
     assert engine.needs_draw(view, SIZE)
     engine.image(view, SIZE)
@@ -216,7 +218,7 @@ def test_the_same_state_draws_nothing(engine: Engine, stack: Stack, monkeypatch:
 
 
 @pytest.mark.gl
-def test_whatever_changes_the_picture_needs_a_draw(engine: Engine, stack: Stack) -> None:
+def test_whatever_changes_the_picture_needs_a_draw(engine: ViewEngine, stack: Stack) -> None:
     view = view_of(stack, 0.5, 0.5)
     engine.image(view, SIZE)
     turned = replace(view, camera=replace(view.camera, azimuth=3.0))
@@ -231,7 +233,7 @@ def test_whatever_changes_the_picture_needs_a_draw(engine: Engine, stack: Stack)
 
 
 @pytest.mark.gl
-def test_a_layer_that_is_off_or_at_zero_causes_no_work_at_all(engine: Engine, stack: Stack) -> None:
+def test_a_layer_that_is_off_or_at_zero_causes_no_work_at_all(engine: ViewEngine, stack: Stack) -> None:
     engine.image(view_of(stack, 0.5, 0.0), SIZE)
     view = view_of(stack, 0.5, 0.0)
     assert not engine.needs_draw(replace(view, layers=(view.layers[0],)), SIZE)
@@ -242,7 +244,7 @@ def test_a_layer_that_is_off_or_at_zero_causes_no_work_at_all(engine: Engine, st
 
 @pytest.mark.gl
 def test_a_camera_move_composes_nothing(
-    engine: Engine, stack: Stack, monkeypatch: pytest.MonkeyPatch
+    engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     view = view_of(stack, 0.5)
     engine.image(view, SIZE)
@@ -256,7 +258,7 @@ def test_a_camera_move_composes_nothing(
 
 @pytest.mark.gl
 def test_a_change_of_colour_sorts_nothing_and_a_change_of_place_does(
-    gl_engine: Engine, stack: Stack, monkeypatch: pytest.MonkeyPatch
+    gl_engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gl_engine.image(view_of(stack), SIZE)
     sorts = Count(monkeypatch, engine_module, "back_to_front")
@@ -267,7 +269,7 @@ def test_a_change_of_colour_sorts_nothing_and_a_change_of_place_does(
 
 
 @pytest.mark.gl
-def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: Engine, stack: Stack) -> None:
+def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: ViewEngine, stack: Stack) -> None:
     """The order on the GPU is that of the means on the GPU, in every frame of a drag."""
     for ears in (0.0, 0.3, 0.7, 1.0):
         view = view_of(stack, ears=ears)
@@ -278,14 +280,14 @@ def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: Engine, stack
 
 
 @pytest.mark.gl
-def test_only_members_of_the_moved_layer_are_composed(engine: Engine, stack: Stack) -> None:
+def test_only_members_of_the_moved_layer_are_composed(engine: ViewEngine, stack: Stack) -> None:
     engine.image(view_of(stack, 0.2, 0.5), SIZE)
     engine.image(view_of(stack, 0.3, 0.5), SIZE)
     assert engine.timings.changed == len(stack.gdfs[SCARF].region)
 
 
 @pytest.mark.gl
-def test_a_state_that_means_nothing_leaves_the_last_picture(engine: Engine, stack: Stack) -> None:
+def test_a_state_that_means_nothing_leaves_the_last_picture(engine: ViewEngine, stack: Stack) -> None:
     good = engine.image(view_of(stack, 0.4, 0.4), SIZE).copy()
     for broken in (
         replace(view_of(stack), layers=(LayerState(7, "gone", 0.5),)),
@@ -300,7 +302,7 @@ def test_a_state_that_means_nothing_leaves_the_last_picture(engine: Engine, stac
 
 @pytest.mark.gl
 def test_a_window_gets_the_picture_upright_in_its_lower_left_corner(
-    engine: Engine, ctx: moderngl.Context, stack: Stack
+    engine: ViewEngine, ctx: moderngl.Context, stack: Stack
 ) -> None:
     screen = ctx.framebuffer([ctx.texture((120, 100), 4)])
     screen.clear(0.0, 1.0, 0.0)
@@ -315,30 +317,30 @@ def test_a_window_gets_the_picture_upright_in_its_lower_left_corner(
 
 
 def test_an_engine_without_a_context_draws_on_the_cpu(stack: Stack) -> None:
-    engine = Engine(None, stack.scene, stack.gdfs)
+    engine = ViewEngine(None, stack.scene, stack.gdfs)
     assert engine.draws_with == "cpu"
     assert engine.image(view_of(stack, 1.0), SIZE).shape == (72, 96, 3)
     with pytest.raises(ValueError, match="needs a context"):
-        Engine(None, stack.scene, draw="gl")
+        ViewEngine(None, stack.scene, draw="gl")
 
 
 @pytest.mark.gl
 def test_software_opengl_is_left_to_the_cpu_rasteriser(ctx: moderngl.Context, stack: Stack) -> None:
-    engine = Engine(ctx, stack.scene, stack.gdfs)
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs)
     assert engine.draws_with == ("cpu" if is_software(ctx) else "gl")
     engine.release()
 
 
 def test_an_edit_of_another_scene_is_refused(stack: Stack) -> None:
     with pytest.raises(ProgdfError, match="another scene"):
-        Engine(None, stack.scene[:100], stack.gdfs)
+        ViewEngine(None, stack.scene[:100], stack.gdfs)
 
 
 @pytest.mark.gl
 def test_a_scene_without_gaussians_is_its_background(
-    engine: Engine, ctx: moderngl.Context, stack: Stack
+    engine: ViewEngine, ctx: moderngl.Context, stack: Stack
 ) -> None:
-    empty = Engine(ctx, stack.scene[:0], draw=engine.draws_with)
+    empty = ViewEngine(ctx, stack.scene[:0], draw=engine.draws_with)
     image = empty.image(ViewState(background=(0.2, 0.4, 0.6)), (8, 4))
     assert np.allclose(image, (0.2, 0.4, 0.6))
     empty.release()
@@ -348,7 +350,7 @@ def test_a_scene_without_gaussians_is_its_background(
 def test_engines_that_come_and_go_leave_no_gl_error(ctx: moderngl.Context, stack: Stack) -> None:
     assert ctx.error in ("GL_NO_ERROR", "GL_INVALID_OPERATION"), "asking clears what other tests left"
     for draw in ("gl", "cpu", "gl"):
-        engine = Engine(ctx, stack.scene, stack.gdfs, draw=draw)
+        engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw=draw)
         engine.image(view_of(stack, 0.5, 0.5), SIZE)
         engine.image(view_of(stack, 0.5, 0.5), (SIZE[1], SIZE[0]))
         engine.release()

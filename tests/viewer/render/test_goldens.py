@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.stacks import Stack, bear_stack, view_of
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context, is_software
 
 Compare = Callable[[str, np.ndarray], None]
@@ -28,9 +28,9 @@ def ctx() -> Iterator[moderngl.Context]:
 
 
 @pytest.fixture(params=["cpu", "gpu"])
-def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[Engine]:
+def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
     """OpenGL, with what edits."""
-    made = Engine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
+    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
     yield made
     made.release()
 
@@ -52,7 +52,7 @@ def test_the_goldens_are_compared_on_a_software_renderer(ctx: moderngl.Context) 
 @pytest.mark.usefixtures("software_gpu")
 @pytest.mark.parametrize("strength", [0.0, 0.5, 1.0])
 def test_the_bear_looks_as_it_did(
-    gl_engine: Engine, stack: Stack, screenshot: Compare, strength: float
+    gl_engine: ViewEngine, stack: Stack, screenshot: Compare, strength: float
 ) -> None:
     screenshot(f"scene_bear_{strength:g}", gl_engine.image(view_of(stack, strength, strength), (240, 180)))
 
@@ -60,7 +60,7 @@ def test_the_bear_looks_as_it_did(
 @pytest.mark.gl
 @pytest.mark.usefixtures("software_gpu")
 def test_a_wrong_golden_is_noticed(
-    gl_engine: Engine, stack: Stack, screenshot: Compare, request: pytest.FixtureRequest
+    gl_engine: ViewEngine, stack: Stack, screenshot: Compare, request: pytest.FixtureRequest
 ) -> None:
     """scene_wrong.png is scene_bear_1.png with one square 4/255 too bright."""
     if request.config.getoption("--regenerate-screenshots"):

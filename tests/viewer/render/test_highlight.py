@@ -15,7 +15,7 @@ from progdf.sh import C0
 from tests.helpers.stacks import Stack
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.render import highlight
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.highlight import Highlight
 from viewer.state import paint
@@ -42,7 +42,7 @@ def view(strength: float = 1.0, painted: str = paint.FULL) -> ViewState:
     return replace(made, layers=(replace(made.layers[0], paint=painted), *made.layers[1:]))
 
 
-def shown(engine: Engine, state: ViewState, ctx: moderngl.Context) -> np.ndarray:
+def shown(engine: ViewEngine, state: ViewState, ctx: moderngl.Context) -> np.ndarray:
     """What `draw` brings on a screen. [H,W,3]"""
     screen = ctx.framebuffer([ctx.texture(SIZE, 4, dtype="f4")])
     engine.draw(state, screen, SIZE)
@@ -73,8 +73,8 @@ def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colours() -> None:
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
 def test_what_is_shown_is_the_scene_with_mixed_colours(ctx: moderngl.Context, draw: str) -> None:
     shade = Highlight(SCARF, half_painted())
-    engine = Engine(ctx, bear().scene, bear().gdfs, draw)
-    plain = Engine(ctx, highlighted(engine.gaussians(view(1.0, shade.paint)), shade), (), draw)
+    engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
+    plain = ViewEngine(ctx, highlighted(engine.gaussians(view(1.0, shade.paint)), shade), (), draw)
     expected = shown(plain, replace(view(), layers=()), ctx)
     before = shown(engine, view(1.0, shade.paint), ctx)
     engine.highlight = shade
@@ -92,7 +92,7 @@ def test_what_is_shown_is_the_scene_with_mixed_colours(ctx: moderngl.Context, dr
 def test_both_ways_of_drawing_show_the_same_weights(ctx: moderngl.Context) -> None:
     images = []
     for draw in ("cpu", "gl"):
-        engine = Engine(ctx, bear().scene, bear().gdfs, draw)
+        engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
         engine.highlight = Highlight(SCARF, half_painted())
         images.append(shown(engine, view(0.7), ctx))
         engine.release()
@@ -102,7 +102,7 @@ def test_both_ways_of_drawing_show_the_same_weights(ctx: moderngl.Context) -> No
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
 def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.Context, draw: str) -> None:
-    engine = Engine(ctx, bear().scene, bear().gdfs, draw)
+    engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
     clean = shown(engine, view(0.6), ctx).copy()
     rng = np.random.default_rng(1)
     weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
@@ -112,11 +112,11 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
         engine.highlight = Highlight(step % 5 == 4, painted if step % 5 < 4 else paint.FULL)
         state = view(float(rng.choice([0.0, 0.3, 1.0])), painted)
         found = shown(engine, state, ctx)
-        fresh = Engine(ctx, bear().scene, bear().gdfs, draw)
+        fresh = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
         fresh.highlight = engine.highlight
         assert np.array_equal(found, shown(fresh, state, ctx)), step
         assert np.array_equal(
-            engine.image(state, SIZE), Engine(ctx, bear().scene, bear().gdfs, draw).image(state, SIZE)
+            engine.image(state, SIZE), ViewEngine(ctx, bear().scene, bear().gdfs, draw).image(state, SIZE)
         )
     engine.highlight = None
     assert np.array_equal(shown(engine, view(0.6), ctx), clean)
@@ -124,7 +124,7 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
 
 @pytest.mark.gl
 def test_a_stroke_draws_only_the_part_of_the_picture_that_it_touched(ctx: moderngl.Context) -> None:
-    engine = Engine(ctx, bear().scene, bear().gdfs, "cpu")
+    engine = ViewEngine(ctx, bear().scene, bear().gdfs, "cpu")
     weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
     engine.highlight = Highlight(SCARF, paint.encode(weights))
     shown(engine, view(0.0), ctx)

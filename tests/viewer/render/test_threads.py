@@ -30,7 +30,7 @@ def test_a_command_draws_on_one_thread_and_reads_edits_on_all(
 
     monkeypatch.setattr(threads, "_MOST", 3)
     monkeypatch.setattr(document, "load_gdf", reading)
-    monkeypatch.setattr(render.Engine, "image", drawing)
+    monkeypatch.setattr(render.ViewEngine, "image", drawing)
     before = torch.get_num_threads()
     scene, edit, *_ = bear().save(tmp_path)
     with pytest.raises(KeyboardInterrupt):

@@ -24,7 +24,7 @@ from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.stacks import recording_of
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.pictures import compare_labels
-from viewer.render.engine import Engine
+from viewer.render.engine import ViewEngine
 from viewer.state import comparison as compare
 from viewer.state import recordings
 from viewer.state.recordings import RecordingFile
@@ -48,7 +48,7 @@ def drawn(view: ViewState, recorded: tuple[bool, bool]) -> np.ndarray:
         replace(gdf, field=recordings.recorded_field(recording_of(gdf))) if kept else gdf
         for gdf, kept in zip(bear().gdfs, recorded, strict=True)
     ]
-    return Engine(None, bear().scene, gdfs, "cpu").image(replace(view, compare=Comparison()), SIZE)
+    return ViewEngine(None, bear().scene, gdfs, "cpu").image(replace(view, compare=Comparison()), SIZE)
 
 
 @pytest.fixture
