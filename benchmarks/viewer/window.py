@@ -28,7 +28,7 @@ from .scenes import edit_for, scenes_of
 
 IDLE_S, DRAG_S = 10.0, 60.0
 MEMBERS = 3_000
-_SETTLED_S, _LONGEST_S = 1.5, 60.0
+SETTLED_S, _LONGEST_S = 1.5, 60.0
 _SWEEP = 40
 """Steps of the mouse from one end of the slider to the other; one about every 1/60 s."""
 
@@ -164,7 +164,7 @@ def _rested(opened: Opened, state: str, wall_s: float) -> Idle:
     end, before = time.monotonic() + _LONGEST_S, -1.0
     while (now := opened.processor_s()) != before and time.monotonic() < end:
         before = now
-        time.sleep(_SETTLED_S)
+        time.sleep(SETTLED_S)
     used, began = opened.processor_s(), time.monotonic()
     time.sleep(wall_s)
     return Idle(state, opened.processor_s() - used, time.monotonic() - began)

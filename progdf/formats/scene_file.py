@@ -44,7 +44,7 @@ SOG_META = "meta.json"
 """The file that stands for an unpacked .sog: its folder's table of images."""
 
 _MOST_META = 64_000_000
-_MEMORY, _OUTPUT, _SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
+_MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
 """What a reader of another's making gets: so much, and so much for each byte of its file."""
 
 
@@ -164,7 +164,7 @@ def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
     if importlib.util.find_spec("gaussforge") is None:
         raise ProgdfError(f"{path}: .{kind} needs the package gaussforge; pip install progdf-studio[formats]")
     size = _size(path)
-    memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, _SECONDS))
+    memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         target = Path(folder) / "scene.ply"
         words = [kind, str(path.resolve()), str(target), *map(str, (memory, output, seconds))]

@@ -19,13 +19,13 @@ from benchmarks.viewer.scenes import copies, edit_for, scenes_of
 from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.window import Dragging, Idle
 from progdf.camera import Camera
-from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
+from tests.helpers.demo_scenes import bear
 from viewer.camera.view_camera import bounds_of, first_camera
+from viewer.render import engine
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
-from viewer.render.timings import FrameTimings
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (160, 400)
@@ -101,14 +101,16 @@ def test_a_frame_in_the_order_of_the_last_one_is_found(
 ) -> None:
     path = tmp_path / "bear.ply"
     save_ply(path, bear(600).gaussians)
-    draw = ViewEngine._update_picture
+    sort, last = engine.back_to_front, dict[int, Any]()
 
-    def stale(engine: ViewEngine, view: ViewState, camera: Camera, *others: Any) -> FrameTimings:
-        if engine._ordered_for is not None:
-            engine._ordered_for = camera.viewmat.numpy().tobytes()
-        return draw(engine, view, camera, *others)
+    def stale(means: Any, camera: Camera, near: float) -> Any:
+        """What was right for the engine's picture before."""
+        order = sort(means, camera, near)
+        before = last.setdefault(means.ctypes.data, order)
+        last[means.ctypes.data] = order
+        return before if len(before) == len(order) else order
 
-    monkeypatch.setattr(ViewEngine, "_update_picture", stale)
+    monkeypatch.setattr(engine, "back_to_front", stale)
     ctx = headless_context()
     turnings = bench_frames.measure_turning(ctx, path, steps=2, size=SIZE)
     ctx.release()
@@ -120,9 +122,9 @@ def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
     scene = bear(600).gaussians
     gdf = edit_for(scene, 50, moves=False)
     ctx = headless_context()
-    engine = ViewEngine(ctx, scene, [gdf], "cpu")
+    drawn_by = ViewEngine(ctx, scene, [gdf], "cpu")
     view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.3),), draft="off")
-    with Mouse(ctx, engine, scene, [gdf], view, SIZE) as mouse:
+    with Mouse(ctx, drawn_by, scene, [gdf], view, SIZE) as mouse:
         mouse.grip_slider()
         assert mouse.main_view.work.view.layers[0].strength == pytest.approx(0.3)
         mouse.turn(24.2)
@@ -134,7 +136,7 @@ def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
         mouse.release()
         assert mouse.main_view.work.view.camera.azimuth == pytest.approx(view.camera.azimuth - 3.0)
         assert mouse.picture().shape == (*SIZE[::-1], 3)
-    engine.release()
+    drawn_by.release()
     ctx.release()
 
 
@@ -177,7 +179,7 @@ def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
 ) -> None:
     if not (shutil.which("Xvfb") and shutil.which("xdotool")):
         pytest.skip("Xvfb and xdotool are not installed")
-    monkeypatch.setattr(bench_window, "_SETTLED_S", 0.2)
+    monkeypatch.setattr(bench_window, "SETTLED_S", 0.2)
     scene = bear(600).gaussians
     resting = bench_window.idle(scene, wall_s=0.2)
     assert len(resting) == 2
@@ -214,7 +216,8 @@ def test_what_cannot_be_measured_here_is_said_and_left_out_unless_it_was_named(
     def refuse(**_: object) -> list[Table]:
         raise ProgdfError("nothing here; something there")
 
-    monkeypatch.setattr(front, "_function", lambda _: refuse)
+    monkeypatch.setattr(front, "BENCHES", {"window": front.BENCHES["window"]})
+    monkeypatch.setattr(bench_window, "tables", refuse)
     assert front.main([]) == 0
     assert "window is not measured: nothing here" in capsys.readouterr().err
     with pytest.raises(ProgdfError, match="nothing here"):

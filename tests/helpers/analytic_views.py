@@ -18,13 +18,13 @@ import numpy as np
 import torch
 import tyro
 
-from progdf.demo_scenes import bear
 from progdf.demo_scenes.edits import AnalyticEdit, bear_edits, scale_edit
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.images import write_image
 from progdf.rasterize import render
 from progdf.scene.region_spec import parse_region
+from tests.helpers.demo_scenes import bear
 from tests.helpers.paths import SHARED_DATA
 from trainer.option_checks import resolve_options
 from trainer.options import TrainOptions

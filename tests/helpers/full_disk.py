@@ -1,10 +1,17 @@
-"""A disk that takes no more, for tests of what is written."""
+"""Disks that take no more or nothing at all, for tests of what is written."""
 
 from __future__ import annotations
 
+import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from progdf.io.atomic import is_temporary
 
 
 @contextmanager
@@ -16,3 +23,15 @@ def files_up_to(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def refuse_temporary_files(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    """The system refuses to make any file for `atomic_write`, for a reason of `errno`."""
+    system_open = os.open
+
+    def refuse(path: Any, flags: int, *more: Any, **named: Any) -> int:
+        if flags & os.O_CREAT and is_temporary(Path(path).name):
+            raise OSError(code, os.strerror(code), str(path))
+        return system_open(path, flags, *more, **named)
+
+    monkeypatch.setattr(os, "open", refuse)

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes import DemoScene, bear
+from progdf.demo_scenes import DemoScene
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.field.trajectory import FILE_NAME, Trajectory, save_trajectory
 from progdf.formats.ply import save_ply
@@ -16,6 +16,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
+from tests.helpers.demo_scenes import bear
 from viewer.camera.view_camera import first_camera
 from viewer.state.view_state import LayerState, ViewState
 

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.demo_scenes import bear
+from progdf.demo_scenes.bear_parts import LABELS
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
+from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
 from trainer.optimize.losses import GradientL1
 from trainer.optimize.objective import LossWeights, Objective
@@ -76,7 +77,7 @@ def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:
 
 def quick_options(folder: Path, out: str = "run", part: str = "body", **more: object) -> TrainOptions:
     """Options of a run that takes a few seconds on the bear of `write_bear` in `folder`."""
-    number = bear(400).label_names.index(part)
+    number = LABELS.index(part)
     settings: dict[str, object] = {
         "scene": folder / "scene.ply",
         "out": folder / out,

@@ -40,7 +40,7 @@ class FileActions:
 
     def __init__(self, app: Application, path: Path | None = None, memory: Path | None = None) -> None:
         self._app, self.path, self._memory = app, path, memory
-        self._autosave = SessionAutosave()
+        self.session_autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
         self._browser = native.Browser()
         self._edits = EditActions(app)
@@ -115,7 +115,7 @@ class FileActions:
         if path != self.path and path.is_file() and kind_of(path) != "session":
             raise ProgdfError(f"{path} is not a session; choose another name")
         self._write(path)
-        self._autosave.drop()
+        self.session_autosave.drop()
         self.path = path
         main_view = self._app.main_view
         main_view.work = workspace.mark_saved(main_view.work)
@@ -132,21 +132,21 @@ class FileActions:
             Seconds until it has to be called again; None if nothing waits.
         """
         if not self.has_unsaved:
-            self._autosave.stop()
+            self.session_autosave.stop()
             return None
-        kept, before = workspace.worth_saving(self._app.main_view.work), self._autosave.path
+        kept, before = workspace.worth_saving(self._app.main_view.work), self.session_autosave.path
         try:
-            wait = self._autosave.wait(now, kept, self._autosave_base, self._write)
+            wait = self.session_autosave.wait(now, kept, self._autosave_base, self._write)
         except (ProgdfError, OSError) as error:
             self._app.main_view.show_message(f"Autosave failed: {error}", error=True)
             return None
-        if self._autosave.path is not None and self._autosave.path != before:
-            self._app.main_view.recent = self._remember(self._autosave.path)
+        if self.session_autosave.path is not None and self.session_autosave.path != before:
+            self._app.main_view.recent = self._remember(self.session_autosave.path)
         return wait or None
 
     def on_close(self) -> None:
         """The window closes, and nothing is lost: the autosave has done its work."""
-        self._autosave.drop()
+        self.session_autosave.drop()
 
     def release(self) -> None:
         """Take away what of the desktop's is still on screen."""
@@ -172,7 +172,7 @@ class FileActions:
 
     def _open_session(self, path: Path) -> None:
         opened = session.open_session(path)
-        self._autosave.drop()
+        self.session_autosave.drop()
         self._app.show(opened.document)
         main_view = self._app.main_view
         main_view.restart(opened.view, opened.snapshots)
@@ -186,7 +186,7 @@ class FileActions:
         # what was never saved, or was discarded, never takes the place of a session unasked
         self.path = beside if beside.is_file() and not discarded else None
         if not discarded:
-            self._autosave.continue_from(path)
+            self.session_autosave.continue_from(path)
             main_view.show_message(f"Restored the unsaved work of {beside.name}")
 
     def offer_autosave(self) -> None:
@@ -194,7 +194,7 @@ class FileActions:
         if self._app.document.path is None:
             return
         found = autosaves.find_autosaves(self._session_name(), numbered=self.path is None)
-        left = [path for path in found if path != self._autosave.path and path not in self._put_off]
+        left = [path for path in found if path != self.session_autosave.path and path not in self._put_off]
         if left:
             self._put_off.add(left[0])  # if it is not decided now
             self._app.main_view.recent = self._remember(*reversed(left))
@@ -203,7 +203,7 @@ class FileActions:
     def _discard(self) -> None:
         """Unsaved work is given up; its autosave stays under another name."""
         self._app.main_view.work = workspace.mark_saved(self._app.main_view.work)
-        aside = self._autosave.discard()
+        aside = self.session_autosave.discard()
         if aside is not None:
             self._app.main_view.recent = self._remember(aside)
 
@@ -215,7 +215,7 @@ class FileActions:
 
     def _open_scene(self, path: Path) -> None:
         opened = documents.load(path)
-        self._autosave.drop()
+        self.session_autosave.drop()
         self._app.show(opened)
         self.path = None
         main_view = self._app.main_view
@@ -287,7 +287,7 @@ class FileActions:
 
     def _autosave_base(self) -> Path:
         """The session's file; where it never had one, a name that nothing has."""
-        return self.path or autosaves.free_session(self._session_name(), self._autosave.path)
+        return self.path or autosaves.free_session(self._session_name(), self.session_autosave.path)
 
     def _remember(self, *paths: Path) -> tuple[Path, ...]:
         if not paths:

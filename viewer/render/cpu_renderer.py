@@ -33,7 +33,7 @@ members of 125 000 Gaussians: 41 ms a step, 35 without)."""
 WORTH_DRAWING_APART = 0.8
 """Share of the picture beyond which all of it is drawn."""
 
-_FLOOR, _PIXELS_PER_GAUSSIAN = 4096, 1 / 3
+CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
 """Pixels that take as long as another call of the rasteriser, and as its look at one more Gaussian."""
 
 
@@ -126,7 +126,7 @@ class CpuRenderer:
         crops = [(0, 0, camera.width, camera.height)]
         kept = self._kept if self._kept is not None and self._kept.shows(camera, background) else None
         if kept is not None and self._cells is not None:
-            worth = _FLOOR + int(_PIXELS_PER_GAUSSIAN * len(self._means))
+            worth = CALL_PIXELS + int(GAUSSIAN_PIXELS * len(self._means))
             crops = dirty_rectangles(self._cells, (camera.width, camera.height), worth)
         share = area(crops) / whole
         if kept is None or share > WORTH_DRAWING_APART:

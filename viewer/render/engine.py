@@ -99,7 +99,8 @@ class ViewEngine:
         self.near = near_plane(bounds_of(scene).radius)
         """Depth at and below which nothing is drawn, world units."""
         self._edits = _Edits()
-        self._order: NDArray[np.uint32] = np.zeros(0, np.uint32)
+        self.order: NDArray[np.uint32] = np.zeros(0, np.uint32)
+        """Rows from back to front, where the renderer wants them so."""
         self._ordered_for: bytes | None = None
         self._picture: _Picture | None = None
         self.highlight: Highlight | None = None
@@ -112,7 +113,7 @@ class ViewEngine:
         self._edit_obstacle = ""
         self._edit_error: float | None = None
         wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))
-        self._renderer, self._editing = self._create(wants_pass and self.draws_with == "gl")
+        self.renderer, self.editing = self._create(wants_pass and self.draws_with == "gl")
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
@@ -137,7 +138,7 @@ class ViewEngine:
         self.timings = self._update_picture(
             view, to_camera(view.camera, *drawn_size(size, pixels)), self.highlight
         )
-        self._renderer.show(framebuffer, size)
+        self.renderer.show(framebuffer, size)
         return self.timings
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
@@ -155,23 +156,23 @@ class ViewEngine:
             ProgdfError: a layer of `view` means nothing.
         """
         self.timings = self._update_picture(view, camera or to_camera(view.camera, *size))
-        return self._renderer.pixels()
+        return self.renderer.pixels()
 
     def gaussians(self, view: ViewState) -> Gaussians:
         """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
         edits = _edits(view)
         self._compose(edits)
-        return self._editing.gaussians(*self._stack(edits))
+        return self.editing.gaussians(*self._stack(edits))
 
     @property
     def edits_with(self) -> str:
         """What works out the attributes: "gpu" or "cpu"."""
-        return self._editing.where
+        return self.editing.where
 
     def edit_error(self) -> float:
         """How far the attributes that are drawn are from `progdf.compose`: see `EditsBy.error`."""
         if self._edit_error is None:
-            self._edit_error = self._editing.error(*self._stack(self._edits))
+            self._edit_error = self.editing.error(*self._stack(self._edits))
         return self._edit_error
 
     def edits(self) -> EditsBy | None:
@@ -183,12 +184,12 @@ class ViewEngine:
     def forget(self) -> None:
         """Draw the next picture as a whole, though only a part of the last one has changed."""
         self._picture = None
-        self._renderer.forget()
+        self.renderer.forget()
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
-        self._editing.release()
-        self._renderer.release()
+        self.editing.release()
+        self.renderer.release()
 
     def _create(self, wants_pass: bool) -> tuple[Renderer, Editing]:
         """The renderer with the scene in it, and what edits it there."""
@@ -224,11 +225,11 @@ class ViewEngine:
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
-        if self._renderer.wants_order and self._ordered_for != wanted.viewmat:
-            self._order = back_to_front(self._editing.means, camera, self.near)
+        if self.renderer.wants_order and self._ordered_for != wanted.viewmat:
+            self.order = back_to_front(self.editing.means, camera, self.near)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
-        share = self._renderer.draw(camera, view.background, self._order)
+        share = self.renderer.draw(camera, view.background, self.order)
         drawn_at = time.perf_counter()
         self._picture = wanted
         return FrameTimings(
@@ -237,7 +238,7 @@ class ViewEngine:
             1e3 * (sorted_at - started),
             1e3 * (drawn_at - sorted_at),
             changed,
-            len(self._order) if self._renderer.wants_order else len(self.scene),
+            len(self.order) if self.renderer.wants_order else len(self.scene),
             share,
         )
 
@@ -248,7 +249,7 @@ class ViewEngine:
         started = time.perf_counter()
         stack = self._stack(edits)
         unpacked_ms = 1e3 * (time.perf_counter() - started)
-        step = self._editing.update(*stack)
+        step = self.editing.update(*stack)
         self._edits, self._picture, self._edit_error = edits, None, None
         if step.moved:
             self._ordered_for = None
@@ -262,13 +263,13 @@ class ViewEngine:
         if self._highlighted is not None and (highlight is None or highlight.gdf != self._highlighted[0].gdf):
             last, shown = self._highlighted
             self._highlighted = None
-            self._renderer.highlight(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
+            self.renderer.highlight(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
         if highlight is not None:
             members = self._gdf(highlight.gdf).region.members.numpy()
             new = highlight_colors(highlight, self.gdfs)
             others = slice(None) if self._highlighted is None else (new != self._highlighted[1]).any(1)
             self._highlighted = highlight, new
-            self._renderer.highlight(members[others], new[others])
+            self.renderer.highlight(members[others], new[others])
         return 1e3 * (time.perf_counter() - started)
 
     def _stack(self, edits: _Edits) -> tuple[Stack, str]:

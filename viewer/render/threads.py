@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import torch
 
-_MOST = torch.get_num_threads()
+MOST_THREADS = torch.get_num_threads()
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def one_thread() -> Iterator[None]:
 @contextmanager
 def all_threads() -> Iterator[None]:
     """Let torch work on as many threads as when the program began: for networks that are baked."""
-    with _threads(_MOST):
+    with _threads(MOST_THREADS):
         yield
 
 

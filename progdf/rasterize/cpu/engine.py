@@ -38,7 +38,7 @@ MOST_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 _LEAST_TILES = 4  # fewer are not worth a call
-_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
+TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
 _ALL = np.empty(0, np.bool_)
 
 
@@ -145,7 +145,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
 
     def project_and_find(begin: int, end: int) -> Array:
         project(begin, end, scene, camera, splats, np.empty(16))
-        return find(begin, end, _ROOM * (end - begin))
+        return find(begin, end, TILE_ROOM * (end - begin))
 
     tiles = np.concatenate(_share_gaussians(project_and_find, n))
     total = int(counts.sum(dtype=np.int64))

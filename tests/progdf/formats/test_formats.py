@@ -194,7 +194,7 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
     path = write_scene(tmp_path / "a.splat", scene_of())
     script = tmp_path / "child.py"
     monkeypatch.setattr(gaussforge_child, "__file__", str(script))
-    monkeypatch.setattr(formats, "_SECONDS", (1, 0.0))
+    monkeypatch.setattr(formats, "SECONDS", (1, 0.0))
     for body, said in (
         ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
         ("import time; time.sleep(60)", "gave no answer in 2 s"),

@@ -279,7 +279,7 @@ def test_a_file_that_contradicts_itself_is_refused(
     assert "is inconsistent" in refusal(rewritten(saved, tmp_path, **changes))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_flipped_or_missing_bytes_give_the_same_edit_or_one_line(
     saved: Path, shirt: Gdf, tmp_path: Path, data: st.DataObject

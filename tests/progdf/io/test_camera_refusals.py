@@ -131,7 +131,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=JSON, kind=st.sampled_from(["inria", "nerfstudio", "ours"]), data=st.data())
 def test_any_value_in_any_place_loads_or_is_refused(
     content: object, kind: str, data: st.DataObject, tmp_path: Path

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from progdf.demo_scenes import bear, room
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.scene.subject import subject_rows
+from tests.helpers.demo_scenes import bear, room
 from tests.helpers.stacks import bear_stack
 from tests.helpers.ui_rig import first_view, rig
 from viewer.camera import controls

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.io.npy import open_npy
 from progdf.io.session import read_session, sha256
-from tests.helpers.full_disk import files_up_to
+from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.refused import refusal
 
 
@@ -121,10 +122,7 @@ def test_a_missing_folder_and_a_folder_in_place_of_a_file_are_one_line(tmp_path:
 def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(temporary_file: Path, _: int | None) -> None:
-        raise PermissionError(13, "Permission denied", str(temporary_file))
-
-    monkeypatch.setattr("progdf.io.atomic._create", refused)
+    refuse_temporary_files(monkeypatch, errno.EACCES)
     path = tmp_path / "out.txt"
     with pytest.raises(ProgdfError) as told, atomic_write(path):
         pass

@@ -50,12 +50,17 @@ def test_a_caller_is_not_kept_waiting_by_a_pool_that_is_busy() -> None:
         busy.wait()
         release.wait(60)
 
-    holder = threading.Thread(target=run_chunks, args=(hold, 2))
+    holder = threading.Thread(target=run_chunks, args=(hold, 2), daemon=True)
+    caller = threading.Thread(target=lambda: found.extend(run_chunks(lambda n: n, 10)), daemon=True)
+    found: list[int] = []
     holder.start()
     busy.wait()  # the holder and, on a machine of two cores, the pool's only thread
-    assert run_chunks(lambda chunk: chunk, 10) == list(range(10))
+    caller.start()
+    caller.join(30)
+    in_time = list(found)
     release.set()
-    holder.join()
+    holder.join(30)
+    assert in_time == list(range(10))
 
 
 def test_an_error_in_any_thread_reaches_the_caller_when_all_are_done() -> None:

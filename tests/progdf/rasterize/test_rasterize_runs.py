@@ -29,7 +29,7 @@ def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_til
 
     scene, camera = random_gaussians(4000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
-    monkeypatch.setattr(engine, "_ROOM", room)
+    monkeypatch.setattr(engine, "TILE_ROOM", room)
     for threads in (1, 1, 2, 3, 7):
         set_threads(threads)
         again = draw(scene, camera, "cpu")
@@ -136,13 +136,12 @@ def test_a_cold_start_says_once_that_it_compiles(
     from progdf.rasterize.cpu import jit
 
     monkeypatch.setattr(jit, "kernel_cache", lambda: tmp_path)
-    monkeypatch.setattr(jit, "_ready", set())
     with caplog.at_level(logging.WARNING, logger="progdf"):
         for _ in range(2):
-            with jit.compilation("forward", 9):
+            with jit.compilation("test", 9):
                 pass
     assert [record.getMessage() for record in caplog.records] == [
-        "compiling the rasteriser's forward kernels (about 9 s, once per machine)"
+        "compiling the rasteriser's test kernels (about 9 s, once per machine)"
     ]
 
 

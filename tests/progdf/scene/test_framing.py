@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians, normalize_quats
 from progdf.rasterize.reference import rotation_matrices
 from progdf.scene.bounds import front_direction, is_surrounding, normals_of
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up
+from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import ball, random_gaussians
 
 Y_UP = torch.tensor([0.0, 1.0, 0.0])

@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes import DemoScene, bear, room
+from progdf.demo_scenes import DemoScene
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
 from progdf.scene.up_axis import guess_up
+from tests.helpers.demo_scenes import bear, room
 from tests.helpers.paths import SHARED_DATA
 from tests.helpers.scenes import random_gaussians
 from viewer.camera.view_camera import FILL, first_camera, fit, to_camera

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from progdf.__main__ import main
 from progdf.cli.options import parse_options
-from progdf.demo_scenes import bear, room
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import AXES, axis_direction, find_up, guess_up, up_from_json
+from tests.helpers.demo_scenes import bear, room
 from tests.helpers.scenes import ball, random_gaussians
 from tests.helpers.stacks import bear_stack
 from viewer.camera.view_camera import first_camera

@@ -20,7 +20,7 @@ from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options, write_bear
 from trainer.fit.memory_bank import JointTraining, MemoryBank
 from trainer.option_checks import check_network_options, resolve_options
-from trainer.options import FitOptions
+from trainer.options import FitOptions, TrainOptions
 from trainer.pipeline.refit import refit
 from trainer.pipeline.run import RunResult, train
 
@@ -31,7 +31,7 @@ def short_fits() -> Iterator[None]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(neural_fit, "EFFORT", {"tiny": (300, 256, 5e-3)})
+        patch.setattr(neural_fit, "EFFORT", {"tiny": (200, 256, 5e-3)})
         patch.setattr("trainer.fit.network.EFFORT", neural_fit.EFFORT)
         yield
     torch.set_num_threads(threads)
@@ -44,10 +44,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+def joint_options(folder: Path, out: str) -> TrainOptions:
+    settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "fit": "joint"}
+    return quick_options(folder, out, **settings)
+
+
 @pytest.fixture(scope="module")
 def alongside(folder: Path) -> RunResult:
     """A finished run whose network was trained beside the edit."""
-    return train(quick_options(folder, "joint", steps=60, stages=2, field="neural", fit="joint"), quiet=True)
+    return train(joint_options(folder, "joint"), quiet=True)
 
 
 # ---- the bank
@@ -140,10 +145,7 @@ def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
 def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
     folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = replace(
-        quick_options(folder, "again", steps=60, stages=2, field="neural", fit="joint", save_every=0.0),
-        name="joint",
-    )
+    options = replace(joint_options(folder, "again"), name="joint", save_every=0.0)
     step, steps = JointTraining.step, 0
 
     def interrupted(self: JointTraining) -> None:

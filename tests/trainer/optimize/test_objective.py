@@ -11,6 +11,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.gaussians import pack
 from progdf.metrics.lpips import Lpips
+from tests.helpers.count import Count
 from tests.helpers.trained import WHITE, small
 from trainer.editors import make_editor
 from trainer.optimize.losses import GradientL1, LpipsLoss, erode, l1, progressive_change, sharpness
@@ -244,16 +245,24 @@ def test_the_table_of_losses_has_a_gap_where_a_term_was_not_paid() -> None:
     assert table == {"step": [3, 7], "l1": [0.12346, 0.1], "perceptual": [None, 0.5]}
 
 
-def test_kept_features_have_a_bound_and_values_do_not_depend_on_it() -> None:
+def test_kept_features_have_a_bound_and_values_do_not_depend_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         network = Lpips.load()
     except ProgdfError as error:
         pytest.skip(str(error))
     pictures = [noise(40, 40, 3, seed=seed).float() for seed in range(4)]
-    roomy, tight = LpipsLoss(network), LpipsLoss(network, room=80_000)
-    for _ in range(2):
-        for key, target in enumerate(pictures[1:]):
-            assert float(roomy(pictures[0], target, key)) == float(tight(pictures[0], target, key))
     sizes = [sum(x.numel() * 4 for x in network.features(target)) for target in pictures[1:]]
-    assert sum(sizes) > 80_000 > sizes[0]
-    assert (len(tight._kept), len(roomy._kept)) == (2, 3)
+    assert sum(sizes) > 80_000 > sizes[0] + sizes[1]
+    roomy, tight = LpipsLoss(network), LpipsLoss(network, room=80_000)
+    features = Count(monkeypatch, Lpips, "features")
+
+    def distances(loss: LpipsLoss) -> tuple[list[float], int]:
+        """Of all targets, and of how many pictures features were computed."""
+        before = features.calls
+        values = [float(loss(pictures[0], target, key)) for key, target in enumerate(pictures[1:])]
+        return values, features.calls - before
+
+    expected, calls = distances(roomy)
+    assert distances(tight) == (expected, calls) == (expected, 6)
+    assert distances(roomy) == (expected, 3)
+    assert distances(tight) == (expected, 4), "one of the three targets found no room"

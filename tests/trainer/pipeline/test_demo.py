@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,15 +25,23 @@ from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.cameras import load_cameras
 from progdf.region import from_labels
 from progdf.scene.region_spec import parse_region
+from tests.helpers import demo_scenes
 from trainer.options import TrainOptions
 from trainer.pipeline import demo
 
 SIZE = 1500
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(autouse=True)
+def _made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    shows = demo_scenes.bear, demo_scenes.room
+    for (name, show), make in zip(demo.SHOWS.items(), shows, strict=True):
+        monkeypatch.setitem(demo.SHOWS, name, replace(show, make=make))
+
+
+@pytest.fixture
 def bear() -> scenes.DemoScene:
-    return scenes.bear(SIZE)
+    return demo_scenes.bear(SIZE)
 
 
 def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:

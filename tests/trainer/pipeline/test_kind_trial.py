@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes import bear
 from progdf.demo_scenes.edits import AnalyticEdit, bear_edits
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
+from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
 from trainer.options import TrainOptions

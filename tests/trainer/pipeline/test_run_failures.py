@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import errno
 import json
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ import trainer.optimize.pgs
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.io.tensors import read_tensors, write_tensors
-from tests.helpers.full_disk import files_up_to
+from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
 from trainer.pipeline.run import train
@@ -92,11 +92,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     OUT.mkdir()
-
-    def create(beside: Path, _: int | None) -> None:
-        raise OSError(30, os.strerror(30), str(beside))
-
-    monkeypatch.setattr("progdf.io.atomic._create", create)
+    refuse_temporary_files(monkeypatch, errno.EROFS)
     with pytest.raises(ProgdfError, match=r"run.log\.txt cannot be written \(Read-only file system\); "):
         train(small_run(bear_folder), quiet=True)
     with pytest.raises(ProgdfError, match="cannot be made"):

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from progdf.camera import NEAR
 from progdf.compose.reference import Layer, compose_layers
-from progdf.demo_scenes import bear
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import load_gdf
 from progdf.region import Region
 from progdf.scene.bounds import near_plane
+from tests.helpers.demo_scenes import bear
 from trainer.options import TrainOptions
 from trainer.pipeline.run import train
 from trainer.views.view import region_rig, render_view, with_near_plane

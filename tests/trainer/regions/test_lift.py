@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.demo_scenes import DemoScene, bear
+from progdf.demo_scenes import DemoScene
 from progdf.gaussians import Gaussians
 from progdf.scene.neighbors import nearest_rows
 from progdf.scene.orbit_rig import orbit_rig
+from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, random_gaussians
 from tests.helpers.trained import label_mask
 from trainer.regions import lift

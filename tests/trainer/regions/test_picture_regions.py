@@ -14,7 +14,6 @@ from PIL import Image
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
@@ -23,6 +22,7 @@ from progdf.lens import Lens
 from progdf.region import Region
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import parse_region
+from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, write_bear
 from trainer import segmenters

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from progdf.camera import Camera
-from progdf.demo_scenes import bear
 from progdf.region import Region
+from tests.helpers.demo_scenes import bear
 from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
 from trainer.setup.resolution import SIZES, choose_resolution
 from trainer.views.view import region_rig

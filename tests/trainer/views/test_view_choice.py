@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.demo_scenes import room
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.lens import Lens
 from progdf.region import from_mask
+from tests.helpers.demo_scenes import room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainOptions

@@ -203,7 +203,7 @@ def test_discarded_work_stays_under_another_name_the_last_three(
         window.file_actions.offer_autosave()
         assert window.main_view.work.dialog is None, "its own autosave is nothing that was left"
         window.file_actions.handle(f"discard_autosave:{left_over_now}")
-        window.file_actions._autosave = autosave.SessionAutosave()
+        window.file_actions.session_autosave = autosave.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
     assert len(kept) == autosave.MOST_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.demo_scenes import bear
+from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import random_gaussians
 from viewer.camera import controls
 from viewer.camera import view_camera as turntable

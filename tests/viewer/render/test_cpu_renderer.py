@@ -47,8 +47,8 @@ def ctx() -> Iterator[moderngl.Context]:
 @pytest.fixture(autouse=True)
 def _small_boxes_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     """As they would in a larger picture."""
-    monkeypatch.setattr(cpu_renderer, "_FLOOR", 64)
-    monkeypatch.setattr(cpu_renderer, "_PIXELS_PER_GAUSSIAN", 0.0)
+    monkeypatch.setattr(cpu_renderer, "CALL_PIXELS", 64)
+    monkeypatch.setattr(cpu_renderer, "GAUSSIAN_PIXELS", 0.0)
 
 
 def view_of(stack: Stack, *strengths: float) -> ViewState:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import moderngl
@@ -13,16 +13,19 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from progdf.compose.composer import Composer
 from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gdf.file import Gdf
 from progdf.rasterize import render
+from tests.helpers.count import Count
 from tests.helpers.stacks import EARS, SCARF, Stack, bear_stack, view_of
 from viewer.camera.view_camera import to_camera
 from viewer.gl import edit_pass
 from viewer.gl.screen import read_rgb
+from viewer.render import attribute_updates
 from viewer.render import engine as engine_module
-from viewer.render.attribute_updates import GpuEditing
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context, is_software
 from viewer.render.timings import FrameTimings
@@ -59,20 +62,6 @@ def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stac
     made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
     yield made
     made.release()
-
-
-class Count:
-    """A function in its place that counts its calls."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, target: object, name: str) -> None:
-        self.calls = 0
-        original = getattr(target, name)
-
-        def counted(*args: object, **kwargs: object) -> object:
-            self.calls += 1
-            return original(*args, **kwargs)
-
-        monkeypatch.setattr(target, name, counted)
 
 
 @pytest.mark.gl
@@ -150,15 +139,22 @@ def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
 
 
 @pytest.mark.gl
-def test_beside_the_edit_pass_the_cpu_composes_means_only(ctx: moderngl.Context, stack: Stack) -> None:
+def test_beside_the_edit_pass_the_cpu_composes_means_only(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Composer] = []
+
+    def make(scene: Gaussians, gdfs: Sequence[Gdf]) -> Composer:
+        made.append(Composer(scene, gdfs))
+        return made[-1]
+
+    monkeypatch.setattr(attribute_updates, "Composer", make)
     engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
-    assert isinstance(engine._editing, GpuEditing)
     engine.image(view_of(stack, 0.4, 0.4), SIZE)
     engine.image(view_of(stack, 0.7, 0.7), SIZE)
-    assert engine._editing._composer is None
-    means = engine._editing._means.gaussians
-    assert torch.equal(means.sh0, stack.scene.sh0)
-    assert not torch.equal(means.means, stack.scene.means)
+    (composer,) = made
+    assert torch.equal(composer.gaussians.sh0, stack.scene.sh0)
+    assert not torch.equal(composer.gaussians.means, stack.scene.means)
     engine.release()
 
 
@@ -167,7 +163,7 @@ def test_the_error_is_measured_once_for_every_stack(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
-    measured = Count(monkeypatch, engine._editing, "error")
+    measured = Count(monkeypatch, engine.editing, "error")
     for strength, calls in ((0.4, 1), (0.4, 1), (0.5, 2)):
         engine.image(view_of(stack, strength), SIZE)
         engine.edits()
@@ -210,7 +206,7 @@ def test_the_same_state_draws_nothing(
     view = view_of(stack, 0.5)
     assert engine.needs_draw(view, SIZE)
     engine.image(view, SIZE)
-    draws = Count(monkeypatch, engine._renderer, "draw")
+    draws = Count(monkeypatch, engine.renderer, "draw")
     assert not engine.needs_draw(view, SIZE)
     assert not engine.needs_draw(replace(view, overlay=True, panel=False), SIZE)
     engine.image(replace(view, overlay=True), SIZE)
@@ -248,8 +244,8 @@ def test_a_camera_move_composes_nothing(
 ) -> None:
     view = view_of(stack, 0.5)
     engine.image(view, SIZE)
-    composed = Count(monkeypatch, engine._editing, "update")
-    uploaded = Count(monkeypatch, engine._renderer, "update")
+    composed = Count(monkeypatch, engine.editing, "update")
+    uploaded = Count(monkeypatch, engine.renderer, "update")
     engine.image(replace(view, camera=replace(view.camera, azimuth=50.0)), SIZE)
     assert (composed.calls, uploaded.calls) == (0, 0)
     assert engine.timings.compose_ms == engine.timings.upload_ms == 0.0
@@ -276,7 +272,7 @@ def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: ViewEngine, s
         gl_engine.image(view, SIZE)
         means = compose_layers(stack.scene, [Layer(stack.gdfs[EARS], ears)]).means.numpy()
         order = engine_module.back_to_front(means, to_camera(view.camera, *SIZE))
-        assert np.array_equal(gl_engine._order, order)
+        assert np.array_equal(gl_engine.order, order)
 
 
 @pytest.mark.gl

@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from progdf.camera import Camera
-from progdf.demo_scenes import bear
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.rasterize import render
 from progdf.rasterize.depth import depth_of, paint_depth, render_depth
 from progdf.scene.orbit_rig import orbit_rig
+from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import front_camera, hard_cases, one_gaussian, orbit_camera, random_gaussians
 from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.scene_textures import row_runs
