@@ -26,11 +26,11 @@ from viewer.panel import panel
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
-COLOURS, PANEL_COLOURS = 144, 96  # so that a file stays below 250 kB
+COLORS, PANEL_COLORS = 144, 96  # so that a file stays below 250 kB
 
 
 def layers(hand: Rig) -> None:
-    """Two edits, gains and curve of the first unfolded, its colour held back."""
+    """Two edits, gains and curve of the first unfolded, its color held back."""
     hand.key("G")
     hand.key("Tab")
     for _ in range(2):
@@ -153,21 +153,21 @@ def main() -> None:
         SHOTS[asked.name](hand)
         hand.frame(3)
         picture = Image.fromarray(hand.image())
-    _in_few_colours(picture, SIZE[0] - round(panel.WIDTH_PX)).save(asked.out, optimize=True)
+    _in_few_colors(picture, SIZE[0] - round(panel.WIDTH_PX)).save(asked.out, optimize=True)
 
 
-def _in_few_colours(window: Image.Image, panel_at: int) -> Image.Image:
-    """A palette for the picture, dithered, and one for the panel, whose flat colours that would grain."""
+def _in_few_colors(window: Image.Image, panel_at: int) -> Image.Image:
+    """A palette for the picture, dithered, and one for the panel, whose flat colors that would grain."""
     picture = window.crop((0, 0, panel_at, window.height))
-    few = picture.quantize(COLOURS, kmeans=3, dither=Image.Dither.NONE)
+    few = picture.quantize(COLORS, kmeans=3, dither=Image.Dither.NONE)
     picture = picture.quantize(palette=few, dither=Image.Dither.FLOYDSTEINBERG)
     right = window.crop((panel_at, 0, *window.size)).quantize(
-        PANEL_COLOURS, kmeans=3, dither=Image.Dither.NONE
+        PANEL_COLORS, kmeans=3, dither=Image.Dither.NONE
     )
     both = Image.new("P", window.size)
-    both.putpalette((few.getpalette() or [])[: 3 * COLOURS] + (right.getpalette() or [])[: 3 * PANEL_COLOURS])
+    both.putpalette((few.getpalette() or [])[: 3 * COLORS] + (right.getpalette() or [])[: 3 * PANEL_COLORS])
     both.paste(picture, (0, 0))
-    both.paste(right.point([(i + COLOURS) % 256 for i in range(256)]), (panel_at, 0))
+    both.paste(right.point([(i + COLORS) % 256 for i in range(256)]), (panel_at, 0))
     return both
 
 

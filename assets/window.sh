@@ -14,7 +14,7 @@ cd "$folder"
   --set scarf=0.8 --set gold=0.6 --background '#bfd8f1' &
 window=$!
 xdotool search --sync --onlyvisible --name scene.ply >/dev/null
-sleep 20 # the first picture on a machine compiles the rasteriser
+sleep 20 # the first picture on a machine compiles the rasterizer
 xdotool key shift+F2
 sleep 3
 xdotool key ctrl+q

@@ -151,7 +151,7 @@ def _compose_table() -> Table:
             "largest difference",
         ),
         rows=tuple(rows),
-        note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centres, "
+        note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
         "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
         "member takes does not grow. The plain compose also checks that the edit belongs to the scene.",
     )
@@ -159,7 +159,7 @@ def _compose_table() -> Table:
 
 def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
     composer, alone = Composer(scene, [edit]), Composer(scene, [single])
-    # bases, the original and the last centres are read, row numbers too, 14 numbers written
+    # bases, the original and the last centers are read, row numbers too, 14 numbers written
     traffic = len(edit.region) * (edit.field.bytes_per_member + 56 + 12 + 12 + 56)
     source = np.ones(int(traffic) // 8, np.float32)
     target = source.copy()

@@ -22,7 +22,7 @@ STYLES: dict[str, tuple[tuple[int, int, int], str]] = {
     "neural, code": ((70, 160, 180), "plus"),
     "auto": (INK, "star"),
 }
-"""Colour and marker of each kind, in the order of the legend; the later lies above."""
+"""Color and marker of each kind, in the order of the legend; the later lies above."""
 
 COLUMNS, PANEL = 3, (328, 212)
 LOW, HIGH = 10.0, 70.0
@@ -128,39 +128,39 @@ def _panel(
             draw.text((at_x(place) - 4 * _ZOOM, bottom - 9 * _ZOOM), "paper's 6 M", PALE, font, anchor="rm")
         else:
             points.setdefault(form.kind, []).append((at_x(place), at_y(form.worst)))
-    for kind, (colour, _) in STYLES.items():
+    for kind, (color, _) in STYLES.items():
         if joined and len(points.get(kind, [])) > 1:
             path: list[tuple[float, float]] = sorted(points[kind])
-            draw.line(path, colour, round(1.5 * _ZOOM))
+            draw.line(path, color, round(1.5 * _ZOOM))
     for kind in STYLES:
         for x, y in points.get(kind, []):
             _mark(draw, kind, x, y)
 
 
 def _mark(draw: ImageDraw.ImageDraw, kind: str, x: float, y: float) -> None:
-    colour, shape = STYLES[kind]
+    color, shape = STYLES[kind]
     r, thin = 4.5 * _ZOOM, 2 * _ZOOM
     if shape == "disc":
-        draw.ellipse([x - r, y - r, x + r, y + r], colour)
+        draw.ellipse([x - r, y - r, x + r, y + r], color)
     elif shape == "ring":
-        draw.ellipse([x - r, y - r, x + r, y + r], PAPER, colour, thin)
+        draw.ellipse([x - r, y - r, x + r, y + r], PAPER, color, thin)
     elif shape == "square":
-        draw.rectangle((x - 0.85 * r, y - 0.85 * r, x + 0.85 * r, y + 0.85 * r), colour)
+        draw.rectangle((x - 0.85 * r, y - 0.85 * r, x + 0.85 * r, y + 0.85 * r), color)
     elif shape == "diamond":
-        draw.polygon([(x - r, y), (x, y - 1.2 * r), (x + r, y), (x, y + 1.2 * r)], colour)
+        draw.polygon([(x - r, y), (x, y - 1.2 * r), (x + r, y), (x, y + 1.2 * r)], color)
     elif shape == "triangle":
-        draw.polygon([(x - r, y + 0.8 * r), (x, y - r), (x + r, y + 0.8 * r)], colour)
+        draw.polygon([(x - r, y + 0.8 * r), (x, y - r), (x + r, y + 0.8 * r)], color)
     elif shape == "cross":
-        draw.line([(x - r, y - r), (x + r, y + r)], colour, thin)
-        draw.line([(x - r, y + r), (x + r, y - r)], colour, thin)
+        draw.line([(x - r, y - r), (x + r, y + r)], color, thin)
+        draw.line([(x - r, y + r), (x + r, y - r)], color, thin)
     elif shape == "plus":
-        draw.line([(x - 1.2 * r, y), (x + 1.2 * r, y)], colour, thin)
-        draw.line([(x, y - 1.2 * r), (x, y + 1.2 * r)], colour, thin)
+        draw.line([(x - 1.2 * r, y), (x + 1.2 * r, y)], color, thin)
+        draw.line([(x, y - 1.2 * r), (x, y + 1.2 * r)], color, thin)
     else:
         turns = [math.pi * (i / 5 - 0.5) for i in range(10)]
         sizes = [(1.7 if i % 2 == 0 else 0.7) * r for i in range(10)]
         star = [(x + s * math.cos(a), y + s * math.sin(a)) for s, a in zip(sizes, turns, strict=True)]
-        draw.polygon(star, colour, PAPER)
+        draw.polygon(star, color, PAPER)
 
 
 def _legend(draw: ImageDraw.ImageDraw, kinds: Sequence[str], font: _Font) -> None:

@@ -68,7 +68,7 @@ def position_floor(
     Args:
         strengths: of the snapshots, ascending from 0 to 1. [T]
         offsets: [T,M,C] float32
-        places: the members' centres before the edit. [M,3]
+        places: the members' centers before the edit. [M,3]
         visibility: how much each member shows. [M]; None is evenly
         judge: compares pictures; None leaves the decibels out
 

@@ -66,7 +66,7 @@ class RasterTimes:
     Args:
         forward, both: the cpu engine without and with the backward pass, on all threads
         duels: against the tiled torch renderer, on all threads and on one; empty where it is left out
-        image_error: largest difference of a colour
+        image_error: largest difference of a color
         gradient_errors: largest difference over the largest gradient, by input
     """
 
@@ -229,9 +229,9 @@ def tables() -> list[Table]:
     )
     note = (
         "Median and range; the engines take turns in one process. Errors are against float64: largest "
-        "difference of a colour; largest difference of a gradient over the largest, worst input named."
+        "difference of a color; largest difference of a gradient over the largest, worst input named."
     )
-    return [Table("rasterize", "CPU rasteriser", columns, tuple(rows), note)]
+    return [Table("rasterize", "CPU rasterizer", columns, tuple(rows), note)]
 
 
 def _spread(times: list[float]) -> str:

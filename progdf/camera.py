@@ -1,4 +1,4 @@
-"""Cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5, column vectors."""
+"""Cameras: OpenCV axes (x right, y down, z forward), pixel centers at +0.5, column vectors."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """The camera's centre in world units. [3]"""
+        """The camera's center in world units. [3]"""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def resize(self, width: int, height: int) -> Camera:
@@ -92,6 +92,6 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def intrinsics(fov_y: float, width: int, height: int) -> Tensor:
-    """Intrinsics of a centred camera with square pixels; `fov_y` in radians. [3,3] float32"""
+    """Intrinsics of a centered camera with square pixels; `fov_y` in radians. [3,3] float32"""
     focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * fov_y, dtype=torch.float64)))
     return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

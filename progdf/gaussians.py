@@ -23,12 +23,12 @@ class Gaussians:
     """N Gaussians as raw tensors; activate with `scales`, `opacities`, `unit_quats`.
 
     Args:
-        means: centres, world units. [N,3]
+        means: centers, world units. [N,3]
         quats: rotations wxyz, any nonzero length. [N,4]
         log_scales: log of the standard deviations in world units. [N,3]
         logit_opacities: opacities before the sigmoid. [N]
-        sh0: colour, band 0 of the spherical harmonics. [N,3]
-        shN: colour, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
+        sh0: color, band 0 of the spherical harmonics. [N,3]
+        shN: color, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
         antialiased: trained with Mip-Splatting's 2D filter and to be drawn with it, see `rasterize`
 
     Raises:

@@ -69,7 +69,7 @@ def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor
 
     Args:
         photograph: taken through `lens`. [H,W,3] 0..1
-        K: intrinsics of both, pixels of the photograph; pixel centres at +0.5. [3,3]
+        K: intrinsics of both, pixels of the photograph; pixel centers at +0.5. [3,3]
         lens: what bent it
 
     Returns:

@@ -65,9 +65,9 @@ def inside_box(name: str, scene: Gaussians, corner: Tensor, opposite: Tensor) ->
     return from_mask(name, ((scene.means >= low) & (scene.means <= high)).all(dim=1))
 
 
-def inside_sphere(name: str, scene: Gaussians, centre: Tensor, radius: float) -> Region:
-    """The Gaussians whose mean is at most `radius` world units from `centre`."""
-    return from_mask(name, (scene.means - centre).norm(dim=1) <= radius)
+def inside_sphere(name: str, scene: Gaussians, center: Tensor, radius: float) -> Region:
+    """The Gaussians whose mean is at most `radius` world units from `center`."""
+    return from_mask(name, (scene.means - center).norm(dim=1) <= radius)
 
 
 def union(a: Region, b: Region, name: str = "") -> Region:

@@ -20,7 +20,7 @@ _C3 = (
 
 
 def sh0_to_rgb(sh0: Tensor) -> Tensor:
-    """Colour of band 0 alone, before the clamp at 0. [...,3] -> [...,3]"""
+    """Color of band 0 alone, before the clamp at 0. [...,3] -> [...,3]"""
     return sh0 * C0 + 0.5
 
 
@@ -34,7 +34,7 @@ def basis(degree: int, directions: Tensor) -> Tensor:
 
     Args:
         degree: 0..3 (band 4, where a file has it, is carried along and not shown)
-        directions: unit vectors from the camera centre to the Gaussian, world axes. [N,3]
+        directions: unit vectors from the camera center to the Gaussian, world axes. [N,3]
 
     Returns:
         [N,(degree+1)²]
@@ -68,6 +68,6 @@ def basis(degree: int, directions: Tensor) -> Tensor:
 
 
 def shade(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
-    """Colour seen along `directions`: max(0, Σ basis·sh + 0.5). [N,3], [N,≥(degree+1)²,3] -> [N,3]"""
+    """Color seen along `directions`: max(0, Σ basis·sh + 0.5). [N,3], [N,≥(degree+1)²,3] -> [N,3]"""
     weights = basis(degree, directions)
     return ((weights[..., None] * sh[:, : weights.shape[-1]]).sum(dim=1) + 0.5).clamp_min(0.0)

@@ -1,13 +1,13 @@
 #version 330 core
-// Projects one Gaussian and evaluates its colour, once a frame; the results go to a buffer (transform feedback).
+// Projects one Gaussian and evaluates its color, once a frame; the results go to a buffer (transform feedback).
 //
 // Reads   splat: which Gaussian, in drawing order (farthest first); the raw scene (include/raw_splats.glsl);
 //         the camera: OpenCV axes (x right, y down, z forward), lengths in world units, intrinsics in pixels.
 // Writes  viewer/gl/layout.py: PROJECTED, in pixels of the picture, x right and y down from the upper left corner:
-//         alpha(d) = opacity · 2^−(u² + v²), u = l11 · (d.x + slope · d.y), v = l22 · d.y, d = pixel − centre.
+//         alpha(d) = opacity · 2^−(u² + v²), u = l11 · (d.x + slope · d.y), v = l22 · d.y, d = pixel − center.
 //         r2 is u² + v² at alpha = 1/255, and negative where nothing is to be drawn.
 //
-// float32 all through, so nothing may cancel: the camera's centre comes in two parts, and the determinant of the 2D
+// float32 all through, so nothing may cancel: the camera's center comes in two parts, and the determinant of the 2D
 // covariance is a sum of squares. Relative to the size of the Gaussian, neither needles of 1e6:1 nor scales of 1e18
 // over- or underflow.
 
@@ -18,15 +18,15 @@
 in uint splat;
 
 uniform mat3 rotation;       // world → camera, column vectors
-uniform vec3 eye_high;       // the camera's centre, world units, rounded to float32 …
+uniform vec3 eye_high;       // the camera's center, world units, rounded to float32 …
 uniform vec3 eye_low;        // … and what the rounding left over
 uniform vec4 intrinsics;     // fx, fy, cx, cy
 uniform vec2 size;           // width, height
 uniform bool antialiased;    // opacity × sqrt(det before dilation / det after)
 uniform bool highlighted;         // whether `highlight` is there
-uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own colour
+uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own color
 
-out vec2 centre;
+out vec2 center;
 out vec3 shape;              // slope, l11, l22
 out float r2;
 out vec4 rgb_opacity;
@@ -45,7 +45,7 @@ mat3 rotation_of(vec4 wxyz) {
 }
 
 void main() {
-    centre = vec2(0.0);
+    center = vec2(0.0);
     shape = vec3(0.0, 1.0, 1.0);
     r2 = -1.0;
     rgb_opacity = vec4(0.0);
@@ -98,7 +98,7 @@ void main() {
         rgb = mix(rgb, over.rgb, over.a);
     }
     if (not_finite(rgb)) return;        // before the clamp, which hides NaN and -inf
-    centre = at;
+    center = at;
     shape = vec3(-b / (c + dilation), UNIT * sqrt((c + dilation) / det) / unit_px,
                  UNIT * inversesqrt(c + dilation) / unit_px);
     r2 = reach2;

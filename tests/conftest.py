@@ -72,7 +72,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    """The rasteriser draws with two threads, as on the smallest machine that has several."""
+    """The rasterizer draws with two threads, as on the smallest machine that has several."""
     from progdf.rasterize import set_threads
 
     set_threads(2)

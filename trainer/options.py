@@ -117,8 +117,8 @@ class TrainOptions:
     """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
     dense that most have less than a pixel."""
     steps: int = 800
-    """Optimiser steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
-    kind: Literal["auto", "colour", "style", "geometry"] = "auto"
+    """Optimizer steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
+    kind: Literal["auto", "color", "style", "geometry"] = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor knows; for folder:,
     photographs: and instruct: all are tried on a few small views, and the log says which was best."""
     group_steps: int | None = None
@@ -130,8 +130,8 @@ class TrainOptions:
     style, which is the paper's way, towards the end alone. instruct is asked for strengths, by rising
     guidance, only if more than 1 are asked for here: each is another pass over the views."""
     sh: Literal["auto", "on", "off"] = "auto"
-    """Colours that change with the direction one looks from: trained, and kept where leaving them out would
-    cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colours and the region's own
+    """Colors that change with the direction one looks from: trained, and kept where leaving them out would
+    cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
     hardly change with the view (auto)."""
     perceptual_weight: float | None = None
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
@@ -141,10 +141,10 @@ class TrainOptions:
     is, which lets go of the steps (decay) or tightens (growth). As a loss it freezes the edit."""
     sharpness: Literal["auto", "hinge", "paper", "off"] = "auto"
     """Sharpness of the renders: not less than the target's (hinge), or the printed term, which pulls at no
-    pixel but the rim's (paper). auto: hinge for style, off for colour and geometry."""
+    pixel but the rim's (paper). auto: hinge for style, off for color and geometry."""
     slider: Slider = "auto"
     """Slider values. even: equal steps look equally large, and an editor with a dial is asked for pictures
-    that do; stages: s is the editor's own strength, even in between; time: the optimiser's. auto: even, but
+    that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto: even, but
     stages where folder: has pictures of several strengths."""
     field: FieldKind = "auto"
     """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
@@ -184,7 +184,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Refit the field of a run to its recorded trajectory; nothing is optimised again."""
+    """Refit the field of a run to its recorded trajectory; nothing is optimized again."""
 
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""

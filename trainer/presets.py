@@ -41,10 +41,10 @@ CONSTANTS: Mapping[Preset, Constants] = {
 PRESETS: Mapping[Preset, Mapping[str, Any]] = {
     "default": {},
     # the trainer of ProGDF (AAAI 2025) as it is printed. PGS: λ = 1, 5, 1, one target, the rates of 3DGS, all
-    # attributes free, raw iterates along the optimiser's time; `--progressive growth` is its other schedule.
+    # attributes free, raw iterates along the optimizer's time; `--progressive growth` is its other schedule.
     # GDF: 6 million parameters that see positions alone, hard bins, trained beside PGS on L1 + LPIPS, which
     # takes a quarter of an hour; `--field auto` leaves it out. Not the paper's: the gradients through clamped
-    # colours, and the bake.
+    # colors, and the bake.
     "paper": {
         "steps": 1500,
         "stages": 1,

@@ -124,7 +124,7 @@ def _run_variant(root: Path, variant: Variant, shared: AblationSetup, quiet: boo
     log = RunLog(folder / "log.txt", quiet)
     try:
         trajectory = _record(root, variant, shared, options, perceptual, log)
-        seconds = log.seconds["optimise"]
+        seconds = log.seconds["optimize"]
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
@@ -149,15 +149,15 @@ def _record(
     perceptual: Perceptual,
     log: RunLog,
 ) -> Trajectory:
-    """The variant's trajectory. Its optimisation goes on where it was stopped, or is another variant's."""
+    """The variant's trajectory. Its optimization goes on where it was stopped, or is another variant's."""
     home = root / variant.trains_as
     home.mkdir(exist_ok=True)
     state = StateFolder(home / "state")
-    begun = {"digest": digest_of(shared, variant, optimisation=True)}
+    begun = {"digest": digest_of(shared, variant, optimization=True)}
     if state.identity() != begun:
         state.begin(begun)
     edited = shared.edited if options.stages != 1 else {1.0: shared.edited[1.0]}
-    with log.stage("optimise"):
+    with log.stage("optimize"):
         trajectory, _ = optimize_members(options, shared.setup, edited, shared.kind, perceptual, state, log)
     trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator)
     return retime_trajectory(trajectory, shared.setup, options, log)

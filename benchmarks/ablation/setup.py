@@ -25,7 +25,7 @@ from trainer.views.view import View
 from .variants import Variant
 
 _T = TypeVar("_T")
-_LAID_OVER = ("slider",)  # options that the optimisation does not depend on
+_LAID_OVER = ("slider",)  # options that the optimization does not depend on
 _COMMAND = ("out", "scene", "threads", "resume", "save_every", "quick")  # nor anything else
 
 
@@ -118,12 +118,12 @@ def make_ablation_setup(
     )
 
 
-def digest_of(shared: AblationSetup, variant: Variant, optimisation: bool = False) -> str:
-    """Of all that decides a variant's figures, or of its optimisation alone."""
-    without = (*_COMMAND, *_LAID_OVER) if optimisation else _COMMAND
+def digest_of(shared: AblationSetup, variant: Variant, optimization: bool = False) -> str:
+    """Of all that decides a variant's figures, or of its optimization alone."""
+    without = (*_COMMAND, *_LAID_OVER) if optimization else _COMMAND
     options = plain(replace(shared.options, **variant.changes))
     decides = {name: value for name, value in options.items() if name not in without}
-    told = json.dumps([shared.digest, decides, variant.linear and not optimisation], sort_keys=True)
+    told = json.dumps([shared.digest, decides, variant.linear and not optimization], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
 
 

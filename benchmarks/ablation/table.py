@@ -28,7 +28,7 @@ class Outcome:
         uniformity: least over largest visible change of twenty equal steps, 0..1
         t50, t90: slider value at which half and nine tenths of the change are reached
         bytes_per_member: of the field
-        seconds: of the optimisation
+        seconds: of the optimization
         objective: the loss, in words
         failed: why there are no figures, "" where there are
     """

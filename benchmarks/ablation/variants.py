@@ -38,7 +38,7 @@ class Variant:
 
     @property
     def trains_as(self) -> str:
-        """Name of the variant whose optimisation it shares: the slider is laid over what was recorded."""
+        """Name of the variant whose optimization it shares: the slider is laid over what was recorded."""
         return BASE if set(self.changes) <= {"slider"} else self.name
 
 
@@ -54,11 +54,11 @@ VARIANTS = (
     Variant("sharpness-hinge", "as sharp as the target", {"sharpness": "hinge"}),
     Variant("sharpness-paper", "the printed sharpness", {"sharpness": "paper"}),
     Variant("no-lpips", "L1 alone", {"perceptual_weight": 0.0}),
-    Variant("no-sh", "view-dependent colour left as it is", {"sh": "off"}),
+    Variant("no-sh", "view-dependent color left as it is", {"sh": "off"}),
     Variant("no-groups", "parts are not moved as wholes first", {"group_steps": 0}),
     Variant("slider-stages", "the editor's own strengths, even in between", {"slider": "stages"}),
     Variant("slider-even", "even over the whole slider", {"slider": "even"}),
-    Variant("slider-time", "the optimiser's time", {"slider": "time"}),
+    Variant("slider-time", "the optimizer's time", {"slider": "time"}),
     Variant("paper", "all as the paper prints it", _AS_PRINTED),
 )
 

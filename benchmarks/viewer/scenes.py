@@ -40,7 +40,7 @@ def scenes_of(paths: Sequence[Path] = ()) -> list[Gaussians]:
 
 
 def copies(scene: Gaussians, times: int = COPIES) -> Gaussians:
-    """The scene laid over itself, every copy's centres off by a normal 0.2 % of the radius: as dense as a
+    """The scene laid over itself, every copy's centers off by a normal 0.2 % of the radius: as dense as a
     scene that was trained with `times` as many Gaussians."""
     rng = torch.Generator().manual_seed(0)
     repeated: dict[str, Any] = {name: torch.cat([getattr(scene, name)] * times) for name in ATTRIBUTES}
@@ -51,12 +51,12 @@ def copies(scene: Gaussians, times: int = COPIES) -> Gaussians:
 
 
 def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
-    """A made-up edit of the `members` Gaussians nearest to the scene's centre, as large as a trained one:
+    """A made-up edit of the `members` Gaussians nearest to the scene's center, as large as a trained one:
     beside the full offset three int8 bases.
 
     Args:
         members: how many; all of a scene that has fewer
-        moves: whether it moves and turns them too; else it only recolours them
+        moves: whether it moves and turns them too; else it only recolors them
     """
     rng = torch.Generator().manual_seed(0)
     region = _nearest(scene, members)
@@ -83,7 +83,7 @@ def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
 
 
 def _nearest(scene: Gaussians, count: int) -> Tensor:
-    centre = torch.tensor(bounds_of(scene).centre)
-    distances = (scene.means - centre).norm(dim=1).nan_to_num(nan=math.inf)
+    center = torch.tensor(bounds_of(scene).center)
+    distances = (scene.means - center).norm(dim=1).nan_to_num(nan=math.inf)
     chosen: Tensor = distances.argsort(stable=True)[:count].sort().values
     return chosen

@@ -73,7 +73,7 @@ class SliderCase:
 
     @property
     def title(self) -> str:
-        return "colour and place" if self.moves else "colour"
+        return "color and place" if self.moves else "color"
 
 
 CASES = (
@@ -200,7 +200,7 @@ def table(results: Sequence[SliderTimes], renderer: str) -> Table:
         ),
         tuple(_cells(result) for result in results),
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
-        "waited for, the parts are medians. The CPU rasteriser sorts as it draws and draws where the slider "
+        "waited for, the parts are medians. The CPU rasterizer sorts as it draws and draws where the slider "
         "touches the picture. Largest difference between a picture drawn step by step and the same drawn "
         f"afresh: {max(result.apart for result in results):g}.",
     )

@@ -1,7 +1,7 @@
 """`progdf rebind EDIT.gdf --from A --to B -o C.gdf`: an edit carried over to the same scene in another file.
 
 Other formats change the numbers and the order of the Gaussians. Each Gaussian of B gets the offsets of the
-one of A that it is: the nearest, by place, then colour and size, one to one where that is possible.
+one of A that it is: the nearest, by place, then color and size, one to one where that is possible.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Colour edits as pure functions of colours and strength, the same for pixels and for Gaussians.
+"""Color edits as pure functions of colors and strength, the same for pixels and for Gaussians.
 
 Every function takes sRGB as it is stored (0..1, not linear) in any shape [...,3], returns the same shape,
 gives the input back bit for bit where the strength is 0, and moves continuously with it. Hue, chroma and
@@ -21,20 +21,20 @@ _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of ampl
 
 
 def parse_color(text: str) -> Tensor:
-    """The colour of `#rrggbb` or `#rgb`, the `#` optional, as sRGB. [3] float32; else a ProgdfError."""
+    """The color of `#rrggbb` or `#rgb`, the `#` optional, as sRGB. [3] float32; else a ProgdfError."""
     digits = text.strip().removeprefix("#")
     if len(digits) == 3:
         digits = "".join(2 * digit for digit in digits)
     if len(digits) != 6 or any(digit not in "0123456789abcdefABCDEF" for digit in digits):
-        raise ProgdfError(f"'{text}' is not a colour; write it as #rrggbb, for example #d4af37")
+        raise ProgdfError(f"'{text}' is not a color; write it as #rrggbb, for example #d4af37")
     return torch.tensor([int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)])
 
 
 def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
-    """The weighted mean colour, averaged in OKLab. [...,3], [...] or None -> [3]
+    """The weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]
 
     Take it once over the whole region (all views, all members) and pass it to every `recolor` of that region:
-    the edit is then the same function of colour in each view.
+    the edit is then the same function of color in each view.
     """
     lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
     w = torch.ones_like(lab[:, 0]) if weights is None else weights.reshape(-1).to(lab.dtype)
@@ -50,13 +50,13 @@ def recolor(
     reference: Tensor | None = None,
     path: ColorPath = "bowed",
 ) -> Tensor:
-    """Give a thing another colour and keep its shading: all of `recolor_fully`, or a part of the way there.
+    """Give a thing another color and keep its shading: all of `recolor_fully`, or a part of the way there.
 
     Args:
-        rgb: sRGB colours, 0..1; what lies outside (SH colours may) fades with the strength. [...,3]
-        target: the colour that `reference` has at strength 1, sRGB 0..1. [3]
+        rgb: sRGB colors, 0..1; what lies outside (SH colors may) fades with the strength. [...,3]
+        target: the color that `reference` has at strength 1, sRGB 0..1. [3]
         strength: 0..1
-        reference: the region's own colour, `typical_color` of `rgb` by default. [3]
+        reference: the region's own color, `typical_color` of `rgb` by default. [3]
         path: see `bend_of`
     """
     own = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
@@ -69,7 +69,7 @@ def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     """The finished `recolor`. [...,3] -> [...,3] 0..1
 
     Lightness is scaled so that `reference` becomes `target`; chroma follows the lightness; the hue is the
-    target's, or stays where the target is too grey to have one. A dark source is lifted.
+    target's, or stays where the target is too gray to have one. A dark source is lifted.
     """
     lab, (new_l, new_a, new_b) = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
     new_c = torch.hypot(new_a, new_b)
@@ -89,7 +89,7 @@ def tint(
     path: ColorPath = "bowed",
     share: float = 0.7,
 ) -> Tensor:
-    """Wash with a colour: lightness stays, hue and chroma go `share` of the way to the target's. [...,3]
+    """Wash with a color: lightness stays, hue and chroma go `share` of the way to the target's. [...,3]
 
     See `recolor` for the arguments; here `reference` decides nothing but the bend.
     """
@@ -119,7 +119,7 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
 
 
 def night(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
-    """Moonlight: `darken`, with colours fading to a cool blue as they do in scarce light. [...,3]"""
+    """Moonlight: `darken`, with colors fading to a cool blue as they do in scarce light. [...,3]"""
     blue = tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75)
     return darken(interpolate_colors(rgb, blue, strength, STRAIGHT), strength, stops)
 
@@ -150,7 +150,7 @@ def stripe_pattern(
 
 
 def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) -> Tensor:
-    """Stripes along any coordinate counted in periods, centred on whole numbers. [...] -> [...] in 0..1"""
+    """Stripes along any coordinate counted in periods, centered on whole numbers. [...] -> [...] in 0..1"""
     distance = (turns - turns.round()).abs()
     edge = ((0.5 * width - distance) / max(softness, 1e-6) + 0.5).clamp(0, 1)
     return edge * edge * (3 - 2 * edge)

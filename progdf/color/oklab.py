@@ -22,14 +22,14 @@ _GAMUT_SLACK = 1e-3  # less than a third of an 8-bit step
 
 
 def srgb_to_oklab(rgb: Tensor) -> Tensor:
-    """Lightness 0..1 and the two opponent axes a, b of sRGB colours. [...,3] -> [...,3]"""
+    """Lightness 0..1 and the two opponent axes a, b of sRGB colors. [...,3] -> [...,3]"""
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
     lms = linear @ rgb.new_tensor(_LMS_FROM_LINEAR).T
     return (lms.sign() * lms.abs() ** (1 / 3)) @ rgb.new_tensor(_LAB_FROM_LMS).T
 
 
 def oklab_to_srgb(lab: Tensor) -> Tensor:
-    """The inverse of `srgb_to_oklab`; colours that sRGB cannot show leave 0..1. [...,3] -> [...,3]"""
+    """The inverse of `srgb_to_oklab`; colors that sRGB cannot show leave 0..1. [...,3] -> [...,3]"""
     lms = (lab @ torch.linalg.inv(lab.new_tensor(_LAB_FROM_LMS)).T) ** 3
     linear = lms @ torch.linalg.inv(lab.new_tensor(_LMS_FROM_LINEAR)).T
     return torch.where(
@@ -38,7 +38,7 @@ def oklab_to_srgb(lab: Tensor) -> Tensor:
 
 
 def fit_gamut(lab: Tensor) -> Tensor:
-    """sRGB of OKLab colours; chroma that sRGB cannot show is reduced, lightness and hue stay. [...,3]"""
+    """sRGB of OKLab colors; chroma that sRGB cannot show is reduced, lightness and hue stay. [...,3]"""
     rgb = oklab_to_srgb(lab)
     outside = (rgb - 0.5).abs().amax(dim=-1) > 0.5 + _GAMUT_SLACK
     if bool(outside.any()):

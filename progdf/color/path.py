@@ -1,4 +1,4 @@
-"""The way of colours from the original to the finished edit: neither through grey nor through other hues."""
+"""The way of colors from the original to the finished edit: neither through gray nor through other hues."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from progdf.errors import ProgdfError
 from .oklab import fit_gamut, hue_of, srgb_to_oklab
 
 Strength = float | Tensor
-"""How far the edit has gone, 0..1: one number, or a tensor with the colours' shape less the last axis."""
+"""How far the edit has gone, 0..1: one number, or a tensor with the colors' shape less the last axis."""
 
 _GREEN = math.radians(142.5)  # hue of sRGB's
 
 ColorPath = Literal["bowed", "hue"]
-"""The way of colours from the original to the finished edit, see `bend_of`."""
+"""The way of colors from the original to the finished edit, see `bend_of`."""
 
 
 @dataclass(frozen=True)
 class Bend:
-    """How the way between two colours bends from the straight line in OKLab towards the hue circle.
+    """How the way between two colors bends from the straight line in OKLab towards the hue circle.
 
     Args:
         bow: share of the way along the hue circle in the mixture, 0 (straight) to 1
@@ -44,10 +44,10 @@ STRAIGHT = Bend(0.0, 1.0, 0.0, 1.0)
 
 
 def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Bend:
-    """The bend for a region whose typical colour `reference` becomes `target`; sRGB, [3] each.
+    """The bend for a region whose typical color `reference` becomes `target`; sRGB, [3] each.
 
     - "bowed": mostly straight, bowed by 0.4 towards the shorter hue, so that half of blue is half way to blue
-      and not grey. Hues that are opposite within 10° keep off green, which nobody expects.
+      and not gray. Hues that are opposite within 10° keep off green, which nobody expects.
     - "hue": along the hue circle, the shorter way; between nearly opposite hues the way over green.
     """
     start, end = (hue_of(srgb_to_oklab(color.clamp(0, 1))) for color in (reference, target))
@@ -71,13 +71,13 @@ def path_of(name: str) -> ColorPath:
 
 
 def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:
-    """Colours on their way to others: straight in OKLab, bowed towards the hue circle.
+    """Colors on their way to others: straight in OKLab, bowed towards the hue circle.
 
-    The bow grows with what both colours have of chroma: a grey's hue is noise, and turned it would shine in
-    all colours of the rainbow half way. Neighbours keep together all around the circle, see `Bend`.
+    The bow grows with what both colors have of chroma: a gray's hue is noise, and turned it would shine in
+    all colors of the rainbow half way. Neighbors keep together all around the circle, see `Bend`.
 
     Args:
-        rgb: at strength 0, sRGB; what lies outside 0..1 (SH colours may) fades with the strength. [...,3]
+        rgb: at strength 0, sRGB; what lies outside 0..1 (SH colors may) fades with the strength. [...,3]
         end: at strength 1, bit for bit, 0..1. [...,3]
         strength: 0..1
         bend: of the region

@@ -38,7 +38,7 @@ class Change:
     Args:
         rows: sorted indices of all Gaussians that may differ from before. [M] int64
         attributes: names of `gaussians.ATTRIBUTES` that may differ in these rows
-        largest_move: largest distance that a centre has moved since the last update, world units
+        largest_move: largest distance that a center has moved since the last update, world units
     """
 
     rows: NDArray[np.int64]
@@ -85,7 +85,7 @@ class Composer:
         self._pool: ThreadPoolExecutor | None = None
         self._weights: tuple[list[Tensor], list[int], NDArray[np.float32]] = ([], [], np.zeros(0, np.float32))
 
-    def update(self, layers: Sequence[Layer], blend: str = "normalised") -> Change:
+    def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
         """Make `gaussians` the scene under `layers`: what `compose_layers(scene, layers, blend)` gives.
 
         Args:
@@ -129,7 +129,7 @@ class Composer:
         chosen: tuple[int, ...],
         blend: str,
     ) -> float:
-        """Write these attributes of the plan's rows; the largest squared step of a centre."""
+        """Write these attributes of the plan's rows; the largest squared step of a center."""
         edits = self._edits
         layers, numbers, bounds = plan.stack_edits(tuple(edit for edit, _ in stack))
         strengths = 0.0
@@ -137,10 +137,10 @@ class Composer:
             node, on_node, share = find_segment(edits.nodes[edit], layer.strength)
             layers[i, 3:] = weights_at[i], node, on_node
             gains = layer.gains
-            numbers[i] = share, layer.clamped_strength, gains.geometry, gains.opacity, gains.colour
+            numbers[i] = share, layer.clamped_strength, gains.geometry, gains.opacity, gains.color
             strengths += layer.clamped_strength
         # a little below 1: sums in float32 may round up to where the kernel has to look
-        normalize = blend == "normalised" and strengths > 1 - 1e-6
+        normalize = blend == "normalized" and strengths > 1 - 1e-6
         blocks = plan.blocks
         arguments = (
             self._base, self._out, plan.rows.view(np.uint64), plan.base_index, self._columns,

@@ -28,7 +28,7 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
     exceeded by a tenth of the members: what the edit leaves alone hides nothing, half of its own large
     changes hide all. z is what one sees:
 
-    - "colour": the largest channel of the change in sRGB, root mean square over all directions of view
+    - "color": the largest channel of the change in sRGB, root mean square over all directions of view
       (C0 · √Σ Δ² over the SH coefficients); floor 0.1
     - "opacity": the change of σ(logit); floor 0.2
     - "geometry": the largest of the way / 0.05 of the region's size, the growth of a log-scale / 0.4, and the
@@ -41,7 +41,7 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
     """
     members, field = gdf.region.members, gdf.field
     sizes = {
-        "colour": (_color_change(field), _COLOR),
+        "color": (_color_change(field), _COLOR),
         "opacity": (_opacity_change(scene, members, field), _OPACITY),
         "geometry": (_shape_change(scene, members, field), 1.0),
     }

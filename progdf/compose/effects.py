@@ -20,7 +20,7 @@ Effect = tuple[tuple[float, Gains, Tensor | None, int, int], ...]
 class Effects:
     """The parts of all edits under one blend rule; an edit that does nothing is absent."""
 
-    blend: str = "normalised"
+    blend: str = "normalized"
     of: Mapping[int, Effect] = field(default_factory=dict)
 
 

@@ -29,12 +29,12 @@ LAYER = ("edit", "list", "aligned", "weights", "node", "on_node")
 are all of the edit's; where its [M] weights begin, −1 for all 1; the node at or right of the strength; 1
 where it is at the node."""
 
-NUMBER = ("between", "clamped_strength", "geometry", "opacity", "colour")
+NUMBER = ("between", "clamped_strength", "geometry", "opacity", "color")
 """Columns of `numbers`: where between two nodes the strength is; the strength within 0..1; its gains."""
 
-COLUMN = ("line", "width", "out", "gain", "centres")
+COLUMN = ("line", "width", "out", "gain", "centers")
 """Columns of `columns`, one line an attribute: its first line in a block of `base`, its width, its first
-number in `out`, the column of `numbers` with its gain, and 1 for the centres."""
+number in `out`, the column of `numbers` with its gain, and 1 for the centers."""
 
 
 @kernel(cache=True, allocates=True)
@@ -79,11 +79,11 @@ def compose_rows(
         tables: coefficients and steps
         weights: per member
         over: the blend rule "over"
-        normalize: the blend rule "normalised", and strengths may add up to more than 1 somewhere
+        normalize: the blend rule "normalized", and strengths may add up to more than 1 somewhere
         first_block, last_block: which blocks of 256 rows
 
     Returns:
-        The largest squared distance between new and old centres; 0 where these are not chosen.
+        The largest squared distance between new and old centers; 0 where these are not chosen.
     """
     one = np.float32(1.0)
     weight_sum = np.empty(256, np.float32)

@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 
-BLENDS = ("normalised", "sum", "over")
+BLENDS = ("normalized", "sum", "over")
 """How layers that share a Gaussian go together; see `progdf.compose.reference.compose_layers`."""
 
 KINDS = {
@@ -19,8 +19,8 @@ KINDS = {
     "log_scales": "geometry",
     "quats": "geometry",
     "logit_opacities": "opacity",
-    "sh0": "colour",
-    "shN": "colour",
+    "sh0": "color",
+    "shN": "color",
 }
 """Attribute name -> the gain that scales its change."""
 
@@ -31,7 +31,7 @@ class Gains:
 
     geometry: float = 1.0
     opacity: float = 1.0
-    colour: float = 1.0
+    color: float = 1.0
 
 
 @dataclass(frozen=True)

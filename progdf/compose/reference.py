@@ -26,12 +26,12 @@ NEGATIVE_ZERO = -0.0
 _ALL = slice(None)
 
 
-def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalised") -> Gaussians:
+def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalized") -> Gaussians:
     """The scene under a stack of edits.
 
     With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:
 
-    - "normalised": Σ m g Δ(s) / max(1, Σ m s). One layer alone is untouched, order does not matter, and it
+    - "normalized": Σ m g Δ(s) / max(1, Σ m s). One layer alone is untouched, order does not matter, and it
       is the plain sum while the strengths on a Gaussian add up to no more than 1.
     - "sum": Σ m g Δ(s).
     - "over": in the order given, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s), where c is how much the layer
@@ -81,7 +81,7 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
                 below = below * (1 - weight * hidden * part.coverage[KINDS[name]][part.members, None])
             offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[part.members]
             total[part.rows] = below + weight * layer.gain(name) * offsets
-        if blend == "normalised":
+        if blend == "normalized":
             total = total / weight_sum.clamp(min=1.0)[:, None]
         new = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
         changed[name] = old.index_copy(0, rows, new)

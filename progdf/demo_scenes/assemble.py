@@ -126,7 +126,7 @@ def _sample_visible(
         if len(kept) >= count:
             break
         if drawn > _MOST_DRAWN * count:
-            raise ValueError(f"{part.name} at {part.centre.tolist()} lies inside other parts; move it")
+            raise ValueError(f"{part.name} at {part.center.tolist()} lies inside other parts; move it")
         drawn = max(drawn + 1, math.ceil(1.01 * drawn * count / max(len(kept), 1)))
     chosen = torch.randperm(len(kept), generator=random)[:count].sort().values
     return at[kept[chosen]]

@@ -33,7 +33,7 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
 
 def _rig(count: int = 32, width: int = 512, height: int = 512) -> tuple[Camera, ...]:
     """Cameras around the bear, the first in front, 4 to 42 degrees above the horizon."""
-    centre = torch.tensor([0.0, 0.78, 0.12])
+    center = torch.tensor([0.0, 0.78, 0.12])
     K = intrinsics(math.radians(40), width, height)
     cameras = []
     for i in range(count):
@@ -46,6 +46,6 @@ def _rig(count: int = 32, width: int = 512, height: int = 512) -> tuple[Camera, 
                 math.cos(azimuth) * math.cos(elevation),
             ]
         )
-        viewmat = look_at(centre + 4.6 * direction, centre, torch.tensor([0.0, 1.0, 0.0]))
+        viewmat = look_at(center + 4.6 * direction, center, torch.tensor([0.0, 1.0, 0.0]))
         cameras.append(Camera(viewmat, K, width, height, name=f"bear_{i:03d}"))
     return tuple(cameras)

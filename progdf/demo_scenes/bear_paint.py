@@ -1,4 +1,4 @@
-"""The bear's coat: colour, relief and shine of every part as functions of place."""
+"""The bear's coat: color, relief and shine of every part as functions of place."""
 
 from __future__ import annotations
 

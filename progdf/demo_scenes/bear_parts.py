@@ -29,7 +29,7 @@ def rotation_matrix(degrees: Triple) -> Tensor:
 def ellipsoid(
     name: str,
     label: str,
-    centre: Triple,
+    center: Triple,
     radii: Triple,
     turn: Triple = (0.0, 0.0, 0.0),
     weight: float = 1.0,
@@ -39,20 +39,20 @@ def ellipsoid(
 ) -> Part:
     """An ellipsoid of these radii, turned by degrees about x, then y, then z; see `Part` for the rest."""
     matrix = rotation_matrix(turn) @ torch.diag(torch.tensor(radii))
-    return Part(name, label, ball(exponent), torch.tensor(centre), matrix, weight, None, casts_shadow, clears)
+    return Part(name, label, ball(exponent), torch.tensor(center), matrix, weight, None, casts_shadow, clears)
 
 
 def _detail(
     name: str,
     label: str,
-    centre: Triple,
+    center: Triple,
     radii: Triple,
     turn: Triple = (0.0, 0.0, 0.0),
     weight: float = 7.0,
     clears: float = 0.16,
 ) -> Part:
     """A small part drawn finely, with no fur over it and no shadow of its own."""
-    return ellipsoid(name, label, centre, radii, turn, weight, casts_shadow=False, clears=clears)
+    return ellipsoid(name, label, center, radii, turn, weight, casts_shadow=False, clears=clears)
 
 
 def _eye(x: float) -> list[Part]:
@@ -81,16 +81,16 @@ def _pads(foot: Part) -> list[Part]:
         side = side / side.norm()
         frame = turn @ torch.stack([side, torch.linalg.cross(outward, side), outward], dim=1)
         matrix = frame @ torch.diag(torch.tensor([wide, tall, 0.022]))
-        centre = foot.centre + turn @ torch.tensor([x, y, z])
-        pads.append(Part("pad", foot.label, ball(), centre, matrix, 3.0, None, False, 0.08))
+        center = foot.center + turn @ torch.tensor([x, y, z])
+        pads.append(Part("pad", foot.label, ball(), center, matrix, 3.0, None, False, 0.08))
     return pads
 
 
 def _pair(
-    name: str, label: str, centre: Triple, radii: Triple, turn: Triple = (0, 0, 0), weight: float = 1.0
+    name: str, label: str, center: Triple, radii: Triple, turn: Triple = (0, 0, 0), weight: float = 1.0
 ) -> list[Part]:
     """The part on the +x side and its mirror image; `turn` is that of the +x side."""
-    x, y, z = centre
+    x, y, z = center
     mirrored = (turn[0], -turn[1], -turn[2])
     return [
         ellipsoid(name, label, (x, y, z), radii, turn, weight),

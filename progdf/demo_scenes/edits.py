@@ -1,4 +1,4 @@
-"""Edits whose true course is known: what every Gaussian is at every strength, with nothing to optimise.
+"""Edits whose true course is known: what every Gaussian is at every strength, with nothing to optimize.
 
 A field fitted to one of these can be compared with the truth itself instead of with a recording of it.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from progdf.color import edits as colour
+from progdf.color import edits as color
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
@@ -58,32 +58,32 @@ class AnalyticEdit:
 
 
 def recolor_edit(target: Tensor) -> AnalyticEdit:
-    """`colour.recolor` of every Gaussian, seen from the members' own colour; `target` [3] sRGB."""
+    """`color.recolor` of every Gaussian, seen from the members' own color; `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         rgb = sh0_to_rgb(part.sh0)
-        return _with_color(part, colour.recolor(rgb, target, strength, _own_color(part)), strength)
+        return _with_color(part, color.recolor(rgb, target, strength, _own_color(part)), strength)
 
     return AnalyticEdit("recolor", change)
 
 
 def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
-    """Stripes across `axis` [3], `period` world units apart, in the colour `target` [3] sRGB."""
+    """Stripes across `axis` [3], `period` world units apart, in the color `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         rgb = sh0_to_rgb(part.sh0)
-        pattern = colour.stripe_pattern(part.means, axis, period)
-        edited = colour.stripes(rgb, pattern, target, strength, _own_color(part))
+        pattern = color.stripe_pattern(part.means, axis, period)
+        edited = color.stripes(rgb, pattern, target, strength, _own_color(part))
         return _with_color(part, edited, strength * pattern[:, None, None])
 
     return AnalyticEdit("stripes", change)
 
 
 def darken_edit(stops: float = 3.0) -> AnalyticEdit:
-    """Night falls: `colour.night`, view-dependent light fading with the rest."""
+    """Night falls: `color.night`, view-dependent light fading with the rest."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
-        dark = colour.night(sh0_to_rgb(part.sh0), strength, stops)
+        dark = color.night(sh0_to_rgb(part.sh0), strength, stops)
         # sRGB values fall about as the light to the power 1/2.2
         return replace(part, sh0=rgb_to_sh0(dark), shN=part.shN * 2 ** (-stops * strength / 2.2))
 
@@ -91,7 +91,7 @@ def darken_edit(stops: float = 3.0) -> AnalyticEdit:
 
 
 def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
-    """Scale about the nearest of `pivots` [P,3]: centres move straight, log-scales by log of the size.
+    """Scale about the nearest of `pivots` [P,3]: centers move straight, log-scales by log of the size.
 
     Args:
         factor: size at strength 1
@@ -101,8 +101,8 @@ def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> An
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         size = 1 + strength * (factor - 1)
-        centre = _nearest(part.means, pivots)
-        means = centre + size * (part.means - centre)
+        center = _nearest(part.means, pivots)
+        means = center + size * (part.means - center)
         if shift is not None:
             means = means + strength * shift.to(means)
         return replace(part, means=means, log_scales=part.log_scales + math.log(size))
@@ -111,7 +111,7 @@ def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> An
 
 
 def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
-    """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centres run on circles."""
+    """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centers run on circles."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         half = math.radians(degrees * strength) / 2
@@ -134,12 +134,12 @@ def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
     roots = _ear_roots(scene.gaussians.means[ears])
     return {
         "gold": (
-            recolor_edit(colour.parse_color("#d89a12")),
+            recolor_edit(color.parse_color("#d89a12")),
             scene.members("body", "head", "ears", "arms", "legs"),
         ),
-        "blue scarf": (recolor_edit(colour.parse_color("#2356c7")), scene.members("scarf")),
+        "blue scarf": (recolor_edit(color.parse_color("#2356c7")), scene.members("scarf")),
         "stripes": (
-            stripes_edit(colour.parse_color("#2b62c9"), scene.up, 0.20),
+            stripes_edit(color.parse_color("#2b62c9"), scene.up, 0.20),
             scene.members("body", "arms"),
         ),
         "big ears": (scale_edit(1.7, roots), ears),
@@ -158,9 +158,9 @@ def _ear_roots(means: Tensor) -> Tensor:
 
 
 def _own_color(part: Gaussians) -> Tensor:
-    """The typical colour, each Gaussian counted as much as it can cover. [3]"""
+    """The typical color, each Gaussian counted as much as it can cover. [3]"""
     _, middle, long = part.scales.sort(dim=1).values.unbind(1)
-    return colour.typical_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
+    return color.typical_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
 
 
 def _nearest(means: Tensor, pivots: Tensor) -> Tensor:
@@ -168,7 +168,7 @@ def _nearest(means: Tensor, pivots: Tensor) -> Tensor:
 
 
 def _with_color(part: Gaussians, rgb: Tensor, share: float | Tensor) -> Gaussians:
-    """Set the colour, and let view-dependent light take its hue: the sheen of gold is golden."""
+    """Set the color, and let view-dependent light take its hue: the sheen of gold is golden."""
     hue = rgb.clamp_min(0) / rgb.clamp_min(0).mean(dim=1, keepdim=True).clamp_min(1e-3)
     sheen = part.shN.mean(dim=2, keepdim=True) * (0.35 + 0.65 * hue)[:, None, :]
     return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (sheen - part.shN))

@@ -1,4 +1,4 @@
-"""Light baked into colours: a warm lamp with soft shadows, sky, ground, darkening where parts touch."""
+"""Light baked into colors: a warm lamp with soft shadows, sky, ground, darkening where parts touch."""
 
 from __future__ import annotations
 
@@ -95,10 +95,10 @@ def view_dependent_light(
     Args:
         normals: unit. [N,3]
         velvet, gloss: how much, in sRGB units
-        color: colour of both. [N,3]
+        color: color of both. [N,3]
 
     Returns:
-        what to add to the colour [N,3], and the coefficients of band 1 [N,3,3].
+        what to add to the color [N,3], and the coefficients of band 1 [N,3,3].
     """
     mirror = 2 * (normals @ KEY.direction)[:, None] * normals - KEY.direction
     slope = velvet * normals - gloss * mirror
@@ -112,7 +112,7 @@ def _wrap_light(cosine: Tensor, softness: float) -> Tensor:
 
 def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Tensor:
     """Share of the sky that a part hides, as a sphere of its size at its distance would. [N] in 0..1"""
-    away = part.shape.nearest(local) @ part.matrix.T + part.centre - points
+    away = part.shape.nearest(local) @ part.matrix.T + part.center - points
     gap = away.norm(dim=1)
     size = float(torch.linalg.svdvals(part.matrix)[1]) * part.shape.girth
     towards = torch.where(gap[:, None] > 1e-3, away / gap[:, None].clamp_min(1e-3), normals)

@@ -25,7 +25,7 @@ class Pelt:
         length: what is added to a hair's first, world units: fur keeps some length however fine the sampling
         rise: how steeply a hair leaves the surface; 0 lies, 1 is 45 degrees
         lift: how far a hair's middle is above the surface, in its first standard deviation
-        unruly: how much directions differ from neighbour to neighbour
+        unruly: how much directions differ from neighbor to neighbor
     """
 
     standing: float = 0.0

@@ -124,13 +124,13 @@ def room_parts() -> list[Part]:
 
 
 def _flat(
-    name: str, label: str, centre: Triple, across: Triple, up: Triple, facing: Triple, weight: float
+    name: str, label: str, center: Triple, across: Triple, up: Triple, facing: Triple, weight: float
 ) -> Part:
     """A rectangle of half sides `across` and `up`, seen from the side that `facing` points to."""
     x, y, z = (torch.tensor(axis, dtype=torch.float32) for axis in (across, facing, up))
     z = z if float(torch.linalg.cross(z, x) @ y) > 0 else -z
     matrix = torch.stack([x, y, z], dim=1)
-    return Part(name, label, panel(), torch.tensor(centre, dtype=torch.float32), matrix, weight, None, False)
+    return Part(name, label, panel(), torch.tensor(center, dtype=torch.float32), matrix, weight, None, False)
 
 
 def _lathe_body(

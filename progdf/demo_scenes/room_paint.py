@@ -114,7 +114,7 @@ def _vase(part: Part, at: Samples, table: Tensor) -> Paint:
 
 
 def _flower(part: Part, at: Samples, table: Tensor) -> Paint:
-    kind = int(float(part.centre.sum()) * 1000) % len(_PETALS)
+    kind = int(float(part.center.sum()) * 1000) % len(_PETALS)
     color = mix_colors(_PETALS[kind], "#ffffff", 0.15 + 0.25 * noise(at.points, table, 30.0))
     heart = step(at.local[:, 1], 0.80, 0.92)
     return Paint(

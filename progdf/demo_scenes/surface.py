@@ -133,7 +133,7 @@ class Part:
         name: which part it is; paint goes by it
         label: name of the label its Gaussians carry
         shape: the surface
-        centre: where the shape's origin lies, world units. [3]
+        center: where the shape's origin lies, world units. [3]
         matrix: local -> world directions, stretch and rotation in one. [3,3]
         weight: Gaussians per area against other parts
         density: relative Gaussians per area along the profile, by local radius; None is even
@@ -144,7 +144,7 @@ class Part:
     name: str
     label: str
     shape: Shape
-    centre: Tensor
+    center: Tensor
     matrix: Tensor
     weight: float = 1.0
     density: Callable[[Tensor], Tensor] | None = None
@@ -154,7 +154,7 @@ class Part:
     def to_local(self, points: Tensor) -> Tensor:
         """World points in the shape's coordinates. [N,3] -> [N,3]"""
         inverse: Tensor = torch.linalg.inv(self.matrix)
-        return (points - self.centre) @ inverse.T
+        return (points - self.center) @ inverse.T
 
     def depth(self, points: Tensor) -> Tensor:
         """About how far below the surface points lie, world units, 0 outside. [N,3] world -> [N]"""
@@ -162,17 +162,17 @@ class Part:
         local = self.to_local(points)
         inside = (self.shape.level(local) < 1).nonzero()[:, 0]
         if len(inside):
-            surface = self.shape.nearest(local[inside]) @ self.matrix.T + self.centre
+            surface = self.shape.nearest(local[inside]) @ self.matrix.T + self.center
             depth[inside] = (surface - points[inside]).norm(dim=1)
         return depth
 
     def touches(self, other: Part) -> bool:
         """Whether the spheres around the two parts meet."""
-        return float((self.centre - other.centre).norm()) < self.reach + other.reach
+        return float((self.center - other.center).norm()) < self.reach + other.reach
 
     @property
     def reach(self) -> float:
-        """Radius of a sphere about the centre that holds the part, world units."""
+        """Radius of a sphere about the center that holds the part, world units."""
         profile = self.shape.profile
         farthest = math.sqrt(2) if profile is None else float(profile.norm(dim=1).max())
         return farthest * float(self.matrix.norm(dim=0).max())
@@ -186,7 +186,7 @@ class Samples:
         points: world positions. [N,3]
         local: the same in the shape's coordinates. [N,3]
         normals: unit, outwards. [N,3]
-        spacing: distance to the neighbours, world units. [N]
+        spacing: distance to the neighbors, world units. [N]
     """
 
     points: Tensor
@@ -231,7 +231,7 @@ def sample(part: Part, count: int) -> Samples:
     element = _area_element(part.matrix, spot, tangent, angle)
     cell = element * (2 * math.pi / _TURNS) / (count * t_share * turn_share).float()
     return Samples(
-        local @ part.matrix.T + part.centre,
+        local @ part.matrix.T + part.center,
         local,
         normals / normals.norm(dim=1, keepdim=True),
         cell.sqrt(),
@@ -247,7 +247,7 @@ def _sample_panel(part: Part, count: int) -> Samples:
     normal = torch.linalg.cross(part.matrix[:, 2], part.matrix[:, 0])
     area = float(4 * normal.norm())
     return Samples(
-        local @ part.matrix.T + part.centre,
+        local @ part.matrix.T + part.center,
         local,
         (normal / normal.norm()).expand(count, 3),
         torch.full((count,), math.sqrt(area / count)),

@@ -144,7 +144,7 @@ def _cubic_shares(frames: Tensor, at: Tensor) -> Tensor:
     left, right = gaps[:-1, None], gaps[1:, None]
     tangents[1:-1] = (right * slopes[:-1] + left * slopes[1:]) / (left + right)
     tangents[0], tangents[-1] = slopes[0], slopes[-1]
-    if count > 2:  # the ends bend as their neighbours do: a parabola is met
+    if count > 2:  # the ends bend as their neighbors do: a parabola is met
         tangents[0] = 2 * slopes[0] - tangents[1]
         tangents[-1] = 2 * slopes[-1] - tangents[-2]
     i = torch.searchsorted(frames, at).clamp(1, count - 1)

@@ -33,7 +33,7 @@ LAYOUT: Mapping[Size, tuple[int, int]] = {"tiny": (64, 3), "small": (384, 4), "p
 CONTROL = 16
 """Numbers in one node of the control signal."""
 
-_LOOK = slice(3, BASE_CHANNELS)  # of a packed row: all but the centre
+_LOOK = slice(3, BASE_CHANNELS)  # of a packed row: all but the center
 _LIMIT = 4.0  # standard deviations within which the inputs are kept
 
 
@@ -118,7 +118,7 @@ class NeuralShape:
     def frame(self) -> dict[str, tuple[int, ...]]:
         """Names and shapes of what scales inputs and outputs, float32."""
         look = self.seen - 3 - 6 * self.frequencies
-        return {"centre": (3,), "extent": (), "look_mean": (look,), "look_spread": (look,),
+        return {"center": (3,), "extent": (), "look_mean": (look,), "look_spread": (look,),
                 "spread": (len(self.columns),)}  # fmt: skip
 
 
@@ -226,7 +226,7 @@ class BoundField:
 
 def encode(shape: NeuralShape, frame: Mapping[str, Tensor], rows: Tensor, end: Tensor) -> Tensor:
     """What the network sees of the Gaussians. [M,≥14], [M,c] -> [M,seen]"""
-    place = (rows[:, :3] - frame["centre"]) / frame["extent"]
+    place = (rows[:, :3] - frame["center"]) / frame["extent"]
     waves = place[:, None, :] * (math.pi / 2 * 2.0 ** torch.arange(shape.frequencies))[:, None]
     parts = [place, waves.sin().flatten(1), waves.cos().flatten(1)]
     if shape.inputs == "own":

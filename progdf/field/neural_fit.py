@@ -2,7 +2,7 @@
 
 The direct loss compares offsets, in spreads of their attribute, weighted by how visible the Gaussian is and
 by how much the attribute shows in pictures; it needs no rendering. The paper's L_pred, which compares
-pictures, can finish the work. Weighting by what shows is worth 3.5 dB (robot recoloured, 33 after 29).
+pictures, can finish the work. Weighting by what shows is worth 3.5 dB (robot recolored, 33 after 29).
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ def _place_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
     extent = torch.tensor(1.0)
     if len(rows):
         low, high = rows[:, :3].amin(dim=0), rows[:, :3].amax(dim=0)
-        frame["centre"] = (low + high) / 2
+        frame["center"] = (low + high) / 2
         extent = (high - low).amax() / 2
     frame["extent"] = extent if float(extent) > 1e-12 else torch.tensor(1.0)
     frame["look_spread"] = torch.ones_like(frame["look_spread"])

@@ -41,7 +41,7 @@ class RenderedTrajectories:
 
     Args:
         trajectories: by attribute
-        gram: inner products of these changes over pixels and colours. [A,T,A,T] float64
+        gram: inner products of these changes over pixels and colors. [A,T,A,T] float64
         pictures: inner products of what the snapshots change in the pictures. [T,T] float64
         values: numbers that each inner product sums over
         channels: width of a packed row

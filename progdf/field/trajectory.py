@@ -47,7 +47,7 @@ class Trajectory:
         s: slider value of each recording, ascending, first 0, last 1. [S] float32
         offsets: raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
         end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
-        steps: optimiser steps done at each recording. [S] int64
+        steps: optimizer steps done at each recording. [S] int64
         stage_ends: recording at which each stage ends, ascending, the last S − 1
         strengths: what the editor was asked for, of each stage; `s[stage_ends]` is where that is
     """

@@ -1,6 +1,6 @@
 """Compressed .ply (SuperSplat, splat-transform) → Gaussians: 16 bytes a Gaussian in chunks of 256.
 
-Positions, log-scales and, in newer files, colours are shares of their chunk's range; rotations are the three
+Positions, log-scales and, in newer files, colors are shares of their chunk's range; rotations are the three
 smaller components of a quaternion; opacities are bytes; f_rest bytes cover −4 to 4.
 """
 

@@ -1,8 +1,8 @@
 """.ksplat (the format of GaussianSplats3D) → Gaussians.
 
-A header of 4096 bytes, one of 1024 for each section, then the sections: buckets' centres and rows. Level 0
+A header of 4096 bytes, one of 1024 for each section, then the sections: buckets' centers and rows. Level 0
 keeps float32; levels 1 and 2 keep positions as shares of their bucket, and half floats, SH of level 2 as
-bytes. Colours and opacities are bytes; SH stands band by band, channel-major within a band.
+bytes. Colors and opacities are bytes; SH stands band by band, channel-major within a band.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def _rows(
 
 
 def _centers(path: str | os.PathLike[str], content: bytes, section: _Section) -> Floats:
-    """The centre of each row's bucket: full buckets first, then those whose sizes stand in the file. [N,3]"""
+    """The center of each row's bucket: full buckets first, then those whose sizes stand in the file. [N,3]"""
     sizes = np.frombuffer(content, "<u4", section.partial_buckets, section.sizes_at).astype(np.int64)
     full = section.full_buckets * section.bucket_size
     ends = np.concatenate([[full], full + np.cumsum(sizes)])

@@ -25,7 +25,7 @@ class LoadReport:
         bad_scales: NaN, infinite or beyond e^40
         bad_quats: NaN or infinite
         bad_opacities: NaN
-        bad_colours: NaN or infinite f_dc
+        bad_colors: NaN or infinite f_dc
         bad_sh: NaN or infinite f_rest; only the broken coefficients become 0, the row stays visible
         flat_scales: −inf log-scale (an exactly flat Gaussian), made a very thin one
         opaque: +inf opacity, made a finite one that looks the same
@@ -48,7 +48,7 @@ class LoadReport:
     bad_scales: int = 0
     bad_quats: int = 0
     bad_opacities: int = 0
-    bad_colours: int = 0
+    bad_colors: int = 0
     bad_sh: int = 0
     flat_scales: int = 0
     opaque: int = 0
@@ -67,7 +67,7 @@ class LoadReport:
             (self.bad_scales, "NaN, infinite or absurd scale"),
             (self.bad_quats, "NaN or infinite rotation"),
             (self.bad_opacities, "NaN opacity"),
-            (self.bad_colours, "NaN or infinite colour"),
+            (self.bad_colors, "NaN or infinite color"),
         )
         hidden = ", ".join(f"{group_digits(rows)} with {what}" for rows, what in reasons if rows)
         phrases = (
@@ -104,7 +104,7 @@ class LoadReport:
             lines.append("trained anti-aliased (mip), and drawn so")
         if self.scaled_quats:
             lines.append(
-                f"normalised: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
+                f"normalized: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
             )
         return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]
 

@@ -23,7 +23,7 @@ OPAQUE_LOGIT = 15.0
 """In place of +inf: opacity 1 − 3e-7, which no renderer shows differently, yet an edit can still lower it."""
 
 INVISIBLE_LOGIT = -30.0
-"""In place of −inf: opacity 1e-13, far under the 1/255 that every rasteriser skips."""
+"""In place of −inf: opacity 1e-13, far under the 1/255 that every rasterizer skips."""
 
 LEAST_QUAT = 1e-6
 UNIT_TOLERANCE = 1e-6
@@ -48,9 +48,9 @@ def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
     bad_opacities = scene.logit_opacities.isnan()
     opaque = scene.logit_opacities == torch.inf
     transparent = scene.logit_opacities == -torch.inf
-    bad_colours = ~scene.sh0.isfinite().all(dim=1)
+    bad_colors = ~scene.sh0.isfinite().all(dim=1)
     bad_sh = ~scene.shN.flatten(1).isfinite().all(dim=1)
-    hidden = bad_means | bad_scales | bad_quats | bad_opacities | bad_colours
+    hidden = bad_means | bad_scales | bad_quats | bad_opacities | bad_colors
     counts = {
         "scaled_quats": int(((lengths != 1) & ~zero_quats & ~bad_quats).sum()),
         "hidden": int(hidden.sum()),
@@ -58,7 +58,7 @@ def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
         "bad_scales": int(bad_scales.sum()),
         "bad_quats": int(bad_quats.sum()),
         "bad_opacities": int(bad_opacities.sum()),
-        "bad_colours": int(bad_colours.sum()),
+        "bad_colors": int(bad_colors.sum()),
         "bad_sh": int(bad_sh.sum()),
         "flat_scales": int((flat.any(dim=1) & ~hidden).sum()),
         "opaque": int((opaque & ~hidden).sum()),

@@ -44,7 +44,7 @@ from .header import (
 from .region_packing import pack_region, unpack_region
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[int, str]] = WeakIdKeyDictionary()
-"""Version and hash of the centres of scenes that are alive."""
+"""Version and hash of the centers of scenes that are alive."""
 _FAR = 1e18
 """An offset that is larger is absurd, as a position is (see `progdf.formats.repair`)."""
 _FARTHEST = {"log_scales": 80.0}

@@ -185,7 +185,7 @@ def _own(file: str, index: int, entry: object) -> Camera:
 
 
 def _inria(file: str, index: int, entry: object) -> Camera:
-    """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the centre."""
+    """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the center."""
     where = f"camera {index} of {file}"
     table = table_at(where, entry)
     c2w = torch.eye(4, dtype=torch.float64)

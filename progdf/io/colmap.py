@@ -44,7 +44,7 @@ _LENSES = {
 
 
 class _Image(msgspec.Struct):
-    """A registered image: world → camera, OpenCV axes, pixel centres at +0.5, as ours."""
+    """A registered image: world → camera, OpenCV axes, pixel centers at +0.5, as ours."""
 
     name: str
     pose: list[list[float]]

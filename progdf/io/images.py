@@ -149,7 +149,7 @@ def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
 
 
 def flatten_onto(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
-    """The picture without transparency, on a paper of one colour, scaled to `size`. RGB"""
+    """The picture without transparency, on a paper of one color, scaled to `size`. RGB"""
     if not picture.has_transparency_data:
         plain = picture.convert("RGB")
         return plain if size in (None, plain.size) else plain.resize(size, Image.Resampling.LANCZOS)

@@ -17,7 +17,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
     Args:
         image, target: the same shape. [H,W,3] or [...]
-        mask: what counts, bool or weights 0..1; broadcast over the colours. [H,W]
+        mask: what counts, bool or weights 0..1; broadcast over the colors. [H,W]
 
     Raises:
         ValueError: shapes differ, or the mask counts nothing.
@@ -33,7 +33,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Structural similarity (Wang et al. 2004): Gaussian window 11 px, σ 1.5, range 1, per colour;
+    """Structural similarity (Wang et al. 2004): Gaussian window 11 px, σ 1.5, range 1, per color;
     differentiable.
 
     Args:

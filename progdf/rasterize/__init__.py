@@ -1,11 +1,11 @@
-"""The differentiable rasteriser: one signature, several engines.
+"""The differentiable rasterizer: one signature, several engines.
 
 `reference` is plain torch, slow, in any floating type: the oracle. `cpu` is numba, fast, with an analytic
 backward. The conventions both follow are in `conventions.py`; beyond those numbers:
 
 - the support of a Gaussian is exactly {alpha ≥ 1/255}, whatever the tile size;
 - the near plane cuts at camera z > `near`; order is camera z in float32, ties by index;
-- pixel centres lie at column + 0.5, row + 0.5;
+- pixel centers lie at column + 0.5, row + 0.5;
 - a Gaussian with a number that is not finite is not drawn; a quaternion that is zero or not finite is the
 identity.
 """
@@ -48,7 +48,7 @@ def rasterize(
     """Draw Gaussians in activated units (Kerbl et al. 2023), differentiable in every floating input.
 
     Args:
-        means: centres, world units. [N,3]
+        means: centers, world units. [N,3]
         quats: rotations wxyz, any nonzero length. [N,4]
         scales: standard deviations, world units, ≥ 0. [N,3]
         opacities: 0..1. [N]
@@ -104,7 +104,7 @@ def render(
     A scene that was trained anti-aliased is drawn so (`Gaussians.antialiased`).
 
     Returns:
-        image [H,W,3] float32 in 0..1 as far as the colours are (of the window where there is a `crop`)
+        image [H,W,3] float32 in 0..1 as far as the colors are (of the window where there is a `crop`)
     """
     degree = min(gaussians.sh_degree, 3)
     image, _, _ = rasterize(

@@ -30,7 +30,7 @@ class RasterInfo:
     """What the projection found, not differentiable.
 
     Args:
-        means2d: centres in pixels; 0 for a Gaussian that is not in front of the near plane or not finite.
+        means2d: centers in pixels; 0 for a Gaussian that is not in front of the near plane or not finite.
             [N,2]
         depths: camera z, world units; 0 likewise. [N] float32
         visible: the box around its {alpha ≥ 1/255} touches the window that was rendered. [N] bool

@@ -1,6 +1,6 @@
-"""Depth: how far away what a pixel shows is. Any engine draws it, as a colour that is no colour.
+"""Depth: how far away what a pixel shows is. Any engine draws it, as a color that is no color.
 
-    depth = Σ w z / Σ w,  alpha = Σ w,  w = αT,  z: camera z of a Gaussian's centre
+    depth = Σ w z / Σ w,  alpha = Σ w,  w = αT,  z: camera z of a Gaussian's center
 
 The expected depth, as gsplat's "ED": of a surface half covered by another it lies between the two. There is
 no kernel of its own: the scene is painted with (z, 1, 0) and drawn on black, so the depth has the picture's
@@ -46,7 +46,7 @@ def render_depth(
 
 
 def paint_depth(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The scene in the colours (camera z, 1, 0), to be drawn on black from this camera by any engine."""
+    """The scene in the colors (camera z, 1, 0), to be drawn on black from this camera by any engine."""
     viewmat = camera.viewmat.double()
     z = (gaussians.means.double() @ viewmat[2, :3] + viewmat[2, 3]).to(gaussians.means)
     colors = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)

@@ -19,7 +19,7 @@ from .engines import RasterView
 Array = NDArray[Any]
 
 CELL = 8
-"""Pixels of a cell's side; a cell spans whole rows of the rasteriser's tiles."""
+"""Pixels of a cell's side; a cell spans whole rows of the rasterizer's tiles."""
 
 _MARGIN = 1.0  # px on each side: far more than rounding, far less than a cell
 

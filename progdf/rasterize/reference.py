@@ -1,4 +1,4 @@
-"""The rasteriser in plain torch: any floating type, differentiable in everything, the oracle of the tests.
+"""The rasterizer in plain torch: any floating type, differentiable in everything, the oracle of the tests.
 
 Conventions: Kerbl et al. 2023 (3D Gaussian Splatting) with the choices listed in `progdf.rasterize`. Tiles of
 16x16 pixels bound the memory; within a tile every Gaussian meets every pixel.
@@ -34,7 +34,7 @@ class ReferenceSplats:
 
     Args:
         rows: their indices. [V] int64
-        means2d: centres in pixels. [V,2]
+        means2d: centers in pixels. [V,2]
         whitening: L with σ = ½|Lᵀd|² for a pixel offset d: l11, l21, l22. [V,3]
         opacities: activated, antialias included. [V]
         colors: rgb. [V,3]
@@ -148,8 +148,8 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
         extents[order].to(dtype),
     )
     visible = torch.zeros(len(means), dtype=torch.bool).index_fill(0, splats.rows, True)
-    centres = torch.zeros_like(means[:, :2]).index_copy(0, rows, means2d).detach().float()
-    return splats, RasterInfo(centres, depths, visible)
+    centers = torch.zeros_like(means[:, :2]).index_copy(0, rows, means2d).detach().float()
+    return splats, RasterInfo(centers, depths, visible)
 
 
 def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -163,8 +163,8 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
     near_x = (high[:, 0] >= x) & (low[:, 0] <= x + TILE)
     near_y = (high[:, 1] >= y) & (low[:, 1] <= y + TILE)
     members = (near_x & near_y).nonzero()[:, 0]
-    centre = torch.arange(TILE, dtype=splats.means2d.dtype) + 0.5
-    pixels = torch.cartesian_prod(y + centre, x + centre).flip(1)
+    center = torch.arange(TILE, dtype=splats.means2d.dtype) + 0.5
+    pixels = torch.cartesian_prod(y + center, x + center).flip(1)
     dx, dy = (pixels[:, None] - splats.means2d[members]).unbind(2)
     l11, l21, l22 = splats.whitening[members].unbind(1)
     raw = splats.opacities[members] * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))

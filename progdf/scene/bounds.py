@@ -25,18 +25,18 @@ _SOLID, _CORE = 0.1, 2.5
 
 
 def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
-    """Centre [3] and radius (> 0) of the bulk of a scene, world units.
+    """Center [3] and radius (> 0) of the bulk of a scene, world units.
 
     The median of the means, and the distance within which 97 % of them lie: far strays do not count. A scene
     of one or a few Gaussians is as large as these are: twice the median of their longest axes at least.
     """
     scene = _sample(scene)
     means = scene.means
-    centre = means.median(dim=0).values
-    distances = (means - centre).norm(dim=1)
+    center = means.median(dim=0).values
+    distances = (means - center).norm(dim=1)
     nearest = max(round(0.97 * len(means)), 1)
     size = 2 * float(scene.log_scales.amax(dim=1).median().exp())
-    return centre, max(float(distances.kthvalue(nearest).values), size, 1e-6)
+    return center, max(float(distances.kthvalue(nearest).values), size, 1e-6)
 
 
 def near_plane(radius: float) -> float:
@@ -69,8 +69,8 @@ def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
     far 3 % begin more than five times as far out as the middle, as in outdoor captures with a background).
     """
     sample = _sample(scene)
-    centre, radius = scene_sphere(sample)
-    typical = float((sample.means - centre).norm(dim=1).median())
+    center, radius = scene_sphere(sample)
+    typical = float((sample.means - center).norm(dim=1).median())
     return len(sample) >= _ENOUGH and (radius > _LONG_TAIL * typical or has_ceiling(sample, up))
 
 
@@ -110,12 +110,12 @@ def plane_facing(scene: Gaussians, axis: int) -> tuple[Tensor, Tensor]:
     """How high each Gaussian lies along a world axis, and how much flat area it turns that way.
 
     Returns:
-        height over the centre, in radii of the bulk, −1.5..1.5 [N]; share of the scene's flat area [N]
+        height over the center, in radii of the bulk, −1.5..1.5 [N]; share of the scene's flat area [N]
     """
-    centre, radius = scene_sphere(scene)
+    center, radius = scene_sphere(scene)
     flat = _flatness(scene)
     facing = flat * normals_of(scene)[:, axis].abs() ** 4 / flat.sum().clamp_min(1e-30)
-    return ((scene.means[:, axis] - centre[axis]) / radius).clamp(-1.5, 1.5), facing
+    return ((scene.means[:, axis] - center[axis]) / radius).clamp(-1.5, 1.5), facing
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:

@@ -41,13 +41,13 @@ def orbit_rig(
     even in area: every n-th camera of the list is spread as evenly as the whole.
 
     Args:
-        scene: framed by its median centre and 97th-percentile radius, see `scene_sphere`
+        scene: framed by its median center and 97th-percentile radius, see `scene_sphere`
         count: number of cameras, ≥ 1
         width, height: image size in pixels
         fov_y: vertical field of view, radians
         up: world direction that is up, [3]; None guesses it, see `guess_up`
         elevations: lowest and highest, degrees above the horizon, −89..89; below 0 is under the ground
-        distance: from the centre, in radii at a field of view of 60° along the shorter side of the image; a
+        distance: from the center, in radii at a field of view of 60° along the shorter side of the image; a
             narrower or wider field moves the cameras so that the scene keeps its size in the picture
 
     Raises:
@@ -66,7 +66,7 @@ def orbit_rig(
             "this looks like a scene to stand inside: cameras around it cannot frame it; "
             "give its own cameras, or keep views with F4 in progdf view"
         )
-    centre, radius = scene_sphere(scene)
+    center, radius = scene_sphere(scene)
     K = intrinsics(fov_y, width, height)
     half = math.atan(0.5 * min(width, height) / float(K[1, 1]))
     away = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
@@ -79,6 +79,6 @@ def orbit_rig(
         rise = low + (high - low) * ((0.5 + i * _GOLDEN) % 1.0)
         level = math.sqrt(1 - rise * rise)
         back = level * (math.cos(azimuth) * ahead + math.sin(azimuth) * side) + rise * up
-        viewmat = look_at(centre + away * back, centre, up)
+        viewmat = look_at(center + away * back, center, up)
         cameras.append(Camera(viewmat, K, width, height, name=f"orbit_{i:03d}"))
     return cameras

@@ -4,7 +4,7 @@
     PART    = 'all'
             | 'labels:' FILE '.npy:' ID (',' ID)*
             | 'box:' x0,y0,z0,x1,y1,z1           two opposite corners, world units
-            | 'sphere:' x,y,z,r                  centre and radius, world units
+            | 'sphere:' x,y,z,r                  center and radius, world units
             | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
             | KIND ':' …                         other kinds that the caller knows, e.g. masks:, text:
 

@@ -30,21 +30,21 @@ class Survey:
 
     Args:
         count: Gaussians N
-        centre: median of the means, world units
-        radius: distance from the centre within which 97 % of the means lie, world units
-        farthest: distance of the farthest mean from the centre, world units
+        center: median of the means, world units
+        radius: distance from the center within which 97 % of the means lie, world units
+        farthest: distance of the farthest mean from the center, world units
         box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis
         up: which way is up, and how that was decided
         surrounding: it looks like a scene to stand inside, which cameras around it cannot frame
         median_size: median of the longest axes, one standard deviation, world units
         largest_size: the longest axis of all
-        invisible: Gaussians with an opacity under 1/255, which no rasteriser draws
+        invisible: Gaussians with an opacity under 1/255, which no rasterizer draws
         giants: see `GIANT`
         needles: see `NEEDLE`
     """
 
     count: int
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
     radius: float
     farthest: float
     box: tuple[float, ...]
@@ -59,9 +59,9 @@ class Survey:
 
     def lines(self) -> list[str]:
         """The survey for a person, a line per fact."""
-        x, y, z = self.centre
+        x, y, z = self.center
         lines = [
-            f"place: centre {x:.4g} {y:.4g} {z:.4g}, radius {self.radius:.4g} (97 % of the Gaussians), "
+            f"place: center {x:.4g} {y:.4g} {z:.4g}, radius {self.radius:.4g} (97 % of the Gaussians), "
             f"farthest {self.farthest:.4g}",
             f"up: {self.up.name}, {self.up.reason}",
             f"bulk, 95 % along each axis: --region {_box(self.bulk_box)}",
@@ -90,17 +90,17 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
         scene: N Gaussians
         up: which way is up; None finds it
     """
-    centre, radius = scene_sphere(scene)
+    center, radius = scene_sphere(scene)
     up = find_up(scene) if up is None else up
     axes = scene.log_scales.sort(dim=1).values
     longest = axes[:, 2].exp()
     needles = (axes[:, 2] - axes[:, 1] > torch.tensor(NEEDLE).log()) & (longest > LONG * radius)
-    x, y, z = centre.tolist()
+    x, y, z = center.tolist()
     return Survey(
         count=len(scene),
-        centre=(x, y, z),
+        center=(x, y, z),
         radius=radius,
-        farthest=float((scene.means - centre).norm(dim=1).max()),
+        farthest=float((scene.means - center).norm(dim=1).max()),
         box=_corners(scene.means, 0.0),
         bulk_box=_corners(scene.means, 0.025),
         up=up,

@@ -21,13 +21,13 @@ uniform int blend;                // index into progdf.compose.layers.BLENDS
 
 const int TEXELS_PER_ROW = 4096;
 const int LAYER_TEXELS = 6;
-const int NORMALISED = 0, SUM = 1, OVER = 2;
+const int NORMALIZED = 0, SUM = 1, OVER = 2;
 
 struct Part {
     int member;    // −1: none
     float share;   // painted strength, 0..1
     float cover;   // strength without its overshoot, 0..1
-    vec4 hides;    // of geometry, opacity and colour (progdf/compose/coverage.py), 0..1; only where blend is OVER
+    vec4 hides;    // of geometry, opacity and color (progdf/compose/coverage.py), 0..1; only where blend is OVER
 };
 
 ivec2 texel_at(int index) {
@@ -84,6 +84,6 @@ vec4 nothing() {
 
 // crowd: Σ share · cover of the layers.
 vec4 finished(vec4 original, vec4 total, bvec4 moved, float crowd) {
-    if (blend == NORMALISED && crowd > 1.0) total /= crowd;
+    if (blend == NORMALIZED && crowd > 1.0) total /= crowd;
     return mix(original, original + total, moved);
 }

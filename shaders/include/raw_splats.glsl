@@ -20,7 +20,7 @@ vec3 sh_coefficient(ivec2 texel, int k) {
     return texelFetch(shN, ivec2(texel.x * sh_coefficients + k, texel.y), 0).rgb;
 }
 
-// True for NaN and infinities. By the bits, as drivers may optimise x != x away.
+// True for NaN and infinities. By the bits, as drivers may optimize x != x away.
 bool not_finite(float value) {
     return (floatBitsToUint(value) & 0x7f800000u) == 0x7f800000u;
 }

@@ -59,24 +59,24 @@ def _names(options: TrainOptions, *about: object) -> set[str]:
 
 
 def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
-    color = _names(options, "colour", 4, 1)
+    color = _names(options, "color", 4, 1)
     assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "paper"} <= color
     assert "no-lpips" not in color, "colors are solved for, without LPIPS"
-    assert "no-lpips" in _names(replace(options, perceptual_weight=0.1), "colour", 4, 1)
+    assert "no-lpips" in _names(replace(options, perceptual_weight=0.1), "color", 4, 1)
     assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & color
     style = _names(options, "style", 4, 1)
     assert "sharpness-off" in style
     assert "sharpness-hinge" not in style
     assert "no-groups" in _names(options, "geometry", 4, 1)
-    assert not {"one-target", "slider-stages"} & _names(options, "colour", 1, 1)
-    assert "no-sh" not in _names(options, "colour", 4, 0)
+    assert not {"one-target", "slider-stages"} & _names(options, "color", 1, 1)
+    assert "no-sh" not in _names(options, "color", 4, 0)
     without = replace(options, perceptual_weight=0.0, progressive="warmup")
     assert "no-lpips" not in _names(without, "style", 4, 1)
-    assert "progressive-off" in _names(without, "colour", 4, 1)
+    assert "progressive-off" in _names(without, "color", 4, 1)
 
 
 def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
-    variants = differing_variants(options, "colour", 4, 1)
+    variants = differing_variants(options, "color", 4, 1)
     assert [v.name for v in choose_variants(variants, "no-sh, base")] == ["base", "no-sh"]
     with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
         choose_variants(variants, "base,warmup")
@@ -117,7 +117,7 @@ def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to
     assert not list((run / "ablation").glob("*/state"))
 
 
-def test_variants_of_the_slider_share_one_optimisation_and_end_alike(run: Path) -> None:
+def test_variants_of_the_slider_share_one_optimization_and_end_alike(run: Path) -> None:
     rows = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))["variants"]
     base, linear, plain, by_time = rows
     assert base["psnr"] == linear["psnr"] == by_time["psnr"] != plain["psnr"]

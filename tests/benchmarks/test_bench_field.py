@@ -70,7 +70,7 @@ def test_the_plot_has_a_panel_for_every_edit_and_grows_by_rows_of_three() -> Non
     assert four.width == three.width
     assert four.height > 1.8 * three.height
     corner = three.crop((three.width * 2 // 3, three.height // 2, three.width, three.height))
-    assert any(colour != PAPER for _, colour in corner.getcolors(maxcolors=100_000) or [])
+    assert any(color != PAPER for _, color in corner.getcolors(maxcolors=100_000) or [])
 
 
 def test_a_separable_point_lies_higher_where_its_error_is_smaller() -> None:

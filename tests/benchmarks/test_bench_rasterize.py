@@ -1,4 +1,4 @@
-"""The rasteriser's benchmark runs, and the engine keeps its floor of speed at its ceiling of error."""
+"""The rasterizer's benchmark runs, and the engine keeps its floor of speed at its ceiling of error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from benchmarks import rasterizer as bench_rasterize
 from benchmarks.rasterizer import RasterCase, measure, tables
 
 
-def test_the_rasteriser_benchmark_names_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rasterizer_benchmark_names_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_rasterize, "CASES", (RasterCase(60, 32), RasterCase(90, 40, baseline=False)))
     monkeypatch.setattr(bench_rasterize, "measure", lambda case: measure(case, rounds=1, torch_rounds=1))
     (table,) = tables()

@@ -63,9 +63,9 @@ def hands_truth(path: Path = PLAYBOT, factor: float = 1.35, lift: float = 0.12) 
     """The toy robot with both hands enlarged and lifted by `lift` world units (its y axis points down)."""
     scene = load_ply(path)
     labels = np.load(path.with_name(f"{path.stem}_labels.npy"))
-    centres = [scene.means[torch.from_numpy(labels == hand)].mean(dim=0) for hand in _HANDS]
+    centers = [scene.means[torch.from_numpy(labels == hand)].mean(dim=0) for hand in _HANDS]
     return Truth(
-        scene, labels, _HANDS, scale_edit(factor, torch.stack(centres), torch.tensor([0.0, -lift, 0.0]))
+        scene, labels, _HANDS, scale_edit(factor, torch.stack(centers), torch.tensor([0.0, -lift, 0.0]))
     )
 
 

@@ -54,7 +54,7 @@ def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
 
 
 def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
-    """A stand-in for a renderer: shows colour well, geometry little, half of the members not at all."""
+    """A stand-in for a renderer: shows color well, geometry little, half of the members not at all."""
     rng = torch.Generator().manual_seed(seed)
     shown = torch.randn(90, members, channels, generator=rng) / (members * channels) ** 0.5
     shown[:, ::2] = 0.0

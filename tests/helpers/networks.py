@@ -49,7 +49,7 @@ def baked(form: str = "own") -> BakedField:
 
 
 def smooth_trajectory(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Strengths and offsets of members whose colours change as a smooth function of their place."""
+    """Strengths and offsets of members whose colors change as a smooth function of their place."""
     strengths = torch.linspace(0, 1, 9)
     offsets = torch.zeros(9, len(places), 14)
     wave = torch.sin(places)

@@ -28,7 +28,7 @@ def write_scene(path: Path, scene: Gaussians, spz_version: int = 4) -> Path:
 
 
 def write_compressed_ply(path: Path, scene: Gaussians, comment: str = "", colors: bool = True) -> Path:
-    """As SuperSplat writes it; without `colors` as it did before chunks had a range of colours."""
+    """As SuperSplat writes it; without `colors` as it did before chunks had a range of colors."""
     n = len(scene)
     places, scales = scene.means.numpy(), scene.log_scales.numpy()
     rgb, edges = (scene.sh0 * C0 + 0.5).numpy(), [range(i, min(i + 256, n)) for i in range(0, n, 256)]

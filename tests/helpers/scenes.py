@@ -20,7 +20,7 @@ def random_gaussians(
         count: N
         seed: the same seed gives the same cloud
         sh_degree: 0..3
-        spread: standard deviation of the centres, world units
+        spread: standard deviation of the centers, world units
         scale: median standard deviation of one Gaussian, world units; axes differ by a factor of about 2
     """
     rng = torch.Generator().manual_seed(seed)
@@ -69,7 +69,7 @@ def one_gaussian(
     opacity: float = 0.8,
     rgb: tuple[float, float, float] = (0.9, 0.3, 0.1),
 ) -> Gaussians:
-    """A single Gaussian in activated units: opacity 0..1, deviations in world units, colour 0..1."""
+    """A single Gaussian in activated units: opacity 0..1, deviations in world units, color 0..1."""
     return Gaussians(
         means=torch.tensor([mean]),
         quats=torch.tensor([quat]),
@@ -138,7 +138,7 @@ def hard_cases() -> dict[str, HardCase]:
 
     add("opacity exactly 1", one_gaussian(opacity=1.0))
     add("opacity 0", one_gaussian(opacity=0.0))
-    on_pixel = (0.5 / 30.0 * 2.0, 0.5 / 30.0 * 2.0, 2.0)  # projects onto a pixel centre
+    on_pixel = (0.5 / 30.0 * 2.0, 0.5 / 30.0 * 2.0, 2.0)  # projects onto a pixel center
     add("opacity exactly 1/255", one_gaussian(mean=on_pixel, opacity=1 / 255))
     nan, inf = float("nan"), float("inf")
     for name, value in (("NaN", nan), ("inf", inf), ("-inf", -inf)):
@@ -178,20 +178,20 @@ def hard_cases() -> dict[str, HardCase]:
 
     for name, z in (("at", 0.01), ("just before", 0.0100001), ("just behind", 0.0099999)):
         add(f"{name} the near plane", one_gaussian(mean=(0.0, 0.0, z), scales=(1e-3, 1e-3, 1e-3)))
-    add("at the camera centre", one_gaussian(mean=(0.0, 0.0, 0.0)))
+    add("at the camera center", one_gaussian(mean=(0.0, 0.0, 0.0)))
     add("behind the camera", one_gaussian(mean=(0.0, 0.0, -2.0)))
-    add("centre outside, clamp active", one_gaussian(mean=(4.5, 3.0, 2.0), scales=(1.5, 1.0, 1.2)))
-    add("centre outside on the other side", one_gaussian(mean=(-4.5, -3.0, 2.0), scales=(1.5, 1.0, 1.2)))
+    add("center outside, clamp active", one_gaussian(mean=(4.5, 3.0, 2.0), scales=(1.5, 1.0, 1.2)))
+    add("center outside on the other side", one_gaussian(mean=(-4.5, -3.0, 2.0), scales=(1.5, 1.0, 1.2)))
     off = torch.tensor([[34.0, 0.0, 9.0], [0.0, 21.0, 17.5], [0.0, 0.0, 1.0]])
     wide = concatenate(plain, one_gaussian(mean=(3.4, -2.0, 2.0), scales=(1.5, 1.0, 1.2)))
-    add("principal point off centre, fx unequal fy", wide, replace(front, K=off))
+    add("principal point off center, fx unequal fy", wide, replace(front, K=off))
 
     add("far away", one_gaussian(mean=(2e3, 1e3, 1e5), scales=(5e3, 2e3, 1e3)))
     add("coordinates of 2250", replace(plain, means=plain.means * 750), replace(front))
     loud = plain.sh0.clone()
     loud[::3] = 13.0
     loud[1::3] = -13.0
-    add("colour coefficients of 13", replace(plain, sh0=loud))
+    add("color coefficients of 13", replace(plain, sh0=loud))
     flat = plain.means.clone()
     flat[:, 2] = 3.0
     add("equal depths", replace(plain, means=flat))

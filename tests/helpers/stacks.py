@@ -21,7 +21,7 @@ from viewer.camera.view_camera import first_camera
 from viewer.state.view_state import LayerState, ViewState
 
 NODES = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
-SCARF, EARS = 0, 1  # a change of colour, and one of geometry and colour
+SCARF, EARS = 0, 1  # a change of color, and one of geometry and color
 GREEN, GOLD = (0.10, 0.62, 0.24), (0.90, 0.66, 0.15)
 
 
@@ -70,7 +70,7 @@ def bear_stack(size: int = 4000) -> Stack:
     demo = bear(size)
     scene = demo.gaussians
     scarf, ears = demo.members("scarf"), demo.members("ears")
-    centre = scene.means[ears].mean(0)
+    center = scene.means[ears].mean(0)
     return Stack(
         demo,
         (
@@ -82,7 +82,7 @@ def bear_stack(size: int = 4000) -> Stack:
                 "grow",
                 {
                     "sh0": _towards(scene, ears, GOLD),
-                    "means": 0.35 * (scene.means[ears] - centre),
+                    "means": 0.35 * (scene.means[ears] - center),
                     "log_scales": torch.full((len(ears), 3), 0.3),
                 },
             ),

@@ -52,12 +52,12 @@ Optimization = tuple[Tensor, list[CropScene], list[CropScene], list[TargetStage]
 
 
 def course(case: Small, steps: int = 40, **more: object) -> Optimization:
-    """What `optimise` needs to recolour a small bear's part in two stages."""
+    """What `optimize` needs to recolor a small bear's part in two stages."""
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     stages = [TargetStage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in (0.5, 1.0)]
-    settings = replace(PgsSettings(learning_rates("colour", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
+    settings = replace(PgsSettings(learning_rates("color", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
     return original, crops, crops[:2], stages, Objective(GradientL1(), LossWeights()), settings
 
 

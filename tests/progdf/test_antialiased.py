@@ -135,7 +135,7 @@ def test_training_views_show_what_is_drawn(stack: Stack) -> None:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["gl", "cpu"])
-def test_the_window_draws_it_as_the_rasteriser_does(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
+def test_the_window_draws_it_as_the_rasterizer_does(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
     view = ViewState(
         camera=first_camera(stack.scene, stack.demo.cameras), layers=(LayerState(0, "scarf", 0.7),)
     )

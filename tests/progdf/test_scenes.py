@@ -1,4 +1,4 @@
-"""The bear: exact size, seeded, labelled, opaque; and edits whose course is known."""
+"""The bear: exact size, seeded, labeled, opaque; and edits whose course is known."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_every_number_of_the_bear_is_usable(bear: scenes.DemoScene) -> None:
     assert g.opacities.std() > 0.02
 
 
-def test_some_colours_are_clamped_as_in_real_scenes(bear: scenes.DemoScene) -> None:
+def test_some_colors_are_clamped_as_in_real_scenes(bear: scenes.DemoScene) -> None:
     rgb = sh0_to_rgb(bear.gaussians.sh0)
     assert (rgb < 0.03).any()
     assert (rgb > 0.97).any()
@@ -202,7 +202,7 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     assert (same - render(plain, camera)).abs().max() < 1e-2
 
 
-def test_recolouring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
+def test_recoloring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
     scarf = bear.members("scarf")
     target = torch.tensor([0.1, 0.5, 0.3])
     edited = scenes.recolor_edit(target).apply(bear.gaussians, scarf, 1.0)

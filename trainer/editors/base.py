@@ -10,7 +10,7 @@ from torch import Tensor
 
 from trainer.views.view import View
 
-EditKind = Literal["colour", "style", "geometry"]
+EditKind = Literal["color", "style", "geometry"]
 """What an edit moves, which chooses learning rates and loss weights (docs/method.md 3)."""
 
 Confine = Literal["auto", "yes", "no"]

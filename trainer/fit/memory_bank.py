@@ -1,8 +1,8 @@
-"""The memory bank of snapshots, and the field that is trained on it while the edit is optimised.
+"""The memory bank of snapshots, and the field that is trained on it while the edit is optimized.
 
 ProGDF trains its field alongside PGS: after each of its steps one of the field's, on a snapshot drawn from
 those recorded so far. The slider values are not known before the whole way is, so a snapshot goes by its
-stage's strength and its step until then; when the optimisation is done, the network is finished on the
+stage's strength and its step until then; when the optimization is done, the network is finished on the
 trajectory as it was re-timed. Its end is not known either: until then a network sees positions (and its
 codes) alone. Separable and keyframe fields have closed forms: they are solved once the trajectory is whole.
 """
@@ -21,7 +21,7 @@ from progdf.field.separable import moving_attributes
 from trainer.store.state import Saved
 
 MOST = 64
-"""Snapshots that a bank keeps; of more, those go that differ least in time from their neighbours."""
+"""Snapshots that a bank keeps; of more, those go that differ least in time from their neighbors."""
 
 
 class MemoryBank:

@@ -1,6 +1,6 @@
 """An edit of one target: does it keep the way that its training took, or go straight?
 
-Nobody said what lies between original and end, and an optimiser's way there need not be shown: it
+Nobody said what lies between original and end, and an optimizer's way there need not be shown: it
 takes bytes, and looks worse half way than a blend as often as not. So it has to be nearer to the editor's own
 picture of the half, where the editor has one; parts that move as wholes keep their way, on which they stay
 whole. Everything else goes straight, which are two keyframes.

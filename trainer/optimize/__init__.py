@@ -1,1 +1,1 @@
-"""The edit optimisation that records a trajectory."""
+"""The edit optimization that records a trajectory."""

@@ -275,7 +275,7 @@ def _columns(channels: int, bands: int) -> Tensor:
 
 
 def _map_threads(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
-    """`work` of every item, on as many threads as the rasteriser has; the result depends on none of them."""
+    """`work` of every item, on as many threads as the rasterizer has; the result depends on none of them."""
     if threads() == 1 or len(items) == 1:
         return [work(item) for item in items]
     with ThreadPoolExecutor(threads()) as pool:

@@ -1,9 +1,9 @@
 """The group stage: before anything bends, each connected part is moved as a whole to where the edit shows it.
 
-Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever colour
+Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever color
 it lies on. So the parts' motions are found first, and the members' own offsets live in the frames of their
 parts from then on: what is learnt of a hand moves, turns and grows with the hand (docs/method.md 3).
-The way between two strengths is the parts' way, not the optimiser's: a slider shows the hand in motion.
+The way between two strengths is the parts' way, not the optimizer's: a slider shows the hand in motion.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def group_path(
         original: raw member rows. [M,C]
         groups: see `group_stage`
         ends: the members' offsets at the end of each stage. [M,C] each
-        steps: optimiser steps done then
+        steps: optimizer steps done then
         count: recordings over all stages, about
 
     Returns:

@@ -1,4 +1,4 @@
-"""What the optimiser minimises: L1, a perceptual term, and the clamp whose gradient is not lost.
+"""What the optimizer minimizes: L1, a perceptual term, and the clamp whose gradient is not lost.
 
 L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md 3).
 """
@@ -104,7 +104,7 @@ def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
 def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
     """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
 
-    The paper penalises every parameter's step with α·β^(t/s) (eq. 5), which freezes the edit at its weights;
+    The paper penalizes every parameter's step with α·β^(t/s) (eq. 5), which freezes the edit at its weights;
     what helps is that early steps are short (docs/method.md 3).
     """
     return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
@@ -150,7 +150,7 @@ def sharpness(
 
 
 def laplacian(luma: Tensor) -> Tensor:
-    """Sum of the four neighbours minus four times the pixel, where all four exist. [h,w] -> [h-2,w-2]"""
+    """Sum of the four neighbors minus four times the pixel, where all four exist. [h,w] -> [h-2,w-2]"""
     around = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:]
     return around - 4.0 * luma[1:-1, 1:-1]
 

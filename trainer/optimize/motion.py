@@ -1,6 +1,6 @@
-"""Similarity motions of a region's parts: each is shifted, turned and scaled about its own centre.
+"""Similarity motions of a region's parts: each is shifted, turned and scaled about its own center.
 
-Members' raw rows follow: centres move, log-scales gain the part's, quaternions are turned. Opacity and colour
+Members' raw rows follow: centers move, log-scales gain the part's, quaternions are turned. Opacity and color
 stay, the higher SH bands too: what they show is mostly light that stays where it is when a part turns.
 """
 
@@ -22,7 +22,7 @@ class Motion:
     """Where each of P parts has gone.
 
     Args:
-        shift: of the part's centre, world units. [P,3]
+        shift: of the part's center, world units. [P,3]
         log_scale: log of the part's growth. [P]
         turn: rotation vector, axis times angle in radians. [P,3]
     """
@@ -38,7 +38,7 @@ class Parts:
 
     Args:
         part: which part each member belongs to. [M] int64
-        centres: mean of each part's centres, about which it turns and grows. [P,3]
+        centers: mean of each part's centers, about which it turns and grows. [P,3]
         sizes: root mean square distance from it, world units, > 0. [P]
     """
 
@@ -56,7 +56,7 @@ class Parts:
 
 
 def make_parts(rows: Tensor, part: Tensor) -> Parts:
-    """Centres and sizes of the parts. `rows`: packed members [M,C]; `part`: [M] int64, each below P used"""
+    """Centers and sizes of the parts. `rows`: packed members [M,C]; `part`: [M] int64, each below P used"""
     means, log_scales, _ = _split(rows)
     counts = torch.bincount(part).to(means)
     nothing = means.new_zeros(len(counts), 3)
@@ -86,7 +86,7 @@ def carry_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
         parts, motion: see there
 
     Returns:
-        Raw-space offsets, differentiable. [M,C]; opacity's and colour's are the given ones
+        Raw-space offsets, differentiable. [M,C]; opacity's and color's are the given ones
     """
     moving = _MOVING
     rows = original[:, moving]

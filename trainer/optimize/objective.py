@@ -1,4 +1,4 @@
-"""What an optimiser step is charged with, term by term: L1, perceptual, progressive, sharpness.
+"""What an optimizer step is charged with, term by term: L1, perceptual, progressive, sharpness.
 
 The sum is ProGDF's L_PGS = λ1 L_edit + λ2 L_prog + λ3 L_render (AAAI 2025), L_edit = L1 + LPIPS. Every term
 has its own name, weight and switch: a run can tell what it paid for and an ablation can leave one out.
@@ -61,7 +61,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class Moment:
-    """What one optimiser step looks at.
+    """What one optimizer step looks at.
 
     Args:
         image: the render, differentiable. [h,w,3]

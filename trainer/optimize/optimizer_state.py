@@ -1,4 +1,4 @@
-"""Where the optimisation stands between two steps: the members' offsets, Adam's memory, what was measured.
+"""Where the optimization stands between two steps: the members' offsets, Adam's memory, what was measured.
 
 Everything that decides the steps to come is here, and nothing that can be computed again from the run's
 inputs. So a run that is stopped between two steps goes on from `PgsState.capture_state` to the same bits.
@@ -35,7 +35,7 @@ class _StateValues(msgspec.Struct):
 
 
 class PgsState:
-    """The state of one optimisation, changed in place by its steps.
+    """The state of one optimization, changed in place by its steps.
 
     Args:
         rows: the members' packed raw rows; the state starts exactly at these. [M,C]

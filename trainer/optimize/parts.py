@@ -28,7 +28,7 @@ def connected_parts(means: Tensor, least: float = 0.02) -> Tensor:
     neighbors where their centroids are within reach, so a gap counts exactly to within half its width.
 
     Args:
-        means: centres of the region's members. [M,3]
+        means: centers of the region's members. [M,3]
         least: a part with a smaller share of the members, or fewer than 8, is not a part of its own: stray
             Gaussians go with the nearest part that is
 

@@ -1,11 +1,11 @@
-"""PGS, progressive Gaussian splatting (ProGDF, AAAI 2025): the edit optimisation that records its own way.
+"""PGS, progressive Gaussian splatting (ProGDF, AAAI 2025): the edit optimization that records its own way.
 
-The paper lets one optimisation run towards the edited views and keeps its path. Its own in-betweens look
+The paper lets one optimization run towards the edited views and keeps its path. Its own in-betweens look
 worse than a straight line (docs/method.md 3), so the targets are staged here: the editor pictures the edit at
-several strengths and the members are optimised towards each in turn. Within a stage the target moves too,
+several strengths and the members are optimized towards each in turn. Within a stage the target moves too,
 from the last stage's pictures to its own, so that the way between them is short and straight.
 
-Edits of colours alone are solved for instead, all views at once (`color_solver`), unless something is asked
+Edits of colors alone are solved for instead, all views at once (`color_solver`), unless something is asked
 for that only a descent view by view has (`settings.solves_colors`).
 
 What stages bring is in docs/experiments.md, Stages.
@@ -41,7 +41,7 @@ _RATES_3DGS = {
 # How many times those an edit needs to arrive within a few hundred steps (docs/method.md 3). A color edit
 # leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
 _MULTIPLES: dict[EditKind, dict[str, float]] = {
-    "colour": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},
+    "color": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},
     "style": {"means": 2, "log_scales": 2, "quats": 2, "logit_opacities": 0.4, "sh0": 24, "shN": 24},
     "geometry": {"means": 8, "log_scales": 4, "quats": 8, "logit_opacities": 0.4, "sh0": 4, "shN": 4},
 }
@@ -49,7 +49,7 @@ _MULTIPLES: dict[EditKind, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class PgsSettings:
-    """How the members are optimised.
+    """How the members are optimized.
 
     Args:
         rates: learning rate of each column of a packed row, raw units. [C]
@@ -60,7 +60,7 @@ class PgsSettings:
         reach: change of a channel in a stage for which the rates are right, that which 95 % of the changing
             pixels stay below; a shorter way gets smaller steps, down to a quarter, a longer one larger, up to
             1.5 times; 0: the same for all. Steps larger than the way needs walk at random where the views
-            do not resolve single Gaussians, and close by that shows as speckles of all colours
+            do not resolve single Gaussians, and close by that shows as speckles of all colors
         smoothing: share that the recorded running mean keeps of itself at each step; 0 records the bare
             iterates
         growth: how many times a Gaussian may grow, beyond what its stage places it at
@@ -84,13 +84,13 @@ class PgsSettings:
 
 @dataclass(frozen=True)
 class TargetStage:
-    """One strength to optimise towards.
+    """One strength to optimize towards.
 
     Args:
         strength: the slider value it belongs to, 0..1
         targets: the edited box of each training view. [h,w,3] each
         steps: how many steps
-        place: turns the members' own offsets, which are optimised, into those that are seen and recorded: a
+        place: turns the members' own offsets, which are optimized, into those that are seen and recorded: a
             part that moves as a whole takes them along; differentiable. [M,C] -> [M,C]
         length: factor to the learning rates; None: by the way that the pictures have to go, see
             `PgsSettings.reach`
@@ -160,7 +160,7 @@ def optimize(
     state: PgsState | None = None,
     renewal: Renewal | None = None,
 ) -> Iterator[ParameterSnapshot]:
-    """Optimise the member rows towards each stage in turn, and yield recordings.
+    """Optimize the member rows towards each stage in turn, and yield recordings.
 
     A recording is made whenever the probes' pictures have moved by a share of what the stage has to move
     them, and at every stage's end. Only the members exist here, so nothing else can drift.

@@ -17,7 +17,7 @@ from progdf.field.remap import interpolate
 from progdf.field.trajectory import Trajectory
 from trainer.options import Slider
 
-_LEAST_GAP = 1e-4  # slider values of neighbouring recordings stay apart by this
+_LEAST_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
 
 
 def record(
@@ -49,14 +49,14 @@ def retime(
     The chord length between pictures is what counts: arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
     stretches the slider accordingly. Chords are as long as the steps that a hand makes: shorter ones count
-    jitter that no step shows (a recoloured robot's 20 steps: least over largest .71 instead of .66; a bear's
+    jitter that no step shows (a recolored robot's 20 steps: least over largest .71 instead of .66; a bear's
     scarf .93 instead of .76, its hands .85).
 
     Args:
         trajectory: recordings with any slider values
         pictures: what is seen of each, any fixed shape; between two recordings it is taken to go straight
         slider: "stages": even change between the stages' pinned strengths; "even": over the whole slider,
-            nothing pinned; "time": the optimiser's steps
+            nothing pinned; "time": the optimizer's steps
         passes: how often to repeat
         samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
@@ -98,8 +98,8 @@ def straight_recordings(
 ) -> list[int]:
     """All but those that are jitter: by which the way is longer than past them by more than `detour`.
 
-    The worst goes first and its neighbours are looked at anew; the stages' ends always stay. A gentle curve
-    keeps its recordings. On a recoloured robot this is worth 0.7 dB in the mean against the editor's own
+    The worst goes first and its neighbors are looked at anew; the stages' ends always stay. A gentle curve
+    keeps its recordings. On a recolored robot this is worth 0.7 dB in the mean against the editor's own
     pictures between the stages, and a third of the recordings suffice.
 
     Args:
@@ -143,7 +143,7 @@ def select_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory
 
 
 def _chords(pictures: Sequence[Tensor]) -> Tensor:
-    """Mean absolute difference of neighbours. [n-1] float64"""
+    """Mean absolute difference of neighbors. [n-1] float64"""
     pairs = pairwise(pictures)
     return torch.tensor([float((b - a).abs().mean()) for a, b in pairs], dtype=torch.float64)
 

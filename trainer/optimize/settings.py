@@ -1,4 +1,4 @@
-"""What the options mean for the optimiser, given what the edit moves; 0 and "auto" are decided here.
+"""What the options mean for the optimizer, given what the edit moves; 0 and "auto" are decided here.
 
 What each of them gives, alone, is in docs/experiments.md, Terms and options of a descent.
 """
@@ -18,12 +18,12 @@ from .groups import GROWTH
 from .objective import LossWeights, Sharpness
 from .pgs import PgsSettings, learning_rates
 
-PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"colour": 0.1, "style": 0.3, "geometry": 0.3}
-SHARPNESS: dict[EditKind, Sharpness] = {"colour": "off", "style": "hinge", "geometry": "off"}
+PERCEPTUAL_WEIGHT: dict[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
+SHARPNESS: dict[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
 SHARPNESS_WEIGHT: dict[Sharpness, float] = {"hinge": 0.1, "paper": 1.0, "off": 0.0}
 PROGRESSIVE_WEIGHT = 5.0  # λ2 of the paper
 GROUP_STEPS = 120
-STAGES: dict[EditKind, int] = {"colour": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
+STAGES: dict[EditKind, int] = {"color": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
 
 
 def stage_count(options: TrainOptions, kind: EditKind) -> int:
@@ -56,7 +56,7 @@ def solves_colors(options: TrainOptions, kind: EditKind) -> bool:
     """Whether the edit is solved for (`color_solver`): colors alone change, and nothing is asked for that
     only a descent view by view has."""
     return (
-        kind == "colour"
+        kind == "color"
         and CONSTANTS[options.preset].rates == "kind"
         and options.progressive == "off"
         and options.sharpness in ("auto", "off")
@@ -74,7 +74,7 @@ def idle_options(options: TrainOptions, kind: EditKind) -> list[str]:
 
 
 def objective_line(options: TrainOptions, kind: EditKind, perceptual: str) -> str:
-    """What a run minimises, for log and report. `perceptual`: the name of the distance that is used."""
+    """What a run minimizes, for log and report. `perceptual`: the name of the distance that is used."""
     if solves_colors(options, kind):
         return "squared error, all views at once"
     return loss_weights(options, kind).description(perceptual)
@@ -103,7 +103,7 @@ def pgs_settings(
         kind: what the edit moves
         channels: columns of a packed row
         extent: size of what moves, world units
-        stages: how many strengths there are to optimise towards
+        stages: how many strengths there are to optimize towards
     """
     constants = CONSTANTS[options.preset]
     rates = learning_rates(kind, channels, extent, constants.rates)
@@ -126,7 +126,7 @@ def pgs_settings(
     return PgsSettings(
         rates,
         warmup,
-        # one target alone is approached slowly: quick steps towards it shine in all colours half way
+        # one target alone is approached slowly: quick steps towards it shine in all colors half way
         ramp=0.0 if kind == "geometry" else 0.9 if stages == 1 else 0.6,
         reach=0.0 if kind == "geometry" else 0.16,
         fall=1.0 if stages == 1 else 0.35,

@@ -1,7 +1,7 @@
-"""Members that no training view shows: in an edit of colours they follow the seen ones on their own surface.
+"""Members that no training view shows: in an edit of colors they follow the seen ones on their own surface.
 
-Nothing pulls at a member that is out of every view's sight, so it keeps its old colour: white spots in a room
-at night, for whoever looks where no camera stood. Its neighbours along the surface, of the same colour, know
+Nothing pulls at a member that is out of every view's sight, so it keeps its old color: white spots in a room
+at night, for whoever looks where no camera stood. Its neighbors along the surface, of the same color, know
 what the edit does there (see `surface.surface_likeness`).
 """
 
@@ -58,8 +58,8 @@ class UnseenMembers:
 
 
 def unseen_members_of(setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
-    """Those of a run: nobody but in an edit of colours that is to be followed (`--follow`)."""
-    if kind != "colour":
+    """Those of a run: nobody but in an edit of colors that is to be followed (`--follow`)."""
+    if kind != "color":
         nobody = torch.zeros(0, dtype=torch.int64)
         return UnseenMembers(nobody, nobody[:, None], torch.zeros(0, 1))
     return find_unseen_members(setup.scene, setup.region.members, setup.train)
@@ -68,7 +68,7 @@ def unseen_members_of(setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
 def find_unseen_members(scene: Gaussians, members: Tensor, views: Sequence[View]) -> UnseenMembers:
     """The members that no view shows, and the nearest seen ones along the surface.
 
-    A follower whose neighbours are all unseen follows what these follow; one from which no seen member can be
+    A follower whose neighbors are all unseen follows what these follow; one from which no seen member can be
     reached stays as it is.
 
     Args:

@@ -1,6 +1,6 @@
 """Whether an edit needs the higher bands of spherical harmonics, decided before it is trained.
 
-Bands beyond DC let a colour change with the view. Where the original's hardly does, they have nothing to
+Bands beyond DC let a color change with the view. Where the original's hardly does, they have nothing to
 follow, and what they learn is the noise of the training views: unseen views come out worse for it. Asking
 afterwards (train them, take them out, compare) says the opposite, as DC has leaned on them by then.
 
@@ -19,11 +19,11 @@ from progdf.sh import basis
 from trainer.views.visible_area import visible_area
 
 NEEDED = 0.04
-"""Colour (0..1) by which a region's must change with the view for the bands to pay."""
+"""Color (0..1) by which a region's must change with the view for the bands to pay."""
 
 
 def view_dependence(members: Gaussians, cameras: Sequence[Camera]) -> float:
-    """How much the members' colours change between these cameras: the root mean square, in colour 0..1.
+    """How much the members' colors change between these cameras: the root mean square, in color 0..1.
 
     Each member counts as the area that it can cover.
     """

@@ -1,6 +1,6 @@
 """How to train towards pictures edited elsewhere: the ways to do it are tried on a few small views.
 
-A picture does not say whether its edit recolours, paints, bends or moves, and the wrong way tears what should
+A picture does not say whether its edit recolors, paints, bends or moves, and the wrong way tears what should
 bend and freezes what should be painted. So all are tried for a moment, on views of 128 pixels with L1 alone,
 and judged by views that they did not see (docs/experiments.md, The trial that finds the kind of an edit).
 """
@@ -34,7 +34,7 @@ from trainer.views.view import View, crop, fit_size
 _SIZE = 128  # longer side of the small views, pixels
 _VIEWS = 12  # of those that change most; every third judges
 _MOST_STEPS, _LEAST_STEPS, _SHARE = 60, 24, 1 / 6  # of a trial; share of the run's own
-_AS_GOOD = 0.2  # dB by which training colours alone may be worse than training all: it takes fewer bytes
+_AS_GOOD = 0.2  # dB by which training colors alone may be worse than training all: it takes fewer bytes
 _MOVED = 0.8
 """Share of the gain of painting, in dB, from which moving is taken: what moved and is painted looks torn at a
 PSNR that is no worse. Moving gains .2-.4 of it where paint was meant, .85-1.2 where a mouth was pulled.
@@ -125,7 +125,7 @@ def choose_approach(
     kind = options.kind
     if kind == "auto" and check_editor(options.editor)[0] not in UNTOLD:
         kind = editor.kind
-    if kind in ("colour", "style") or (kind == "geometry" and options.group_steps is not None):
+    if kind in ("color", "style") or (kind == "geometry" and options.group_steps is not None):
         return Approach(kind, group_steps(options, kind)), None
     edited = [editor.edit(view, 1.0) for view in setup.train]
     ways = approaches(options, setup, edited)
@@ -159,7 +159,7 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
         changed += float(((picture - view.image).abs().amax(dim=2) > 0.05)[outside].sum())
         beside += float(outside.sum())
     geometry = [] if changed > _REPAINTED * beside else geometry
-    return [Approach("colour"), Approach("style"), *geometry]
+    return [Approach("color"), Approach("style"), *geometry]
 
 
 def try_approaches(

@@ -17,7 +17,7 @@ from trainer.store.run_folder import read_views
 
 
 def refit(options: FitOptions, quiet: bool = False) -> RunResult:
-    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimised.
+    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimized.
 
     Raises:
         ProgdfError: the folder is no finished run, or its scene is gone or another.

@@ -194,7 +194,7 @@ def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
 
 
 def _saved_step(folder: RunFolder) -> int:
-    """How far the optimisation was when it was saved; 0: not begun."""
+    """How far the optimization was when it was saved; 0: not begun."""
     saved = folder.state.load("training")
     if saved is None:
         return 0

@@ -219,13 +219,13 @@ def _record(
     log: RunLog,
     agreement: Agreement | None,
 ) -> None:
-    """Optimise, and write the trajectory and the finished edit's views."""
+    """Optimize, and write the trajectory and the finished edit's views."""
     kind, scene, region = approach.kind, setup.scene, setup.region
     objective = objective_line(options, kind, perceptual.name)
     log.say(f"loss: {objective}")
     if idle := idle_options(options, kind):
         log.say(f"{', '.join(idle)}: without effect on this {kind} edit, whose loss is {objective}")
-    with log.stage("optimise"):
+    with log.stage("optimize"):
         renewal = reedit(options, setup, kind, folder, log)
         unseen_members = unseen_members_of(setup, kind)
         trajectory, losses = optimize_members(

@@ -12,7 +12,7 @@ from trainer.options import MOST_THREADS
 
 
 def use_threads(wanted: int) -> None:
-    """Give torch and the rasteriser `wanted` threads; 0 is all cores."""
+    """Give torch and the rasterizer `wanted` threads; 0 is all cores."""
     count = wanted_threads(wanted)
     torch.set_num_threads(count)
     set_threads(count)

@@ -45,7 +45,7 @@ from trainer.views.crops import (
 from trainer.views.view import crop
 
 PART = "training"
-"""Of the saved state: all that changes while the members are optimised."""
+"""Of the saved state: all that changes while the members are optimized."""
 
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
@@ -61,7 +61,7 @@ def optimize_members(
     renewal: Renewal | None = None,
     unseen_members: UnseenMembers | None = None,
 ) -> tuple[Trajectory, Losses]:
-    """Optimise the members, from the beginning or from where the saved state stands.
+    """Optimize the members, from the beginning or from where the saved state stands.
 
     Args:
         options: see `TrainOptions`
@@ -72,7 +72,7 @@ def optimize_members(
         folder: where the state is saved
         log: of the run
         renewal: see `pgs.Renewal`
-        unseen_members: members that take their colours from others
+        unseen_members: members that take their colors from others
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -116,7 +116,7 @@ def optimize_members(
         if beside is not None:
             beside.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"going on at step {state.step} of {steps}, with {len(recordings.made)} recordings")
-    with log.steps("optimise", steps) as advance, defer_signals() as stopped:
+    with log.steps("optimize", steps) as advance, defer_signals() as stopped:
 
         def step_done(step: int, left: float) -> None:
             if beside is not None:
@@ -157,17 +157,17 @@ def optimize_members(
     if unseen_members is not None and len(unseen_members.places):
         count = len(unseen_members.places)
         if solver is not None:
-            log.say(f"{count} members that no view shows follow their neighbours")
+            log.say(f"{count} members that no view shows follow their neighbors")
         elif is_no_worse(unseen_members, end, original, crops, stages):
             snapshots = [
                 (step, stage, last, unseen_members.propagate(made)) for step, stage, last, made in snapshots
             ]
             end = unseen_members.propagate(end)
-            log.say(f"{count} members that no view shows follow their neighbours")
+            log.say(f"{count} members that no view shows follow their neighbors")
         else:
             log.say(
                 f"{count} members that hardly show keep what they learnt: "
-                "following their neighbours would take the training views away from the edit"
+                "following their neighbors would take the training views away from the edit"
             )
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
@@ -196,12 +196,12 @@ def _decide_bands(options: TrainOptions, setup: TrainingSetup, kind: EditKind, l
     """`options.sh` as "on" or "off": a color edit trains the bands where the region's own show."""
     if options.sh != "auto" or setup.scene.sh_degree == 0:
         return options
-    if kind != "colour" or CONSTANTS[options.preset].rates == "3dgs":
+    if kind != "color" or CONSTANTS[options.preset].rates == "3dgs":
         return replace(options, sh="on")
     change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
     needed = change >= NEEDED
     log.say(
-        f"the region's colours change with the view by {change:.3f} of 1: "
+        f"the region's colors change with the view by {change:.3f} of 1: "
         f"the SH bands beyond DC are {'trained' if needed else 'left as they are'} ({NEEDED:g} is needed)"
     )
     return replace(options, sh="on" if needed else "off")

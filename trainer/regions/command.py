@@ -35,7 +35,7 @@ from .options import RegionOptions
 _TINT = torch.tensor([1.0, 0.32, 0.05])
 _TINTED = 0.55
 _PALE = 0.72
-"""The region keeps less than half of its own colour; the rest goes so far towards white, without its hue."""
+"""The region keeps less than half of its own color; the rest goes so far towards white, without its hue."""
 
 _FOV, _FILLED = math.radians(45.0), 0.9
 _SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
@@ -82,13 +82,13 @@ def show(options: RegionOptions) -> str:
 
 
 def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
-    """The scene in pale grey with the region tinted; what hides the region hides it here too. [H,W,3] 0..1"""
+    """The scene in pale gray with the region tinted; what hides the region hides it here too. [H,W,3] 0..1"""
     colors = seen_colors(scene, camera)
-    grey = (colors @ torch.tensor([0.299, 0.587, 0.114]))[:, None].clamp(0.0, 1.0)
-    shown = (grey + _PALE * (1 - grey)).expand(-1, 3).clone()
+    gray = (colors @ torch.tensor([0.299, 0.587, 0.114]))[:, None].clamp(0.0, 1.0)
+    shown = (gray + _PALE * (1 - gray)).expand(-1, 3).clone()
     rows = region.members
     # a light tint of its own brightness, so that shape and shading stay readable
-    shown[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * grey[rows]), _TINTED)
+    shown[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * gray[rows]), _TINTED)
     return render_colors(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
 
 

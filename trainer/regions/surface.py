@@ -15,9 +15,9 @@ _NEIGHBORS = 96
 _ROUNDS = 100
 
 # Standard deviations within one surface. The bear's parts lift back with IoU .977-.999, the worst without the
-# normals with .905, without the sizes .871, without the planes .957. Colours and distance gain nothing there,
+# normals with .905, without the sizes .871, without the planes .957. Colors and distance gain nothing there,
 # but not everywhere do parts differ in size. The first three may be half as large again.
-_NEAR = 8  # the distance to this neighbour is the unit of the next two
+_NEAR = 8  # the distance to this neighbor is the unit of the next two
 _ALONG, _OFF_PLANE = 2.0, 0.5
 _TURN = 0.18  # radians between the normals
 _COLOR = 0.16  # sRGB, length of the difference
@@ -28,8 +28,8 @@ def surface_vote(scene: Gaussians, member: Tensor, undecided: Tensor) -> Tensor:
     """Whether what surrounds each undecided Gaussian, on its own surface, belongs to the members.
 
     Nearness in space alone would give the lining of a scarf to the neck under it. What counts is nearness
-    along the surface: neighbours in each other's tangent plane that face the same way and have the same
-    colour and size. Undecided neighbours vote as they are voted on themselves (the harmonic extension of the
+    along the surface: neighbors in each other's tangent plane that face the same way and have the same
+    color and size. Undecided neighbors vote as they are voted on themselves (the harmonic extension of the
     decided ones), so that a decision travels along a surface to where no view looks.
 
     Args:
@@ -58,7 +58,7 @@ def surface_likeness(scene: Gaussians, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
-    """How likely each neighbour is of the same surface; sums to 1. [Q,k]"""
+    """How likely each neighbor is of the same surface; sums to 1. [Q,k]"""
     unit = distances[:, min(_NEAR, distances.shape[1]) - 1, None].clamp_min(1e-12)
     normals, colors = normals_of(scene), sh0_to_rgb(scene.sh0)
     sizes = scene.log_scales.sort(dim=1).values

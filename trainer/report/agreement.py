@@ -2,12 +2,12 @@
 
 Where views were edited one by one, nothing makes them show the same thing, and what they show differently no
 training can reach: it settles on the mean, which looks like fog, and the trainer is blamed. So it is measured
-before training starts. The geometry stays and the members' colours are fitted to the change of all training
-views by least squares: a render is linear in colours, so there is one answer, found in a few seconds. What
+before training starts. The geometry stays and the members' colors are fitted to the change of all training
+views by least squares: a render is linear in colors, so there is one answer, found in a few seconds. What
 the fit leaves of the change on held-out views tells whether the views agree.
 
 PSNR alone does not tell the two apart, the share does (docs/experiments.md, Editors that agree, or do not).
-Where parts move, colours cannot follow, and nothing is measured.
+Where parts move, colors cannot follow, and nothing is measured.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _REMEDIES = {
     "folder": "edit the views more alike, or say --kind geometry if parts move",
 }
 _ROUNDS = 6
-DAMPING = 1e-3  # of the first round's curvature: members that hardly show keep their colour
+DAMPING = 1e-3  # of the first round's curvature: members that hardly show keep their color
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Agreement:
     """How well one scene can show all the edited views.
 
     Args:
-        psnr: of the best colours on held-out views, over the pixels that show the region or change, dB
-        unexplained: what those colours leave of the change there, as a share of its energy, 0 is best
+        psnr: of the best colors on held-out views, over the pixels that show the region or change, dB
+        unexplained: what those colors leave of the change there, as a share of its energy, 0 is best
     """
 
     psnr: float
@@ -57,7 +57,7 @@ class Agreement:
         """One line for the log, with advice where the views disagree. `editor`: its kind."""
         share = f"{100 * self.unexplained:.0f} % of the change"
         if self.agree:
-            return f"the edited views agree: the best colours reach {self.psnr:.1f} dB and miss {share}"
+            return f"the edited views agree: the best colors reach {self.psnr:.1f} dB and miss {share}"
         return (
             f"the edited views disagree: no 3D scene shows all of them, best possible {self.psnr:.1f} dB on "
             f"held-out views, which misses {share}; {_REMEDIES.get(editor, 'mend them')}"
@@ -81,7 +81,7 @@ class ViewChange:
     counts: Tensor
 
     def render(self, colors: Tensor) -> Tensor:
-        """The picture that changes of the members' colours make, where it counts. [M,3] -> [h,w,3]"""
+        """The picture that changes of the members' colors make, where it counts. [M,3] -> [h,w,3]"""
         scene, camera = self.scene, self.scene.camera
         image: Tensor = rasterize(
             scene.means,
@@ -109,7 +109,7 @@ class ViewChange:
 
 
 def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: Sequence[Tensor]) -> Agreement:
-    """Fit one change of colour per member to the edited training views, and look at the held-out ones.
+    """Fit one change of color per member to the edited training views, and look at the held-out ones.
 
     Args:
         setup: scene, region and views

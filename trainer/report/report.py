@@ -52,7 +52,7 @@ def report_picture(evaluator: Evaluator, measured: Measured, losses: Losses, tit
             [column_heading(*column) for column in columns],
             title,
             f"held-out view {evaluator.names[best_view(evaluator)]}"
-            + ("; grey: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
+            + ("; gray: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
     rows = [_against_trajectory(measured)]
@@ -87,7 +87,7 @@ def strip(evaluator: Evaluator, field: BakedField, columns: Columns, width: int 
 
 
 def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
-    """What the editor makes of the best view; grey where it was not asked."""
+    """What the editor makes of the best view; gray where it was not asked."""
     best = best_view(evaluator)
     blank = torch.full((*evaluator.crops[best].size, 3), 0.94)
     original = evaluator.crops[best].original().clamp(0, 1)
@@ -180,7 +180,7 @@ def _training(losses: Losses, perceptual: str) -> Plot:
         paid = [(step, value) for step, value in rows if step is not None and value is not None]
         if term != "step":
             lines[names.get(term, term)] = ([step for step, _ in paid], [value for _, value in paid])
-    return Plot("loss terms as weighted", lines, "optimiser steps", "log")
+    return Plot("loss terms as weighted", lines, "optimizer steps", "log")
 
 
 def _clip(found: Direction) -> Plot:

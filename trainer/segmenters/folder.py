@@ -1,4 +1,4 @@
-"""Masks made elsewhere, one picture a camera: white is the region, black is not, grey is in between.
+"""Masks made elsewhere, one picture a camera: white is the region, black is not, gray is in between.
 
     DIR/NAME.png        named as the run names the camera's view (see RUN/views/original)
     DIR/cameras.json    the cameras, where the masks bring their own; else those of --cameras
@@ -54,10 +54,10 @@ def _file(folder: Path, camera: Camera) -> Path | None:
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
     size = (camera.width, camera.height)
-    grey = flatten_onto(open_picture(path, size), "black").convert("L")
-    if grey.size != size:
-        grey = grey.resize(size, Image.Resampling.BOX)
-    mask = torch.from_numpy(np.asarray(grey, dtype=np.float32) / 255.0)
+    gray = flatten_onto(open_picture(path, size), "black").convert("L")
+    if gray.size != size:
+        gray = gray.resize(size, Image.Resampling.BOX)
+    mask = torch.from_numpy(np.asarray(gray, dtype=np.float32) / 255.0)
     if bent and camera.lens:
         return undistort(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
     return mask

@@ -77,6 +77,6 @@ def choose_resolution(
             break
     line = (
         f"{share:.0%} of the region's visible Gaussians have less than a pixel in all {count} views "
-        f"of {size} pixels: what differs among neighbours is not resolved; give --image-size or --views more"
+        f"of {size} pixels: what differs among neighbors is not resolved; give --image-size or --views more"
     )
     return cameras, views, line if share > _BEARABLE else ""

@@ -49,7 +49,7 @@ class Saved:
 class Resumable(Protocol):
     """Something that trains for many steps and can be stopped between any two.
 
-    The members' optimisation is one (`descent.PgsState`). Whatever trains beside it, such as a field fitted
+    The members' optimization is one (`descent.PgsState`). Whatever trains beside it, such as a field fitted
     jointly, implements these two and is given to `PeriodicSave` under a name of its own: all members of
     one `PeriodicSave` go into one file, so that they are always of the same step. What they hold must decide
     every later bit: parameters, Adam moments and the step count, and the state of every random generator,

@@ -170,7 +170,7 @@ def _likeness(shown: _Shown, taken: Sequence[int]) -> Tensor:
 
 
 def _reach(count: int) -> float:
-    """The mean angle between neighbours of `count` directions spread over a half sphere."""
+    """The mean angle between neighbors of `count` directions spread over a half sphere."""
     return min(1.0, math.sqrt(2 * math.pi / count))
 
 

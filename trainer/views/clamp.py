@@ -25,7 +25,7 @@ class _ClampTowards(torch.autograd.Function):
 def clamp_towards(x: Tensor, low: float, high: float) -> Tensor:
     """`x.clamp(low, high)` whose gradient also passes where descent would bring x back into the range.
 
-    A sixth of a trained scene's colours have a channel below 0; with the plain clamp they could never change
+    A sixth of a trained scene's colors have a channel below 0; with the plain clamp they could never change
     (docs/experiments.md, Rates and steps).
     """
     clamped: Tensor = _ClampTowards.apply(x, low, high)  # type: ignore[no-untyped-call]

@@ -1,7 +1,7 @@
 """Rendering one view's box of the scene with other values in the region's rows, and nothing more than that.
 
 An edit changes the members of a region only, so a view is prepared once: the Gaussians that its box can
-show, their activated values, the colours seen from there. What a training step pays for is the members and
+show, their activated values, the colors seen from there. What a training step pays for is the members and
 the box.
 """
 
@@ -34,7 +34,7 @@ class CropScene:
     Args:
         camera: the whole view
         box: the pixels that are rendered
-        means, quats, scales, opacities, colors: activated values of the n Gaussians of the box, colours
+        means, quats, scales, opacities, colors: activated values of the n Gaussians of the box, colors
             as seen from this camera; members hold the original's values. [n,3], [n,4], [n,3], [n], [n,3]
         rows: where the members are among them, in the region's order. [M] int64
         member_shN: higher SH bands of the members in the original. [M,K,3]
@@ -42,7 +42,7 @@ class CropScene:
         antialiased: see `Gaussians`
         cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
             None where all are drawn
-        still: nothing but the members' colours ever differs
+        still: nothing but the members' colors ever differs
     """
 
     camera: Camera
@@ -153,7 +153,7 @@ COLORS = ("sh0", "shN")
 
 
 def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
-    """SH colours seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
+    """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
 
     Directions are constants here: their share of the means' gradient is small and mostly noise.
     """
@@ -182,8 +182,8 @@ def crop_scene(
         camera: the whole view
         box: the pixels that are rendered
         background: rgb. [3]
-        still: nothing but colours will move, so only the tiles that show a member are drawn, see `tiles`, and
-            without gradients a linear map of the members' colours; transmittance is right in these only
+        still: nothing but colors will move, so only the tiles that show a member are drawn, see `tiles`, and
+            without gradients a linear map of the members' colors; transmittance is right in these only
     """
     colors = seen_colors(scene, camera)
     _, _, seen = rasterize(
@@ -257,7 +257,7 @@ def render_all(
 
 
 def only_recolors(offsets: Tensor) -> bool:
-    """Whether nothing but colours ever moves. [...,14] or [...,14+3K]"""
+    """Whether nothing but colors ever moves. [...,14] or [...,14+3K]"""
     slices = attribute_slices(offsets.shape[-1])
     return not any(bool(offsets[..., slices[name]].any()) for name in GEOMETRY)
 

@@ -1,7 +1,7 @@
 """Which tiles of a view an edit that moves nothing can change, and which Gaussians these tiles show.
 
 While the members of a region keep their places, shapes and opacities, a pixel to which none of them
-contributes keeps its colour. So only the tiles with a pixel to which one does are drawn again, with the
+contributes keeps its color. So only the tiles with a pixel to which one does are drawn again, with the
 Gaussians that reach into them; the others are the original picture. In the drawn tiles the same Gaussians
 are blended in the same order, so picture and gradients are the same bits (tests/trainer/views/test_tiles.py).
 
@@ -22,7 +22,7 @@ _SUPPORT = 2 * 5.55
 """Most squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""
 
 _DILATION = 0.3
-"""Pixels² that the rasteriser adds to a projected covariance."""
+"""Pixels² that the rasterizer adds to a projected covariance."""
 
 
 def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
@@ -51,7 +51,7 @@ def live_pixels(live: Tensor, box: Crop) -> Tensor:
 def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Tensor:
     """Which Gaussians may reach into a live tile; too many rather than too few.
 
-    The bound: the largest axis, through the Jacobian of the projection at the place where the rasteriser
+    The bound: the largest axis, through the Jacobian of the projection at the place where the rasterizer
     takes it (Kerbl 2023 clamps it to 1.3 times the field of view), is the largest a projected axis can be.
 
     Args:
@@ -69,7 +69,7 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     slope = seen[:, :2] / z[:, None]
     center = slope * focal + K[:2, 2]
-    # at least as far out as the rasteriser's clamp, which leaves 0.15 of the picture beyond each edge
+    # at least as far out as the rasterizer's clamp, which leaves 0.15 of the picture beyond each edge
     most = torch.maximum(K[:2, 2], size - K[:2, 2]) / focal + 0.2 * size / focal
     widened = 1 + slope.abs().minimum(most).square().sum(dim=1)
     spread = (scales.double().amax(dim=1) * focal.max() / z).square() * widened + _DILATION

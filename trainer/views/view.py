@@ -42,7 +42,7 @@ class View:
         camera: the whole view; its name is the file name of its pictures
         image: the original. [H,W,3] 0..1
         mask: the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
-        inside: the colour of the members alone, unmixed from what shares a pixel with them; meaningless
+        inside: the color of the members alone, unmixed from what shares a pixel with them; meaningless
             where `mask` is 0. [H,W,3]
         box: the pixels that an edit can change, at least 64 each way where the image is that large
     """
@@ -54,7 +54,7 @@ class View:
     box: Crop
 
     def blend(self, edited_inside: Tensor) -> Tensor:
-        """The view with another colour in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]
+        """The view with another color in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]
 
         Exact at soft edges: what shines through from behind or past the region stays what it was, so a border
         neither bleeds nor keeps a rim.
@@ -94,13 +94,13 @@ def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tens
 
 
 def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
-    """Each Gaussian's colour from where the camera stands. [N,3], not below 0"""
+    """Each Gaussian's color from where the camera stands. [N,3], not below 0"""
     directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
     return shade(min(scene.sh_degree, 3), directions, scene.sh)
 
 
 def render_colors(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
-    """The scene in these colours instead of its own, without gradients. [N,3] -> [H,W,3]"""
+    """The scene in these colors instead of its own, without gradients. [N,3] -> [H,W,3]"""
     with torch.no_grad():
         image: Tensor = rasterize(
             scene.means,

@@ -119,7 +119,7 @@ class App:
         self.file_actions.on_close()
 
     def draw(self) -> None:
-        """One frame of the latest state; nothing while the window is minimised."""
+        """One frame of the latest state; nothing while the window is minimized."""
         if 0 in self.window.pixels:
             self.main_view.rest()
             return

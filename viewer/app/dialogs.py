@@ -163,11 +163,11 @@ def _submit(dialog: Dialog, path: str) -> Answer:
     return Answer(None, (f"open_file:{path}",))
 
 
-def _wrapped_text(text: str, colour: Rgba) -> None:
+def _wrapped_text(text: str, color: Rgba) -> None:
     """Small text in as many lines as it takes."""
     imgui.push_font(None, SMALL_PX)
     imgui.push_text_wrap_pos(0.0)
-    imgui.text_colored(imgui.ImVec4(*colour), text)
+    imgui.text_colored(imgui.ImVec4(*color), text)
     imgui.pop_text_wrap_pos()
     imgui.pop_font()
 
@@ -232,8 +232,8 @@ def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
     for i, name in enumerate(names):
         if i:
             imgui.same_line(0.0, gap)
-        colour = PALETTE.field if i else PALETTE.accent_dark
-        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*colour))
+        color = PALETTE.field if i else PALETTE.accent_dark
+        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*color))
         if imgui.button(name, imgui.ImVec2(wide, 0.0)):
             pressed = name
         imgui.pop_style_color()

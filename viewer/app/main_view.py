@@ -77,7 +77,7 @@ class MainView:
         self.wake = self._pace.wake
 
     def rest(self) -> None:
-        """Nothing can be drawn until the next frame, as the window is minimised."""
+        """Nothing can be drawn until the next frame, as the window is minimized."""
         self._pace.rest()
         self._resting = True
 

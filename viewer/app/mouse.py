@@ -81,7 +81,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     """What the mouse did in this frame, as imgui's io has it."""
     io = imgui.get_io()
     tool, work = _drag(tool, work, pointer)
-    if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_travelled(pointer.ui):
+    if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
     if not inputs.any_button_down():
         tool = replace(tool, drag=None)
@@ -159,7 +159,7 @@ def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[M
     return replace(tool, stroke=stroke), replace(work, view=painted)
 
 
-def _has_travelled(ui: UiContext) -> bool:
+def _has_traveled(ui: UiContext) -> bool:
     """Whether the left button moved between its press and its release, by more than a hand trembles."""
     way = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
     return bool(way.x or way.y)

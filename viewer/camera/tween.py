@@ -2,7 +2,7 @@
 
 "smooth" is the monotone cubic of Fritsch and Carlson (SIAM J. Numer. Anal. 17, 1980): it leaves the first key
 and comes to the last gently, passes through the others without a halt, rests at every turning point, and
-never leaves the range of its neighbours, so a strength of 0..1 stays in 0..1.
+never leaves the range of its neighbors, so a strength of 0..1 stays in 0..1.
 """
 
 from __future__ import annotations

@@ -56,9 +56,9 @@ INSIDE_FOV = 60.0
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the camera frames: a centre and the radius of the bulk around it, world units, radius > 0."""
+    """What the camera frames: a center and the radius of the bulk around it, world units, radius > 0."""
 
-    centre: Vec3 = (0.0, 0.0, 0.0)
+    center: Vec3 = (0.0, 0.0, 0.0)
     radius: float = 1.0
 
 
@@ -195,8 +195,8 @@ def bounds_of(scene: Gaussians) -> Bounds:
     """What frames the bulk of a scene, or of one layer's members; far strays do not count."""
     if not len(scene):
         return Bounds()
-    centre, radius = scene_sphere(scene)
-    x, y, z = (float(c) for c in centre)
+    center, radius = scene_sphere(scene)
+    x, y, z = (float(c) for c in center)
     return Bounds((x, y, z), radius) if math.isfinite(x + y + z + radius) else Bounds()
 
 
@@ -209,7 +209,7 @@ def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera
     half = math.radians(camera.fov_y) / 2
     if 0.0 < aspect < 1.0:
         half = math.atan(math.tan(half) * aspect)
-    return replace(camera, pivot=bounds.centre, distance=1.05 * bounds.radius / math.sin(half))
+    return replace(camera, pivot=bounds.center, distance=1.05 * bounds.radius / math.sin(half))
 
 
 def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera:
@@ -281,12 +281,12 @@ def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:
     Args:
         camera: gives the up axis and the mode
         seen: the pinhole camera
-        bounds: of the scene; the pivot is at the depth of its centre, where that is in front
+        bounds: of the scene; the pivot is at the depth of its center, where that is in front
     """
     world = torch.linalg.inv(seen.viewmat.double()).tolist()
     position: Vec3 = (world[0][3], world[1][3], world[2][3])
     ahead: Vec3 = (world[0][2], world[1][2], world[2][2])
-    depth = dot(add_scaled(bounds.centre, (-1.0, position)), ahead)
+    depth = dot(add_scaled(bounds.center, (-1.0, position)), ahead)
     depth = depth if depth > 1e-3 * bounds.radius else bounds.radius
     fov_y = math.degrees(2.0 * math.atan(seen.height / (2.0 * float(seen.K[1, 1]))))
     return look_from(replace(camera, fov_y=fov_y), position, add_scaled(position, (depth, ahead)))

@@ -181,10 +181,10 @@ def is_number(text: str) -> bool:
 
 
 def parse_background(text: str) -> Vec3:
-    """The colour of `#rrggbb`, "white" or "black", 0..1.
+    """The color of `#rrggbb`, "white" or "black", 0..1.
 
     Raises:
-        ProgdfError: it is no colour.
+        ProgdfError: it is no color.
     """
     red, green, blue = parse_color({"white": "#ffffff", "black": "#000000"}.get(text.lower(), text)).tolist()
     return red, green, blue

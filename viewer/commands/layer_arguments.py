@@ -34,7 +34,7 @@ def stack_of(
     Args:
         gdfs: the edits, the lowest layer first
         settings: `NAME=S`, the strengths
-        gains: `NAME:KIND=G`, with geometry, opacity or colour for KIND
+        gains: `NAME:KIND=G`, with geometry, opacity or color for KIND
         solo: names of the edits that alone are shown
         overshoot: whether strengths go to `stack.OVERSHOOT`
         paint: `NAME=WEIGHTS.npy`, a weight 0..1 per member, or per Gaussian of the scene
@@ -83,13 +83,13 @@ def _weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
 def _gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
     """Name, kind and number of `NAME:KIND=G`."""
     kinds = stack.SLIDERS[1:]
-    right = f"write NAME:KIND=G, for example {gdfs[0].name if gdfs else 'NAME'}:colour=0.5"
+    right = f"write NAME:KIND=G, for example {gdfs[0].name if gdfs else 'NAME'}:color=0.5"
     left, equals, number = text.rpartition("=")
     name, colon, kind = left.rpartition(":")
     if not equals or not colon or not name:
         raise ProgdfError(f"--gain {text} is no gain; {right}")
     known_edit(name, gdfs, "--gain")
-    kind = {"color": "colour"}.get(kind, kind)
+    kind = {"color": "color"}.get(kind, kind)
     if kind not in kinds:
         raise ProgdfError(f"--gain {text}: there is no gain '{kind}'; the gains are {', '.join(kinds)}")
     try:

@@ -75,7 +75,7 @@ def open_stack(options: StackOptions, unset: float = 0.0) -> OpenStack:
     if is_session(options.scene):
         return _session(options)
     _check_each_once(options.gdfs)
-    view = ViewState(blend=options.blend or "normalised", overshoot=options.overshoot)
+    view = ViewState(blend=options.blend or "normalized", overshoot=options.overshoot)
     if isinstance(options, PictureOptions):
         view = replace(view, background=arguments.parse_background(options.background))
     found = document.load(options.scene, options.gdfs)

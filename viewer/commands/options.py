@@ -10,7 +10,7 @@ import tyro
 
 from progdf.scene.up_axis import UpChoice
 
-Blend = Literal["normalised", "sum", "over"]
+Blend = Literal["normalized", "sum", "over"]
 Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
 Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
 Paint = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FILE.npy"), tyro.conf.UseAppendAction]
@@ -32,7 +32,7 @@ class StackOptions:
     """Strength of an edit, 0 to 1; repeat it for several edits. Without any, `render` and `export` show every
     edit at 1 and `view` opens at 0; beside a session it takes the place of the session's."""
     gain: Gains = ()
-    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or colour."""
+    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
     solo: Solo = ()
     """Show this edit alone. Repeat it for several edits."""
     paint: Paint = ()
@@ -40,7 +40,7 @@ class StackOptions:
     overshoot: bool = False
     """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
     blend: Blend | None = None
-    """How edits that share Gaussians go together; normalised, or as the session has it, if not given."""
+    """How edits that share Gaussians go together; normalized, or as the session has it, if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class PictureOptions(StackOptions):
     background: str = "white"
     """#rrggbb, white or black."""
     engine: Annotated[Literal["auto", "gl", "cpu"], tyro.conf.arg(aliases=["--draw"])] = "auto"
-    """What draws: OpenGL or the CPU rasteriser; auto takes OpenGL where a graphics card does the work."""
+    """What draws: OpenGL or the CPU rasterizer; auto takes OpenGL where a graphics card does the work."""
     edit_pass: Literal["auto", "gpu", "cpu"] = "auto"
     """What works out the attributes of a new strength; auto takes the GPU where a graphics card draws."""
 

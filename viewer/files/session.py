@@ -148,7 +148,7 @@ def _check_edit(where: str, edit: Edit, count: int) -> None:
             raise JsonFormError(f"{at}.gdf is {layer.gdf} of {count} edits")
         _check(f"{at}.strength", [layer.strength], 0.0, OVERSHOOT)
         gains = layer.gains
-        _check(f"{at}.gains", [gains.geometry, gains.opacity, gains.colour], 0.0, 1.0)
+        _check(f"{at}.gains", [gains.geometry, gains.opacity, gains.color], 0.0, 1.0)
 
 
 def _check_camera(where: str, camera: ViewCamera) -> None:

@@ -10,7 +10,7 @@
     }
 
 A key without a camera leaves the camera alone; with none in any key, a film is taken from one place. A key
-need not name every edit. What a key leaves out lies between its neighbours that do not.
+need not name every edit. What a key leaves out lies between its neighbors that do not.
 """
 
 from __future__ import annotations

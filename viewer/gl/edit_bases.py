@@ -62,7 +62,7 @@ class PackedEdits:
         levels: [·,4] int8
         places: for each edit in turn, which member each slot is, −1 where none. [E·U] int32
         edits: by target, what each edit does to it
-        covers: where each edit's texels of geometry, opacity and colour begin in `floats`, see
+        covers: where each edit's texels of geometry, opacity and color begin in `floats`, see
             `progdf.compose.coverage`; one a member
         nodes: strengths of each edit's coefficients. [S] each
         sh_coefficients: K of shN that are shown
@@ -144,10 +144,10 @@ def _edit(gdf: Gdf, shown: int, floats: _List, levels: _List) -> dict[int, Targe
 
 
 def _covers(scene: Gaussians, gdf: Gdf) -> Floats:
-    """What a member covers of geometry, opacity and colour. [M,4]"""
+    """What a member covers of geometry, opacity and color. [M,4]"""
     texels = np.zeros((len(gdf.region), 4), np.float32)
     for kind, covered in coverage(scene, gdf).items():
-        texels[:, ("geometry", "opacity", "colour").index(kind)] = covered.numpy()
+        texels[:, ("geometry", "opacity", "color").index(kind)] = covered.numpy()
     return texels
 
 

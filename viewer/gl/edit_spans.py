@@ -1,4 +1,4 @@
-"""Where in the scene's textures the edit pass draws: the members of edits as spans of neighbouring texels.
+"""Where in the scene's textures the edit pass draws: the members of edits as spans of neighboring texels.
 
 A region that a file holds in one piece is a span a texture row; scattered members are a span each. Either way
 as many texels are drawn as there are members, however large the scene is.

@@ -1,4 +1,4 @@
-"""Colours drawn over those of the scene: one texel a Gaussian, made when they are first asked for."""
+"""Colors drawn over those of the scene: one texel a Gaussian, made when they are first asked for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .scene_textures import row_runs
 
 
 class HighlightTexture:
-    """rgb and the share of it, laid out as the scene's textures are; 0 leaves a Gaussian its own colour.
+    """rgb and the share of it, laid out as the scene's textures are; 0 leaves a Gaussian its own color.
 
     Args:
         ctx: where it lives
@@ -33,7 +33,7 @@ class HighlightTexture:
 
     @property
     def empty(self) -> bool:
-        """Whether it leaves every Gaussian its own colour."""
+        """Whether it leaves every Gaussian its own color."""
         return not self._memory[:, 3].any()
 
     def bind(self, program: moderngl.Program, unit: int) -> None:

@@ -21,7 +21,7 @@ Bands 1 to 3 lie in `shN`: rgb32f (rgba32f where the edit pass writes it), K tex
 """
 
 HIGHLIGHT = np.dtype([("rgb", "u1", 3), ("share", "u1")])
-"""What is drawn over a Gaussian's colour; a texel of `highlight` in shaders/project.vert, 0..255 as 0..1."""
+"""What is drawn over a Gaussian's color; a texel of `highlight` in shaders/project.vert, 0..255 as 0..1."""
 
 SHOWN_SH = 15
 """Largest K: coefficients above degree 3 ride along in the scene and are not shown."""
@@ -46,7 +46,7 @@ PLACES = {
 }
 """Attribute -> its place in each of its texels."""
 
-PROJECTED = np.dtype([("centre", "<f4", 2), ("shape", "<f4", 3), ("r2", "<f4"), ("rgb_opacity", "<f4", 4)])
+PROJECTED = np.dtype([("center", "<f4", 2), ("shape", "<f4", 3), ("r2", "<f4"), ("rgb_opacity", "<f4", 4)])
 """One projected Gaussian, written by shaders/project.vert and read by shaders/splat.vert. 40 bytes."""
 
 ORDER = np.dtype("<u4")

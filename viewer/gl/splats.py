@@ -52,7 +52,7 @@ class SplatRenderer:
 
     The CPU engine (as 3DGS) leaves out a Gaussian that would bring a pixel's transmittance to 1e-4 or below,
     and all behind it. Blending from the back cannot know what will cover a pixel, so here they count: at most
-    0.01 of a colour, 76 to 80 dB in a picture. Without that rule the two agree to 120 dB and more.
+    0.01 of a color, 76 to 80 dB in a picture. Without that rule the two agree to 120 dB and more.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
@@ -95,7 +95,7 @@ class SplatRenderer:
         return self.textures.write(scene, attributes, rows)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """Draw Gaussians (sorted) in other colours: rgb and its share, 0..255. [R,4]"""
+        """Draw Gaussians (sorted) in other colors: rgb and its share, 0..255. [R,4]"""
         self._highlights = self._highlights or HighlightTexture(self.ctx, self.textures.count)
         self._highlights.write(rows, highlights)
         if self._highlights.empty:

@@ -64,10 +64,10 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     if depth is not None:
         brush = replace(brush, through=bool(depth))
     label("Weights", column)
-    colours = choice("weights", ("Shown", "Hidden"), int(not brush.weights), ui)
+    colors = choice("weights", ("Shown", "Hidden"), int(not brush.weights), ui)
     tip("Show the weights as colors, from blue (0) to yellow (1) (C)")
-    if colours is not None:
-        brush = replace(brush, weights=not colours)
+    if colors is not None:
+        brush = replace(brush, weights=not colors)
     if brush.weights:
         _legend(column, ui)
     label("Layer", column)
@@ -90,7 +90,7 @@ def _legend(column: float, ui: UiContext) -> None:
     width, height, size = imgui.get_content_region_avail().x, 10.0 * ui.scale, SMALL_PX * ui.scale
     canvas = imgui.get_window_draw_list()
     for (start, a), (end, b) in pairwise(highlight.RAMP):
-        low, high = (u32(highlight.rgba(colour)) for colour in (a, b))
+        low, high = (u32(highlight.rgba(color)) for color in (a, b))
         corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
         canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
     imgui.push_font(None, SMALL_PX)

@@ -191,8 +191,8 @@ def _name(
     x, y = imgui.get_cursor_screen_pos()
     imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
-    colour = PALETTE.text if active else PALETTE.dim
-    imgui.get_window_draw_list().add_text(at, u32(colour), elide(layer.name, room))
+    color = PALETTE.text if active else PALETTE.dim
+    imgui.get_window_draw_list().add_text(at, u32(color), elide(layer.name, room))
     tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename (Enter)")
     if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
         return replace(card, renaming=True, touched=True)
@@ -247,12 +247,12 @@ def _foot(card: CardResult, index: int, row: LayerRow, ui: UiContext) -> CardRes
     return replace(card, state=state, overlap=asked)
 
 
-def _swatch(colour: tuple[float, float, float], active: bool, ui: UiContext) -> None:
+def _swatch(color: tuple[float, float, float], active: bool, ui: UiContext) -> None:
     side = 12.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
     top = y + (imgui.get_frame_height() - side) / 2
     imgui.dummy(imgui.ImVec2(side, imgui.get_frame_height()))
-    rgba: Rgba = (*colour, 1.0 if active else 0.35)
+    rgba: Rgba = (*color, 1.0 if active else 0.35)
     canvas = imgui.get_window_draw_list()
     corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
     canvas.add_rect_filled(*corners, u32(rgba), 3 * ui.scale)

@@ -22,7 +22,7 @@ from viewer.ui.widgets import (
 )
 
 BLEND_HELP = {
-    "normalised": "Overlapping edits are averaged by weight; never more than a full edit.",
+    "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
     "over": "An edit covers those below it, where and as far as it changes something.",
 }
@@ -69,11 +69,11 @@ def heading(state: ViewState, ui: UiContext) -> ViewState:
 
 def _overshoot(state: ViewState, width: float) -> ViewState:
     on = state.overshoot
-    for slot, colour in (
+    for slot, color in (
         (imgui.Col_.button, PALETTE.warning_dark if on else PALETTE.field),
         (imgui.Col_.text, PALETTE.text if on else PALETTE.dim),
     ):
-        imgui.push_style_color(slot, imgui.ImVec4(*colour))
+        imgui.push_style_color(slot, imgui.ImVec4(*color))
     imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y))
     if imgui.button(f"{stack.OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
         state = stack.with_overshoot(state, not on)

@@ -51,7 +51,7 @@ def draw(
         ticks: recorded strengths, 0..1
         width: in window pixels
         scale: window pixels per design pixel
-        fill: colour of the track up to the handle
+        fill: color of the track up to the handle
         active: False draws it muted (a hidden layer); it still works
         most: upper end; beyond 1 the track lies on warning ground
     """
@@ -81,8 +81,8 @@ def draw(
             _anchor(label, mouse, value)  # after the move: a slow frame holds both
     if not held:
         tip(TIP)
-    colour = fill if active else PALETTE.faint
-    _paint(start, top, span, radius, value, ticks, scale, colour, hovered or held, most)
+    color = fill if active else PALETTE.faint
+    _paint(start, top, span, radius, value, ticks, scale, color, hovered or held, most)
     return value
 
 
@@ -154,9 +154,9 @@ def _paint(
     for tick in ticks:
         x = round(start + tick * span) + 0.5
         tall = 6.0 if tick in (0.0, 1.0) else 4.0
-        colour = p.dim if tick <= value else p.faint
+        color = p.dim if tick <= value else p.faint
         canvas.add_line(
-            imgui.ImVec2(x, foot), imgui.ImVec2(x, foot + tall * scale), u32(colour), max(1.0, scale)
+            imgui.ImVec2(x, foot), imgui.ImVec2(x, foot + tall * scale), u32(color), max(1.0, scale)
         )
     canvas.add_circle_filled(imgui.ImVec2(at, middle), radius + 1.0 * scale, u32(p.card))
     canvas.add_circle_filled(imgui.ImVec2(at, middle), radius - (0.0 if lit else 1.0) * scale, u32(p.handle))

@@ -183,8 +183,8 @@ def _paint(
     _paint_numbers(timeline, frame, start, span, top, line, ui)
     for key in timeline.keys:
         x, size = place(timeline, key.frame, start, span), (_KEY_PX + (key.frame == under)) * scale
-        colour = u32(p.handle if key.frame in (frame, under) else p.dim)
-        _paint_key(canvas, x, line, size, colour, key.easing)
+        color = u32(p.handle if key.frame in (frame, under) else p.dim)
+        _paint_key(canvas, x, line, size, color, key.easing)
     if not timeline.keys:
         hint = "Press K to insert a keyframe"
         size = SMALL_PX * scale
@@ -218,25 +218,25 @@ def _paint_numbers(
         x, text = place(timeline, number, start, span), str(number)
         if number != frame and -16.0 * scale < x - here < 36.0 * scale:
             continue
-        colour = u32(p.accent if number == frame else p.dim)
+        color = u32(p.accent if number == frame else p.dim)
         # the playhead's number stands beside its handle, left of it at the end of the ruler
         after = x - 3.2 * scale * len(text)
         if number == frame:
             after = x + 7.0 * scale if x < start + span - 20.0 * scale else x - (7 + 6.4 * len(text)) * scale
         at = imgui.ImVec2(round(after), round(top - 4.0 * scale))
-        canvas.add_text(ui.fonts.regular, size, at, colour, text)
+        canvas.add_text(ui.fonts.regular, size, at, color, text)
 
 
-def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, colour: int, easing: str) -> None:
+def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, color: int, easing: str) -> None:
     """Smooth is round, linear a diamond, hold a square."""
     edge = u32(PALETTE.panel)
     if easing == "smooth":
         canvas.add_circle_filled(imgui.ImVec2(x, y), size + 1.5, edge)
-        canvas.add_circle_filled(imgui.ImVec2(x, y), size, colour)
+        canvas.add_circle_filled(imgui.ImVec2(x, y), size, color)
         return
     corners = 4
     turn = 0.0 if easing == "linear" else math.pi / 4
-    for radius, ink in ((size * 1.2 + 2.0, edge), (size * 1.2, colour)):
+    for radius, ink in ((size * 1.2 + 2.0, edge), (size * 1.2, color)):
         points = [turn + 2 * math.pi * i / corners for i in range(corners)]
         a, b, c, d = (imgui.ImVec2(x + radius * math.cos(t), y + radius * math.sin(t)) for t in points)
         canvas.add_quad_filled(a, b, c, d, ink)

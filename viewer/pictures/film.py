@@ -25,7 +25,7 @@ Draw = Callable[[ViewState], Pixels]
 
 SWEEP_STEPS = 24
 FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
-_PALETTE_REACH = 8  # levels: Pillow looks up the nearest colour of a palette in steps of 4
+_PALETTE_REACH = 8  # levels: Pillow looks up the nearest color of a palette in steps of 4
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -156,13 +156,13 @@ def _save_gif(path: Path, indexed: Sequence[Image.Image], durations: Sequence[in
 
 
 def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
-    """The same palette, but what is nearly the commonest colour becomes that colour: white stays white."""
+    """The same palette, but what is nearly the commonest color becomes that color: white stays white."""
     counts = picture.getcolors(picture.width * picture.height) or []
     commonest = np.array(max(counts)[1])
-    colours = np.array(indexed.getpalette(), np.int64).reshape(-1, 3)
-    distances = np.abs(colours - commonest).max(axis=1)
-    colours[distances <= max(_PALETTE_REACH, int(distances.min()))] = commonest
-    indexed.putpalette(colours.ravel().tolist())
+    colors = np.array(indexed.getpalette(), np.int64).reshape(-1, 3)
+    distances = np.abs(colors - commonest).max(axis=1)
+    colors[distances <= max(_PALETTE_REACH, int(distances.min()))] = commonest
+    indexed.putpalette(colors.ravel().tolist())
     return indexed
 
 

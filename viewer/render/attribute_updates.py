@@ -53,7 +53,7 @@ class Editing(Protocol):
 
     @property
     def means(self) -> NDArray[np.float32]:
-        """Centres under the last stack. [N,3]"""
+        """Centers under the last stack. [N,3]"""
 
     def update(self, stack: Stack, blend: str) -> UpdateCost:
         """Make what is drawn the scene under `stack`.

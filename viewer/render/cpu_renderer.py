@@ -1,4 +1,4 @@
-"""Draws with the CPU rasteriser and keeps the picture: while the camera rests, only its touched part anew."""
+"""Draws with the CPU rasterizer and keeps the picture: while the camera rests, only its touched part anew."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WORTH_DRAWING_APART = 0.8
 """Share of the picture beyond which all of it is drawn."""
 
 CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
-"""Pixels that take as long as another call of the rasteriser, and as its look at one more Gaussian."""
+"""Pixels that take as long as another call of the rasterizer, and as its look at one more Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class CpuRenderer:
             self._highlights = None
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
-        """Make the picture; `order` is not used, the rasteriser sorts by itself. Gives the share drawn."""
+        """Make the picture; `order` is not used, the rasterizer sorts by itself. Gives the share drawn."""
         whole = camera.width * camera.height
         crops = [(0, 0, camera.width, camera.height)]
         kept = self._kept if self._kept is not None and self._kept.shows(camera, background) else None
@@ -230,7 +230,7 @@ class CpuRenderer:
                 self._sh.numpy()[part, 1:] = scene.shN[part].numpy()
 
     def _apply_highlight(self, part: slice) -> None:
-        """Mix the highlights into colours that were just written: all bands, as colour is linear in them."""
+        """Mix the highlights into colors that were just written: all bands, as color is linear in them."""
         assert self._highlights is not None, "nothing to highlight with"
         sh, share = self._sh.numpy()[part], self._highlights[part, 3:]
         sh *= 1.0 - share[:, :, None]
@@ -247,7 +247,7 @@ def _copy(values: torch.Tensor) -> Image:
 
 
 def _exp(values: torch.Tensor) -> Image:
-    """With numpy, on one thread: torch's threads would spin against the rasteriser's."""
+    """With numpy, on one thread: torch's threads would spin against the rasterizer's."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.exp(_copy(values))
 

@@ -16,7 +16,7 @@ def back_to_front(means: NDArray[np.float32], camera: Camera, near: float = NEAR
     """Rows in front of the near plane, farthest first; the exact reverse of (float32 depth, index) ascending.
 
     Args:
-        means: centres, world units; a row that is not finite is left out. [N,3]
+        means: centers, world units; a row that is not finite is left out. [N,3]
         camera: only its `viewmat` counts
         near: least depth, world units
 
@@ -24,7 +24,7 @@ def back_to_front(means: NDArray[np.float32], camera: Camera, near: float = NEAR
         [V] uint32, V ≤ N
     """
     row = camera.viewmat[2].double().numpy()
-    # float64 as the CPU engine does: another rounding would swap neighbours
+    # float64 as the CPU engine does: another rounding would swap neighbors
     with np.errstate(invalid="ignore", over="ignore"):
         depths = means.astype(np.float64) @ row[:3] + row[3]
         seen = np.flatnonzero((depths > near) & (depths < np.inf))

@@ -1,7 +1,7 @@
 """One engine, on screen and headless: state → compose → upload → sort → draw, published together.
 
 It compares the state with the one it last drew and does only the work between them: a camera move composes
-nothing, a change of colour sorts nothing, the same state draws nothing, and where the CPU draws, a slider
+nothing, a change of color sorts nothing, the same state draws nothing, and where the CPU draws, a slider
 draws only the part of the picture that its members touch.
 """
 
@@ -38,7 +38,7 @@ from .renderers import GlRenderer, Image, Renderer
 DRAWS = ("auto", "gl", "cpu")
 EDIT_PASSES = ("auto", "gpu", "cpu")
 """What works out the attributes; "auto" leaves the edit pass to graphics cards: llvmpipe takes 0.6 µs of the
-processor's time a member (places, shapes and colours, three bases), where composing and sending take 0.06."""
+processor's time a member (places, shapes and colors, three bases), where composing and sending take 0.06."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class ViewEngine:
         return self.timings
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
-        """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colours are.
+        """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colors are.
 
         Args:
             view: what to draw
@@ -275,7 +275,7 @@ class ViewEngine:
     def _stack(self, edits: _Edits) -> tuple[Stack, str]:
         """The layers and the blend rule of what was asked for."""
         stack = [(layer[0], layer_of(self._gdf(layer[0]), *layer[1:])) for layer in edits.layers]
-        return stack, edits.blend or "normalised"
+        return stack, edits.blend or "normalized"
 
     def _gdf(self, index: int) -> Gdf:
         if not 0 <= index < len(self.gdfs):

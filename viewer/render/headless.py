@@ -29,6 +29,6 @@ def headless_context() -> moderngl.Context:
 
 
 def is_software(ctx: moderngl.Context) -> bool:
-    """Whether the context draws on the processor; then the CPU rasteriser is several times faster."""
+    """Whether the context draws on the processor; then the CPU rasterizer is several times faster."""
     renderer = str(ctx.info["GL_RENDERER"]).lower()
     return any(name in renderer for name in SOFTWARE)

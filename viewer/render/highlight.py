@@ -1,4 +1,4 @@
-"""Colours over the splats: painted weights, from blue (none of the edit) to yellow, or what layers share."""
+"""Colors over the splats: painted weights, from blue (none of the edit) to yellow, or what layers share."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from viewer.state import paint
 from viewer.state.view_state import ViewState
 
 SHARE = 0.75
-"""Of a member's colour that the ramp takes, so that the rest still tells its shape."""
+"""Of a member's color that the ramp takes, so that the rest still tells its shape."""
 
 RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1.0, 0xF9E558))
-"""Weights and their colours, rgb; lightness rises with the weight, so that also grey tells them apart."""
+"""Weights and their colors, rgb; lightness rises with the weight, so that also gray tells them apart."""
 
 SHARED = 0xFF3FA0
-"""The colour of what is in several layers."""
+"""The color of what is in several layers."""
 
 Bytes = NDArray[np.uint8]
 
@@ -67,9 +67,9 @@ def ramp_colors(weights: NDArray[np.float32]) -> Bytes:
     return np.stack(mixed[:3], axis=-1).astype(np.uint8)
 
 
-def rgba(colour: int) -> tuple[float, float, float, float]:
+def rgba(color: int) -> tuple[float, float, float, float]:
     """0xRRGGBB as numbers 0..1, opaque."""
-    red, green, blue = (colour >> shift & 255 for shift in (16, 8, 0))
+    red, green, blue = (color >> shift & 255 for shift in (16, 8, 0))
     return red / 255, green / 255, blue / 255, 1.0
 
 

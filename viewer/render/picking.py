@@ -32,7 +32,7 @@ class Seen:
 
     Args:
         rows: indices of the Gaussians. [M] int64
-        shares: the part of the pixel's colour that each gives; with the background's share they make 1. [M]
+        shares: the part of the pixel's color that each gives; with the background's share they make 1. [M]
         depths: in front of the camera, world units. [M]
     """
 
@@ -47,7 +47,7 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
     Args:
         scene: what is on screen, so with its edits
         camera: the picture's camera
-        x, y: pixels from the upper left corner, pixel centres at +0.5
+        x, y: pixels from the upper left corner, pixel centers at +0.5
         near: least depth, world units
 
     Returns:
@@ -127,7 +127,7 @@ def _lens(camera: Camera) -> tuple[float, float, float, float]:
 def _alphas(
     scene: Gaussians, rows: NDArray[np.int64], camera: Camera, x: float, y: float, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Which of some Gaussians the rasteriser draws at a position, nearest first, and their alphas there."""
+    """Which of some Gaussians the rasterizer draws at a position, nearest first, and their alphas there."""
     some = scene[torch.from_numpy(rows)]
     pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
     activated = ActivatedGaussians(

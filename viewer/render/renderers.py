@@ -1,4 +1,4 @@
-"""Two ways to draw a scene, one interface: OpenGL, and the CPU rasteriser (cpu_renderer.py)."""
+"""Two ways to draw a scene, one interface: OpenGL, and the CPU rasterizer (cpu_renderer.py)."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Renderer(Protocol):
         """Take the changed attributes of the changed rows (sorted)."""
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """Draw Gaussians (sorted) in other colours from now on, whatever becomes of their own.
+        """Draw Gaussians (sorted) in other colors from now on, whatever becomes of their own.
 
         Args:
-            highlights: rgb and the share that it takes of a Gaussian's colour, 0..255; 0 takes none. [R,4]
+            highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none. [R,4]
         """
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:

@@ -12,10 +12,10 @@ class FrameTimings:
     Args:
         compose_ms: strengths → attributes, by the CPU
         upload_ms: attributes → where they are drawn from; or the GPU's edit pass, which does both there
-        sort_ms: depth order (the CPU rasteriser sorts within `draw_ms`)
+        sort_ms: depth order (the CPU rasterizer sorts within `draw_ms`)
         draw_ms: the picture
         changed: Gaussians whose attributes were composed anew
-        drawn: Gaussians in front of the camera; all of them where the CPU rasteriser draws
+        drawn: Gaussians in front of the camera; all of them where the CPU rasterizer draws
         share: of the picture's pixels that were drawn anew, 0..1
     """
 

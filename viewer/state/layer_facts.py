@@ -1,4 +1,4 @@
-"""What a layer row tells about its .gdf: how many Gaussians, which colour, where it was recorded."""
+"""What a layer row tells about its .gdf: how many Gaussians, which color, where it was recorded."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class LayerRow:
 
     Args:
         count: Gaussians in its region
-        swatch: their mean colour at full strength, 0..1
+        swatch: their mean color at full strength, 0..1
         recorded: strengths of the recorded snapshots
         instruction: what was asked for
         bounds: of the bulk of its members
         shared: per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
         kinds: which gains of `Gains` have something to scale
         curve: the visible change over the strength, measured when it is first asked for
-        points: centres of its members in the original, world units. [M,3] float32
+        points: centers of its members in the original, world units. [M,3] float32
         fit: gives the camera that frames this layer
     """
 
@@ -57,7 +57,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
     members = gdf.region.members
     return LayerRow(
         count=len(members),
-        swatch=_mean_colour(scene, gdf),
+        swatch=_mean_color(scene, gdf),
         recorded=gdf.field.recorded,
         instruction=gdf.instruction,
         bounds=bounds_of(scene[members]),
@@ -75,8 +75,8 @@ def _in_both(gdf: Gdf, other: Gdf) -> int:
     return len(np.intersect1d(*members, assume_unique=True))
 
 
-def _mean_colour(scene: Gaussians, gdf: Gdf) -> Rgb:
-    """Mean of the edited colours, weighted by the original opacities."""
+def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
+    """Mean of the edited colors, weighted by the original opacities."""
     members = gdf.region.members
     if not len(members):
         return 0.5, 0.5, 0.5
@@ -85,6 +85,6 @@ def _mean_colour(scene: Gaussians, gdf: Gdf) -> Rgb:
     if bases is not None:
         sh0 = sh0 + bases.end_offset
     weights = scene.opacities[members].nan_to_num()[:, None] + 1e-6
-    colour = (sh0_to_rgb(sh0).nan_to_num().clamp(0.0, 1.0) * weights).sum(0) / weights.sum()
-    red, green, blue = (float(c) for c in colour)
+    color = (sh0_to_rgb(sh0).nan_to_num().clamp(0.0, 1.0) * weights).sum(0) / weights.sum()
+    red, green, blue = (float(c) for c in color)
     return red, green, blue

@@ -13,7 +13,7 @@ from .view_state import LayerState, ViewState
 OVERSHOOT = 1.2
 """How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
 
-SLIDERS = ("strength", "geometry", "opacity", "colour")
+SLIDERS = ("strength", "geometry", "opacity", "color")
 """What the arrow keys move: the strength, or a gain."""
 
 LONGEST_NAME = 60

@@ -43,7 +43,7 @@ class Stroke:
 
     Args:
         before: weights when it began, 0..1. [M]
-        places: where each member is in the picture, pixels, and f·log(depth), so that neighbours are as far
+        places: where each member is in the picture, pixels, and f·log(depth), so that neighbors are as far
             apart as they look; NaN where the brush cannot reach it. [M,3]
         reached: largest touch of the brush so far, 0..1. [M]
         mode: of `MODES`
@@ -168,7 +168,7 @@ def extend_stroke(stroke: Stroke, x: float, y: float, brush: Brush, density: flo
 
 
 def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
-    """The paint that the stroke has made so far: to 1, to 0, or to the mean of neighbours under the brush.
+    """The paint that the stroke has made so far: to 1, to 0, or to the mean of neighbors under the brush.
 
     Args:
         stroke: under way
@@ -187,7 +187,7 @@ def feather(paint: str, points: Floats, width: float) -> str:
 
     Args:
         paint: of a layer
-        points: the centres of its members, world units. [M,3]
+        points: the centers of its members, world units. [M,3]
         width: see `near_mean`, world units, > 0
 
     Raises:

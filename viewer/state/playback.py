@@ -104,7 +104,7 @@ def _step(view: ViewState, player: Player, by: str) -> tuple[Timeline, Player]:
 
 
 def _jump(view: ViewState, player: Player, way: str) -> tuple[Timeline, Player]:
-    return view.timeline, _at(player, tl.neighbour(view.timeline, player.frame, int(way)))
+    return view.timeline, _at(player, tl.neighbor(view.timeline, player.frame, int(way)))
 
 
 def _at(player: Player, frame: int) -> Player:

@@ -90,7 +90,7 @@ def describe(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[Recordin
         if recordings[layer.gdf].path is None:
             fields.append(layer.name)
         else:
-            places[layer.name] = _neighbours(gdfs[layer.gdf].field.recorded, layer.strength)
+            places[layer.name] = _neighbors(gdfs[layer.gdf].field.recorded, layer.strength)
     if len(places) < 2 and not fields:
         ends = [f"{s:.3g}" for s in next(iter(places.values()), (0.0,))]
         return f"recorded, between {ends[0]} and {ends[1]}" if len(ends) == 2 else f"recorded at {ends[0]}"
@@ -99,7 +99,7 @@ def describe(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[Recordin
     return "; ".join(part for part in parts if part)
 
 
-def _neighbours(nodes: Sequence[float], strength: float) -> tuple[float, ...]:
+def _neighbors(nodes: Sequence[float], strength: float) -> tuple[float, ...]:
     """The snapshot at a strength, or those on either side of it."""
     right = min(bisect_left(nodes, strength), len(nodes) - 1)
     exact = nodes[right] <= strength

@@ -69,7 +69,7 @@ def with_fps(timeline: Timeline, fps: int) -> Timeline:
     return replace(timeline, fps=max(1, min(fps, FASTEST)))
 
 
-def neighbour(timeline: Timeline, frame: int, step: int) -> int:
+def neighbor(timeline: Timeline, frame: int, step: int) -> int:
     """The frame of the next key (step 1) or of the one before (−1); an end of the timeline where none is."""
     frames = [key.frame for key in timeline.keys]
     if step > 0:

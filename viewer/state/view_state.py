@@ -44,7 +44,7 @@ class Brush:
         softness: the part of the radius over which its touch fades, 0..1
         mode: of `paint.MODES`
         through: also behind the front surface
-        weights: the members of the focused layer show their weights as colours meanwhile
+        weights: the members of the focused layer show their weights as colors meanwhile
     """
 
     active: bool = False
@@ -119,7 +119,7 @@ class ViewState:
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
-    blend: str = "normalised"
+    blend: str = "normalized"
     background: Vec3 = (1.0, 1.0, 1.0)
     overlay: bool = False
     panel: bool = True

@@ -1,4 +1,4 @@
-"""The imgui context: fonts, colours, spacing, and one scale for high-density screens."""
+"""The imgui context: fonts, colors, spacing, and one scale for high-density screens."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _rgb(code: int, alpha: float = 1.0) -> Rgba:
 
 @dataclass(frozen=True)
 class Palette:
-    """Calm and neutral, so that the picture keeps its colours; one accent."""
+    """Calm and neutral, so that the picture keeps its colors; one accent."""
 
     panel: Rgba = _rgb(0x1E2024)
     card: Rgba = _rgb(0x282B30)
@@ -141,7 +141,7 @@ def _apply_style(scale: float) -> None:
     style.hover_stationary_delay, style.hover_delay_normal = 0.3, 0.5
     p, col = PALETTE, imgui.Col_
     imgui.style_colors_dark()
-    for slot, colour in {
+    for slot, color in {
         col.window_bg: p.panel,
         col.child_bg: (0.0, 0.0, 0.0, 0.0),
         col.popup_bg: p.card,
@@ -168,9 +168,9 @@ def _apply_style(scale: float) -> None:
         col.text_selected_bg: p.accent_dark,
         col.nav_cursor: p.accent,
     }.items():
-        style.set_color_(slot, imgui.ImVec4(*colour))
+        style.set_color_(slot, imgui.ImVec4(*color))
 
 
-def u32(colour: Rgba) -> int:
-    """A packed colour for draw lists."""
-    return imgui.get_color_u32(imgui.ImVec4(*colour))
+def u32(color: Rgba) -> int:
+    """A packed color for draw lists."""
+    return imgui.get_color_u32(imgui.ImVec4(*color))

@@ -21,7 +21,7 @@ class FramePacer:
         self._unsettled, self._rest_left = SETTLE_FRAMES, LINGER_S
 
     def rest(self) -> None:
-        """Nothing can be drawn, as the window is minimised."""
+        """Nothing can be drawn, as the window is minimized."""
         self._unsettled, self._rest_left = 0, None
 
     def step(self, seconds: float) -> None:

@@ -1,6 +1,6 @@
 """The system's own file dialogs, beside the path field: started, looked at now and then, never waited for.
 
-On Linux a dialog is a program of the desktop. Without one the library answers as if the person had cancelled,
+On Linux a dialog is a program of the desktop. Without one the library answers as if the person had canceled,
 so it is looked for here, and the path field always stays.
 """
 

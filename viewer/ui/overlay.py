@@ -83,7 +83,7 @@ def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
 
 
 def banner(text: str, area: Area, ui: UiContext, row: int = 0) -> None:
-    """A word at the top centre of the picture, or so many rows below."""
+    """A word at the top center of the picture, or so many rows below."""
     size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
     wide = _text_width(text, size, ui)
     x, y = (area.width - wide) / 2, (14.0 + 32.0 * row) * ui.scale
@@ -110,8 +110,8 @@ def message(shown: Message, area: Area, ui: UiContext) -> tuple[bool, float]:
     wrap = imgui.calc_text_size(shown.text).x > room
     imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
     imgui.align_text_to_frame_padding()
-    colour = PALETTE.error if shown.error else PALETTE.text
-    imgui.text_colored(imgui.ImVec4(*colour), shown.text)
+    color = PALETTE.error if shown.error else PALETTE.text
+    imgui.text_colored(imgui.ImVec4(*color), shown.text)
     imgui.pop_text_wrap_pos()
     imgui.same_line()
     closed, top = bool(imgui.small_button("×")), imgui.get_window_pos().y
@@ -139,7 +139,7 @@ def _text_width(text: str, size: float, ui: UiContext) -> float:
 
 
 def _text(
-    x: float, y: float, text: str, size: float, colour: tuple[float, float, float, float], ui: UiContext
+    x: float, y: float, text: str, size: float, color: tuple[float, float, float, float], ui: UiContext
 ) -> None:
     at = imgui.ImVec2(round(x), round(y))
-    imgui.get_background_draw_list().add_text(ui.fonts.regular, size, at, u32(colour), text)
+    imgui.get_background_draw_list().add_text(ui.fonts.regular, size, at, u32(color), text)

@@ -32,11 +32,11 @@ def label(text: str, column: float) -> None:
     imgui.same_line(column)
 
 
-def small(text: str, colour: Rgba, room: float | None = None) -> None:
+def small(text: str, color: Rgba, room: float | None = None) -> None:
     """Small text, shortened to `room` window pixels, or to the line."""
     imgui.push_font(None, SMALL_PX)
     room = imgui.get_content_region_avail().x if room is None else room
-    imgui.text_colored(imgui.ImVec4(*colour), elide(text, room))
+    imgui.text_colored(imgui.ImVec4(*color), elide(text, room))
     imgui.pop_font()
 
 
@@ -95,8 +95,8 @@ def is_released() -> bool:
 
 
 def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
-    """A button of small text on the present line, in the accent's colour while on; True when pressed."""
-    colours = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)
+    """A button of small text on the present line, in the accent's color while on; True when pressed."""
+    colors = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)
     height = 3.0 * ui.scale  # reaches above its line, so that the hand finds it
     x, y = imgui.get_cursor_screen_pos()
     imgui.push_font(None, SMALL_PX)
@@ -105,7 +105,7 @@ def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -
     pressed = bool(imgui.invisible_button(name, imgui.ImVec2(width, line + height)))
     size = imgui.calc_text_size(text)
     at = imgui.ImVec2(round(x + (width - size.x) / 2), round(y + (line - size.y) / 2))
-    imgui.get_window_draw_list().add_text(at, u32(colours[imgui.is_item_hovered()]), text)
+    imgui.get_window_draw_list().add_text(at, u32(colors[imgui.is_item_hovered()]), text)
     imgui.pop_font()
     return pressed
 
@@ -161,19 +161,19 @@ def choice(
     for i, option in enumerate(options):
         if i:
             imgui.same_line(0.0, gap)
-        for slot in _BUTTON_COLOURS if i == current else ():
+        for slot in _BUTTON_COLORS if i == current else ():
             imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.accent_dark))
         imgui.begin_disabled(usable is not None and i >= usable)
         if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
             pressed = i
         imgui.end_disabled()
-        imgui.pop_style_color(len(_BUTTON_COLOURS) if i == current else 0)
+        imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)
     imgui.pop_style_var()
     imgui.end_group()
     return pressed
 
 
-_BUTTON_COLOURS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
+_BUTTON_COLORS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
 
 
 def group_digits(count: int) -> str:

@@ -176,7 +176,7 @@ class Window:
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """Size of the framebuffer; (0, 0) while minimised."""
+        """Size of the framebuffer; (0, 0) while minimized."""
         width, height = glfw.get_framebuffer_size(self.handle)
         return int(width), int(height)
 

@@ -17,7 +17,7 @@ from .project import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE, Pinhole, Splats
 Array = NDArray[Any]
 
 TILE_W, TILE_H = 64, 8
-"""Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorise over."""
+"""Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
 
 
 class TileLists(NamedTuple):

@@ -42,7 +42,7 @@ _ready: set[str] = set()  # stages whose marker was seen
 
 
 def _source_version() -> str:
-    """Of all files of the rasteriser: numba's cache notices neither changed constants nor changed imported
+    """Of all files of the rasterizer: numba's cache notices neither changed constants nor changed imported
     functions."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
@@ -222,7 +222,7 @@ def _first_run(stage: str, seconds: int) -> Iterator[None]:
         cold = not marker.exists()
         if cold:
             log.warning(
-                "compiling the rasteriser's %s kernels (about %d s, once per machine)", stage, seconds
+                "compiling the rasterizer's %s kernels (about %d s, once per machine)", stage, seconds
             )
         yield
         if cold:

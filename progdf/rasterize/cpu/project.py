@@ -1,7 +1,7 @@
 """Kernel: cull Gaussians to the window, project and shade those that are left, in float64.
 
 A projected Gaussian ("splat") is eight float64, one cache line, in units in which alpha = 2^-(u² + v²) ·
-opacity: u = l11 · (dx + slope · dy) and v = l22 · dy for a pixel at offset (dx, dy) from the centre. l is the
+opacity: u = l11 · (dx + slope · dy) and v = l22 · dy for a pixel at offset (dx, dy) from the center. l is the
 Cholesky factor of the conic times sqrt(log2(e) / 2), so the exponent cannot become positive however thin the
 Gaussian is.
 """
@@ -22,7 +22,7 @@ from .shading import Vec, dot, fill_basis, row_times, view_direction
 Array = NDArray[Any]
 
 MX, MY, SLOPE, L11, INV_L11, L22, R2, EXTENT_Y = range(8)
-"""Columns of a splat: centre in pixels, shape, u² + v² at alpha = 1/255, half height in pixels."""
+"""Columns of a splat: center in pixels, shape, u² + v² at alpha = 1/255, half height in pixels."""
 
 UNIT = math.sqrt(0.5 * math.log2(math.e))
 """u and v per standard deviation."""
@@ -80,7 +80,7 @@ class Splats(NamedTuple):
     """What projection finds, by the Gaussians' rows.
 
     Args:
-        means2d, depths: centres in pixels, camera z; 0 for what cannot be drawn. [N,2], [N] float32
+        means2d, depths: centers in pixels, camera z; 0 for what cannot be drawn. [N,2], [N] float32
         visible: whether one is a splat; where not, the next two are not set. [N] bool
         shapes: the columns above. [N,8] float64
         colors: rgb, opacity with antialias included. [N,4] float32
@@ -222,7 +222,7 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
     """A bound of a Gaussian's support that needs no covariance.
 
     Returns:
-        whether it can be drawn at all; its centre in pixels and camera z; the squares of half the sides of a
+        whether it can be drawn at all; its center in pixels and camera z; the squares of half the sides of a
         box around it in pixels
     """
     mean, scale, opacity = vec(scene.means, i), vec(scene.scales, i), np.float64(scene.opacities[i])
@@ -247,7 +247,7 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
 
 @kernel(contract=True, inline=True)
 def _shade(scene: Scene, i: int, degree: int, eye: Vec, basis: Array) -> Vec:
-    """The colour of a Gaussian; basis: scratch, [16] float64"""
+    """The color of a Gaussian; basis: scratch, [16] float64"""
     if degree < 0:
         return vec(scene.colors[i], 0)
     dx, dy, dz, _ = view_direction(vec(scene.means, i), eye)

@@ -45,7 +45,7 @@ BLOCK = 1024
 
 @kernel(contract=True, inline=True)
 def _axes_gradient(seen: Footprint, g: tuple[float, ...], antialiased: bool) -> tuple[float, float, Vec, Vec]:
-    """Gradients to the centre in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
+    """Gradients to the center in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
     # g = −dL/dσ; u and v are in units of their own
     e0, e1 = -g[1] * _PER_UNIT, -g[2] * _PER_UNIT
     h00, h01, h11 = -g[3] * _PER_UNIT2, -g[4] * _PER_UNIT2, -g[5] * _PER_UNIT2

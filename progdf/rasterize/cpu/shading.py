@@ -100,14 +100,14 @@ def shade_backward(
     i: int, colors: Array, degree: int, point: Vec, eye: Vec, gradient: Vec, basis: Array, slopes: Array,
     out: Array,
 ) -> Vec:  # fmt: skip
-    """Gradients of Gaussian i's colour max(0, Σ basis·sh + 0.5).
+    """Gradients of Gaussian i's color max(0, Σ basis·sh + 0.5).
 
     Args:
         i: row of `colors` and `out`
         colors: SH coefficients. [N,K,3] float32
         degree: 0..3
-        point, eye: its centre and the camera's, world axes
-        gradient: to the clamped colour
+        point, eye: its center and the camera's, world axes
+        gradient: to the clamped color
         basis, slopes: scratch. [16], [16,3] float64, `slopes` zero where no derivative is ever written
         out: gradient to the coefficients. [N,K,3] float32
 

@@ -55,7 +55,7 @@ def test_check_says_how_many_and_that_nothing_was_repaired(
     lines = lines_of(capsys, "check", str(tmp_path / "scene.ply"))
     assert lines[0] == "scene.ply: 1 200 Gaussians, SH degree 0, binary little-endian, 82.0 kB"
     assert "repaired: nothing" in lines
-    assert not [line for line in lines if line.startswith(("ignored", "normalised", "odd"))]
+    assert not [line for line in lines if line.startswith(("ignored", "normalized", "odd"))]
 
 
 def test_check_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,7 +91,7 @@ def test_the_survey_is_about_the_bulk_of_the_scene() -> None:
     found = survey(scene)
     assert found.farthest == pytest.approx(500, rel=0.01)
     assert 2.5 < found.radius < 3.5
-    assert max(abs(x) for x in found.centre) < 0.2
+    assert max(abs(x) for x in found.center) < 0.2
     assert found.median_size == pytest.approx(0.02)
     assert not found.surrounding
 

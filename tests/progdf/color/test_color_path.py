@@ -1,4 +1,4 @@
-"""What lies between a colour and its edit: between the ends, never grey, the same way for neighbours."""
+"""What lies between a color and its edit: between the ends, never gray, the same way for neighbors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.color import edits as colour
+from progdf.color import edits as color
 from progdf.color.edits import parse_color, recolor
 from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.color.path import ColorPath, bend_of, interpolate_colors
@@ -19,12 +19,12 @@ PAIRS = {
     "brown to sky": ("#8b5a2b", "#62b3ea"),  # 178 degrees, and the shorter way is the one over green
     "orange to blue": ("#ff8c1a", "#3060d0"),
     "red to green": ("#c02020", "#20a040"),
-    "grey to red": ("#808080", "#c02020"),
+    "gray to red": ("#808080", "#c02020"),
     "pale pink to deep blue": ("#f0d0bc", "#101880"),
 }
 STRENGTHS = torch.linspace(0, 1, 21)
 ORANGE, BLUE = torch.tensor([0.85, 0.45, 0.10]), torch.tensor([0.19, 0.38, 0.82])
-CHROMA_OF_GREY = 0.01
+CHROMA_OF_GRAY = 0.01
 BIT = 2 / 255  # two channels that lie closer are as good as equal
 
 
@@ -37,7 +37,7 @@ def test_every_strength_lies_between_the_ends(name: str) -> None:
     assert float(detour.max()) <= 1.10
     chroma = lab[:, 1:].norm(dim=1)
     assert float(chroma.min()) >= 0.4 * min(float(chroma[0]), float(chroma[-1]))
-    strongest = {int(way[i].argmax()) for i in (0, 20) if float(chroma[i]) > CHROMA_OF_GREY}
+    strongest = {int(way[i].argmax()) for i in (0, 20) if float(chroma[i]) > CHROMA_OF_GRAY}
     assert {int(i) for i in way[1:-1].argmax(dim=1)} <= strongest
     for a, b in ((0, 1), (1, 2), (0, 2)):
         above = way[:, a] - way[:, b]
@@ -52,7 +52,7 @@ def test_the_ends_are_exact_and_the_way_is_even(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
     way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
     assert torch.equal(way[0], start)
-    assert torch.equal(way[-1], colour.recolor_fully(start.expand(21, 3), end, start)[-1])
+    assert torch.equal(way[-1], color.recolor_fully(start.expand(21, 3), end, start)[-1])
     steps = srgb_to_oklab(way).diff(dim=0).norm(dim=1)
     assert float(steps.max()) < 2.5 * float(steps.min())
 
@@ -67,7 +67,7 @@ def test_the_hue_path_turns_along_the_circle_and_keeps_its_chroma() -> None:
 
 
 def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
-    """sRGB colours all around the hue circle. [count,3]"""
+    """sRGB colors all around the hue circle. [count,3]"""
     angle = torch.linspace(0, 2 * math.pi, count + 1)[:-1]
     lab = torch.stack([torch.full_like(angle, lightness), chroma * angle.cos(), chroma * angle.sin()], dim=1)
     return oklab_to_srgb(lab).clamp(0, 1)
@@ -75,7 +75,7 @@ def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
 
 @pytest.mark.parametrize("path", ["bowed", "hue"])
 @pytest.mark.parametrize("reference", ["#d9731a", "#8b5a2b", "#d9a012", "#20a040", "#808080"])
-def test_neighbouring_hues_stay_neighbours_on_the_way(reference: str, path: ColorPath) -> None:
+def test_neighboring_hues_stay_neighbors_on_the_way(reference: str, path: ColorPath) -> None:
     circle = hues(0.65, 0.11)
     for s in (0.25, 0.5, 0.75):
         way = recolor(circle, BLUE, s, parse_color(reference), path)
@@ -96,10 +96,10 @@ def test_a_region_on_both_sides_of_the_opposite_hue_goes_one_way() -> None:
         assert float(hue.mean().abs()) < math.radians(60), "by way of rose, as green is nobody's half"
 
 
-def test_the_greys_of_a_thing_do_not_shine_when_its_colour_turns() -> None:
+def test_the_grays_of_a_thing_do_not_shine_when_its_color_turns() -> None:
     for s in (0.2, 0.4, 0.6, 0.8):
         warm, cool = recolor(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE)
-        assert float((warm - cool).abs().max()) < 0.06, "they were neighbours and stay so"
+        assert float((warm - cool).abs().max()) < 0.06, "they were neighbors and stay so"
 
 
 @pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
@@ -115,5 +115,5 @@ def test_a_straight_and_a_bent_way_have_the_same_lightness() -> None:
     start, end = parse_color("#e0ac88").expand(21, 3), BLUE.expand(21, 3)
     lab = srgb_to_oklab(interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE)))
     expected = torch.lerp(srgb_to_oklab(start), srgb_to_oklab(end), STRENGTHS[:, None])
-    # colours on the edge of the gamut are known to a thousandth
+    # colors on the edge of the gamut are known to a thousandth
     assert torch.allclose(lab[:, 0], expected[:, 0], atol=2e-3)

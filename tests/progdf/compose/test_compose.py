@@ -19,7 +19,7 @@ from progdf.rasterize import set_threads
 from tests.helpers.edits import bits, curved_field, edit_of, some_rows
 from tests.helpers.scenes import random_gaussians
 
-COLOUR = ("sh0", "shN")
+COLOR = ("sh0", "shN")
 
 
 def scene_with_signed_zeros(count: int = 400) -> Gaussians:
@@ -99,10 +99,10 @@ def test_weights_scale_the_change(scene: Gaussians, shirt: Gdf) -> None:
 def test_gains_scale_their_own_kind_of_attribute_only(scene: Gaussians, shirt: Gdf) -> None:
     whole = change(scene, compose_layers(scene, [Layer(shirt, 0.6)]))
     found = change(
-        scene, compose_layers(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, colour=2.0))])
+        scene, compose_layers(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, color=2.0))])
     )
     slices = attribute_slices(whole.shape[1])
-    for names, gain in ((("means", "log_scales", "quats"), 0.5), (("logit_opacities",), 0.0), (COLOUR, 2.0)):
+    for names, gain in ((("means", "log_scales", "quats"), 0.5), (("logit_opacities",), 0.0), (COLOR, 2.0)):
         for name in names:
             assert torch.allclose(found[:, slices[name]], gain * whole[:, slices[name]], atol=1e-6), name
 
@@ -113,32 +113,32 @@ def test_disabled_layers_do_nothing(scene: Gaussians, shirt: Gdf, hat: Gdf) -> N
     )
 
 
-@pytest.mark.parametrize("blend", ["normalised", "sum"])
+@pytest.mark.parametrize("blend", ["normalized", "sum"])
 def test_the_order_of_layers_does_not_matter(scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str) -> None:
     layers = [Layer(shirt, 0.8), Layer(hat, 0.9)]
     a, b = (change(scene, compose_layers(scene, order, blend)) for order in (layers, layers[::-1]))
     assert torch.allclose(a, b, atol=1e-6)
 
 
-def test_normalised_is_the_plain_sum_while_strengths_add_up_to_one(
+def test_normalized_is_the_plain_sum_while_strengths_add_up_to_one(
     scene: Gaussians, shirt: Gdf, hat: Gdf
 ) -> None:
     layers = [Layer(shirt, 0.5), Layer(hat, 0.5)]
-    assert bits(compose_layers(scene, layers, "normalised")) == bits(compose_layers(scene, layers, "sum"))
+    assert bits(compose_layers(scene, layers, "normalized")) == bits(compose_layers(scene, layers, "sum"))
 
 
-def test_normalised_shares_where_strengths_add_up_to_more(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+def test_normalized_shares_where_strengths_add_up_to_more(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     layers = [Layer(shirt, 1.0), Layer(hat, 0.5)]
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
     assert len(both) > 10
     summed = change(scene, compose_layers(scene, layers, "sum"))[both]
-    shared = change(scene, compose_layers(scene, layers, "normalised"))[both]
+    shared = change(scene, compose_layers(scene, layers, "normalized"))[both]
     assert torch.allclose(shared, summed / 1.5, atol=1e-6)
 
 
 def test_over_puts_what_the_last_layer_changes_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
-    hidden = both[coverage(scene, hat)["colour"][torch.searchsorted(hat.region.members, both)] == 1]
+    hidden = both[coverage(scene, hat)["color"][torch.searchsorted(hat.region.members, both)] == 1]
     assert len(hidden) > 10
     stacked = compose_layers(scene, [Layer(shirt, 1.0), Layer(hat, 1.0)], "over")
     alone = compose_layers(scene, [Layer(hat, 1.0)])
@@ -186,9 +186,7 @@ def test_over_hides_as_much_of_a_kind_as_its_gain_lets_through(scene: Gaussians,
     top = striped(scene, shirt)
     below = compose_layers(scene, [Layer(shirt, 1.0)])
     for gain in (0.0, 0.5):
-        stacked = compose_layers(
-            scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(colour=gain))], "over"
-        )
+        stacked = compose_layers(scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(color=gain))], "over")
         stripe = shirt.region.members[1::2]
         expected = torch.lerp(below.sh0[stripe], scene.sh0[stripe] + 1.0, gain)
         assert torch.allclose(stacked.sh0[stripe], expected, atol=1e-6)
@@ -200,11 +198,11 @@ def test_coverage_rises_with_the_change_of_each_kind_and_ends_at_one(scene: Gaus
     changes[1, :, 11] = torch.linspace(0, 2, 40)
     edit = edit_of(scene, torch.arange(40), fit_keyframes(torch.tensor([0.0, 1.0]), changes, 2))
     covered = coverage(scene, edit)
-    assert set(covered) == {"geometry", "colour"}
+    assert set(covered) == {"geometry", "color"}
     assert float(covered["geometry"].max()) < 1e-3
-    assert float(covered["colour"][0]) == 0.0
-    assert bool((covered["colour"].diff() >= 0).all())
-    assert bool((covered["colour"][20:] == 1.0).all()), "half of the largest changes, and more"
+    assert float(covered["color"][0]) == 0.0
+    assert bool((covered["color"].diff() >= 0).all())
+    assert bool((covered["color"][20:] == 1.0).all()), "half of the largest changes, and more"
 
 
 def test_an_overshooting_layer_alone_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:
@@ -220,7 +218,7 @@ def test_strengths_that_are_no_numbers_are_refused(scene: Gaussians, shirt: Gdf,
 
 
 def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
-    with pytest.raises(ProgdfError, match="normalised, sum, over"):
+    with pytest.raises(ProgdfError, match="normalized, sum, over"):
         compose_layers(scene, [Layer(shirt)], "multiply")
 
 
@@ -323,7 +321,7 @@ def test_the_composer_leaves_the_scene_alone(scene: Gaussians, shirt: Gdf) -> No
 def test_a_slider_changes_the_rows_of_its_own_edit_only(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     composer = Composer(scene, [shirt, hat])
     composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)])
-    told = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalised")
+    told = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalized")
     assert np.array_equal(told.rows, hat.region.members.numpy())
 
 
@@ -334,15 +332,15 @@ def test_nothing_is_reported_where_nothing_changed(scene: Gaussians, shirt: Gdf)
     assert (len(told.rows), told.attributes, told.largest_move) == (0, (), 0.0)
 
 
-def test_a_colour_gain_does_not_ask_for_a_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
+def test_a_color_gain_does_not_ask_for_a_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     composer.update([Layer(shirt, 0.5)])
-    told = composer.update([Layer(shirt, 0.5, gains=Gains(colour=0.3))])
+    told = composer.update([Layer(shirt, 0.5, gains=Gains(color=0.3))])
     assert told.attributes == ("sh0",)
     assert not told.means_moved
 
 
-def test_an_edit_of_colours_alone_does_not_ask_for_a_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
+def test_an_edit_of_colors_alone_does_not_ask_for_a_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
     told = Composer(scene, [hat]).update([Layer(hat, 0.5)])
     assert told.attributes == ("sh0",)
     assert told.largest_move == 0.0

@@ -1,4 +1,4 @@
-"""Scenes in the formats that people have: each gives the scene that was written, within its quantisation."""
+"""Scenes in the formats that people have: each gives the scene that was written, within its quantization."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Write = Callable[[Path, Gaussians], Path]
 
 
 def scene_of(degree: int = 0, count: int = 300) -> Gaussians:
-    """Colours within 0..1 and opacities that a byte can hold; quaternions of unit length."""
+    """Colors within 0..1 and opacities that a byte can hold; quaternions of unit length."""
     scene = random_gaussians(count, seed=4, sh_degree=degree, scale=0.05)
     rng = torch.Generator().manual_seed(5)
     return replace(
@@ -65,7 +65,7 @@ WRITERS: dict[str, tuple[Write, str, int]] = {
 
 MEANS = {"compressed": 4e-3, "compressed, older": 4e-3, "ksplat 1": 4e-4, "ksplat 2": 4e-4}
 MEANS |= {"spz 2": 2e-4, "spz 3": 2e-4, "spz 4": 2e-4, "sog": 1e-3}
-"""Largest error of a centre: half a step of each format over a cloud about 7 wide; the others keep floats."""
+"""Largest error of a center: half a step of each format over a cloud about 7 wide; the others keep floats."""
 SH = {"compressed": 0.017, "ksplat 1": 5e-4, "ksplat 2": 6e-3, "spz 2": 0.07, "spz 3": 0.07, "spz 4": 0.07}
 SH |= {"sog": 0.03}
 """Of a coefficient: bytes of −4..4, halves, bytes of −1.5..1.5, 4 and 5 bits of −1..1, and a palette."""

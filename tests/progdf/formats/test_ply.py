@@ -62,7 +62,7 @@ def test_a_saved_scene_loads_to_the_same_bits(degree: int, tmp_path: Path) -> No
     assert_same(load_ply(tmp_path / "scene.ply"), scene)
 
 
-def test_loading_is_idempotent_after_quaternions_were_normalised(tmp_path: Path) -> None:
+def test_loading_is_idempotent_after_quaternions_were_normalized(tmp_path: Path) -> None:
     scene = random_gaussians(5000, seed=3, sh_degree=1)
     save_ply(tmp_path / "raw.ply", scene)
     once, report = load_ply_with_report(tmp_path / "raw.ply")

@@ -60,7 +60,7 @@ def test_a_zero_quaternion_is_no_rotation(tmp_path: Path) -> None:
     assert torch.equal(scene.quats[:9], scene_of().quats[:9])
 
 
-def test_huge_and_tiny_quaternions_are_normalised_without_overflow(tmp_path: Path) -> None:
+def test_huge_and_tiny_quaternions_are_normalized_without_overflow(tmp_path: Path) -> None:
     changes = {"rot_0": (0, 3e30), "rot_1": (0, 4e30), "rot_2": (0, 0.0), "rot_3": (0, 0.0)}
     scene, _ = damaged(tmp_path, changes)
     torch.testing.assert_close(scene.quats[0], torch.tensor([0.6, 0.8, 0.0, 0.0]))

@@ -158,7 +158,7 @@ def test_a_scene_of_another_size_is_named_with_both_sizes(shirt: Gdf) -> None:
     assert "progdf rebind shirt.gdf --from SCENE --to room.ply" in str(refused.value)
 
 
-def test_a_scene_with_one_centre_moved_is_another_scene(saved: Path, scene: Gaussians) -> None:
+def test_a_scene_with_one_center_moved_is_another_scene(saved: Path, scene: Gaussians) -> None:
     means = scene.means.clone()
     means[17, 1] += 1e-6
     with pytest.raises(ProgdfError, match=r"shirt\.gdf was made for another scene: .* at other places"):
@@ -170,7 +170,7 @@ def test_a_scene_of_another_sh_degree_is_refused(saved: Path, scene: Gaussians) 
         load_gdf(saved, replace(scene, shN=scene.shN[:, :0]))
 
 
-def test_colours_may_differ(saved: Path, scene: Gaussians) -> None:
+def test_colors_may_differ(saved: Path, scene: Gaussians) -> None:
     load_gdf(saved, replace(scene, sh0=scene.sh0 + 1))
 
 

@@ -77,12 +77,12 @@ def test_another_scene_is_refused_before_anything_is_baked(saved: Path) -> None:
         load_gdf(saved, replace(scene(), means=means))
 
 
-def test_a_network_that_looks_at_colours_refuses_a_scene_of_other_colours(saved: Path) -> None:
+def test_a_network_that_looks_at_colors_refuses_a_scene_of_other_colors(saved: Path) -> None:
     with pytest.raises(ProgdfError, match=r"another scene: room\.ply .* look different"):
         load_gdf(saved, replace(scene(), sh0=scene().sh0 + 1), "room.ply")
 
 
-def test_a_network_that_sees_places_alone_does_not_mind_other_colours(tmp_path: Path) -> None:
+def test_a_network_that_sees_places_alone_does_not_mind_other_colors(tmp_path: Path) -> None:
     save_gdf(tmp_path / "a.gdf", edit_of(scene(), members(), baked("position")))
     load_gdf(tmp_path / "a.gdf", replace(scene(), sh0=scene().sh0 + 1))
 

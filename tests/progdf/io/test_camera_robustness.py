@@ -174,7 +174,7 @@ def filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> np.ndarray:
 def is_filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> bool:
     """Whether they fill the tighter side of the picture and stand in its middle."""
     left, right, up, down = filled(camera, shown, aspect)
-    widest = max(left, right, up, down)  # of centres: Gaussians as large as the ears' here add a third
+    widest = max(left, right, up, down)  # of centers: Gaussians as large as the ears' here add a third
     return abs(left - right) < 0.07 and abs(up - down) < 0.07 and 0.45 < widest < turntable.FILL
 
 

@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 128, 96
 
 
 def pattern(rays: Tensor) -> Tensor:
-    """A smooth world on the plane z = 1: what colour each ray has. [...,2] -> [...,3]"""
+    """A smooth world on the plane z = 1: what color each ray has. [...,2] -> [...,3]"""
     x, y = rays[..., 0], rays[..., 1]
     return 0.5 + 0.4 * torch.stack([torch.sin(7 * x), torch.sin(6 * y), torch.cos(5 * (x + y))], dim=-1)
 

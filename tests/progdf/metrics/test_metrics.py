@@ -24,7 +24,7 @@ from progdf.metrics.slider import Pictures, slider_statistics, visible_change
 
 
 def picture(height: int = 48, width: int = 40, seed: int = 0) -> Tensor:
-    """Smooth coloured blobs. [H,W,3]"""
+    """Smooth colored blobs. [H,W,3]"""
     coarse = torch.rand(1, 3, 6, 6, generator=torch.Generator().manual_seed(seed))
     return interpolate(coarse, (height, width), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
 

@@ -1,4 +1,4 @@
-"""The rasteriser: both engines against each other and against finite differences, on every hard case."""
+"""The rasterizer: both engines against each other and against finite differences, on every hard case."""
 
 from __future__ import annotations
 

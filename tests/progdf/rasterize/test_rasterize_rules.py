@@ -1,4 +1,4 @@
-"""What a rasterised picture is, in both engines: crops, order, support, background, weights of masks."""
+"""What a rasterized picture is, in both engines: crops, order, support, background, weights of masks."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def test_equal_depths_are_drawn_in_the_order_of_the_list() -> None:
         one_gaussian(rgb=(0.0, 1.0, 0.0), opacity=0.99),
     )
     camera = front_camera()
-    centre = (camera.height // 2, camera.width // 2)
-    assert float(render(concatenate(red, green), camera)[centre][0]) > 0.9
-    assert float(render(concatenate(green, red), camera)[centre][1]) > 0.9
+    center = (camera.height // 2, camera.width // 2)
+    assert float(render(concatenate(red, green), camera)[center][0]) > 0.9
+    assert float(render(concatenate(green, red), camera)[center][1]) > 0.9
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -88,7 +88,7 @@ def walls(ceiling: bool) -> Gaussians:
     return replace(scene, means=spots * torch.tensor([4.0, 3.0, 4.0]))
 
 
-def test_a_scene_to_stand_inside_is_recognised(
+def test_a_scene_to_stand_inside_is_recognized(
     small_bear: Gaussians, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert is_surrounding(walls(ceiling=True), Y_UP)

@@ -20,7 +20,7 @@ Y_UP = torch.tensor([0.0, 1.0, 0.0])
 
 
 def seen(scene: Gaussians, camera: Camera) -> Tensor:
-    """Which centres fall into the picture. [N] bool"""
+    """Which centers fall into the picture. [N] bool"""
     places = scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     pixels = (places @ camera.K.T)[:, :2] / places[:, 2:]
     inside = (pixels >= 0) & (pixels <= torch.tensor([camera.width, camera.height]))
@@ -54,18 +54,18 @@ def test_the_rig_surrounds_the_scene_evenly() -> None:
     assert float(every_fifth.max() - every_fifth.min()) > 0.6 * (high - low)
 
 
-def test_the_rig_looks_at_the_centre_with_up_up_and_begins_at_the_front() -> None:
+def test_the_rig_looks_at_the_center_with_up_up_and_begins_at_the_front() -> None:
     scene = ball()
     scene = replace(scene, means=scene.means + torch.tensor([5.0, -3.0, 2.0]))
-    centre, _ = scene_sphere(scene)
+    center, _ = scene_sphere(scene)
     up = torch.tensor([0.0, -1.0, 0.0])
     cameras = orbit_rig(scene, 7, 64, 48, up=up)
     for camera in cameras:
-        ahead = camera.viewmat[:3, :3] @ (centre - camera.position)
+        ahead = camera.viewmat[:3, :3] @ (center - camera.position)
         torch.testing.assert_close(ahead[:2], torch.zeros(2), atol=1e-4, rtol=0)
         assert float((camera.viewmat[:3, :3] @ up)[1]) < 0
-        assert float((camera.position - centre) @ up) > 0, "a camera under the ground"
-    away = cameras[0].position - centre
+        assert float((camera.position - center) @ up) > 0, "a camera under the ground"
+    away = cameras[0].position - center
     assert float(away @ front_direction(up)) > 0.8 * float(away.norm()) * math.cos(math.radians(60))
     assert [camera.name for camera in cameras[:2]] == ["orbit_000", "orbit_001"]
 
@@ -80,8 +80,8 @@ def test_far_strays_do_not_move_the_rig() -> None:
     scene = ball()
     means = scene.means.clone()
     means[:40] = torch.tensor([2000.0, 0.0, 0.0])
-    centre, radius = scene_sphere(replace(scene, means=means))
-    assert float(centre.norm()) < 0.1
+    center, radius = scene_sphere(replace(scene, means=means))
+    assert float(center.norm()) < 0.1
     assert 0.8 < radius < 1.1
 
 

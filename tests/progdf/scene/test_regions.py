@@ -56,7 +56,7 @@ def test_a_box_holds_what_lies_between_its_corners_in_any_order(scene: Gaussians
     assert members("box:1,1e-1,+9,-0.5,-1.5,0", scene) == rows(expected)
 
 
-def test_a_sphere_holds_what_is_near_its_centre(scene: Gaussians) -> None:
+def test_a_sphere_holds_what_is_near_its_center(scene: Gaussians) -> None:
     distance = (scene.means - torch.tensor([0.1, -0.2, 0.3])).norm(dim=1)
     assert members("sphere:0.1,-0.2,.3,1.2", scene) == rows(distance <= 1.2)
 

@@ -90,11 +90,11 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     for view in views:
         expected = render(scene, view.camera).clamp(0, 1)
         difference = (editor.edit(view, 1.0) - expected).abs().amax(dim=2)
-        # a pixel's colours are cut at 1 before they are edited, the members' are not
+        # a pixel's colors are cut at 1 before they are edited, the members' are not
         assert float(difference.max()) < 0.05
         assert float((difference > 0.02).float().mean()) < 0.001
     share = float((editor.pattern > 0.5).float().mean())
-    assert 0.3 < share < 0.7, "stripes, with the old colour between them"
+    assert 0.3 < share < 0.7, "stripes, with the old color between them"
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from trainer.setup.training_setup import confines_edit
 
 
 def crispness(image: Tensor) -> float:
-    """Mean absolute difference of neighbouring pixels."""
+    """Mean absolute difference of neighboring pixels."""
     return float(image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean())
 
 
@@ -209,7 +209,7 @@ def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(t
         ("folder", "auto", "geometry", False),
         ("folder", "yes", "geometry", True),
         ("folder", "no", "style", False),
-        ("night", "yes", "colour", False),  # it leaves the rest alone by itself
+        ("night", "yes", "color", False),  # it leaves the rest alone by itself
     ],
 )
 def test_what_changed_outside_is_put_back_unless_parts_move_or_the_user_says(

@@ -24,7 +24,7 @@ def setup() -> TrainingSetup:
 
 
 def way(bend: float, attribute: str = "sh0") -> Trajectory:
-    """To another colour (or place), half way `bend` off the straight line."""
+    """To another color (or place), half way `bend` off the straight line."""
     rows = pack(setup().scene[setup().region.members], with_shN=False)
     column = attribute_slices(rows.shape[1])[attribute].start
     offsets = torch.zeros(3, *rows.shape)

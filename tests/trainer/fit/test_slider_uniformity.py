@@ -30,7 +30,7 @@ class Late:
     """Shows nearly nothing of the edit before the end; counts how often it is asked."""
 
     stages: tuple[float, ...] = ()
-    kind: EditKind = "colour"
+    kind: EditKind = "color"
     confined: bool = True
     power: float = 3.0
     asked: int = 0

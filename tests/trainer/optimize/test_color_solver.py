@@ -77,7 +77,7 @@ def psnr(scene: Gaussians, edited: Gaussians, offsets: Tensor, cameras: list[Cam
     return float(-10 * torch.stack([(a - b).square().mean() for a, b in pairs]).mean().log10())
 
 
-def test_a_color_map_draws_and_differentiates_as_the_rasteriser_does() -> None:
+def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
     scene = random_gaussians(400, seed=2)
     scene = replace(scene, means=0.4 * scene.means / scene.means.norm(dim=1).max())
     camera, window = orbit(3, 80)[1], (7, 3, 77, 61)

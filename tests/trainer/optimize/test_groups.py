@@ -107,7 +107,7 @@ def test_a_moved_part_looks_as_it_did_from_a_camera_that_moved_along() -> None:
     rows, _ = some_parts()
     one = make_parts(rows, torch.zeros(len(rows), dtype=torch.int64))
     motion = Motion(torch.tensor([[0.3, -0.2, 0.1]]), torch.tensor([0.4]), torch.tensor([[0.5, 0.9, -0.3]]))
-    # colour as in band 0 alone: the bands above it do not turn with the part
+    # color as in band 0 alone: the bands above it do not turn with the part
     part = replace(case.scene[case.region.members], shN=torch.zeros(len(rows), 0, 3))
     after = part.replace_rows(torch.arange(len(rows)), move_rows(rows, one, motion)[:, :14])
     camera = case.views[0].camera

@@ -147,29 +147,29 @@ def test_the_progressive_change_is_the_printed_sum() -> None:
 
 
 def recolored(weights: LossWeights, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
-    """The recordings of a short recolouring of a small bear."""
+    """The recordings of a short recoloring of a small bear."""
     case = small("body")
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     stage = TargetStage(1.0, [crop(editor.edit(v, 1.0), v.box) for v in case.views], steps)
-    settings = PgsSettings(learning_rates("colour", original.shape[1], 1.0), ramp=0.0)
+    settings = PgsSettings(learning_rates("color", original.shape[1], 1.0), ramp=0.0)
     settings = replace(settings, **more)  # type: ignore[arg-type]
     return list(optimize(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
 
 
-def distance_travelled(weights: LossWeights) -> float:
+def distance_traveled(weights: LossWeights) -> float:
     """Mean offset at the end of it."""
     return float(recolored(weights)[-1].offsets.abs().mean())
 
 
 def test_the_printed_constraint_freezes_the_edit_and_a_small_weight_of_it_does_not() -> None:
-    free = distance_travelled(LossWeights())
+    free = distance_traveled(LossWeights())
     for progressive in ("decay", "growth"):
         weights = LossWeights(progressive=progressive)  # type: ignore[arg-type]
-        assert distance_travelled(weights) < 0.2 * free, progressive
+        assert distance_traveled(weights) < 0.2 * free, progressive
     slight = LossWeights(progressive="decay", progressive_weight=1e-6)
-    assert distance_travelled(slight) > 0.8 * free
+    assert distance_traveled(slight) > 0.8 * free
 
 
 def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps() -> None:

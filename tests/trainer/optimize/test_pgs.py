@@ -1,4 +1,4 @@
-"""The edit optimisation: it arrives, records on the way, moves nothing else, and repeats bit for bit."""
+"""The edit optimization: it arrives, records on the way, moves nothing else, and repeats bit for bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Members that no view shows follow the seen ones on their own surface in an edit of colours."""
+"""Members that no view shows follow the seen ones on their own surface in an edit of colors."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_where_all_is_seen_or_nothing_nobody_follows() -> None:
     assert find_unseen_members(scene, members, views).propagate(offsets) is offsets
 
 
-@pytest.mark.parametrize(("kind", "followed"), [("colour", True), ("geometry", False)])
+@pytest.mark.parametrize(("kind", "followed"), [("color", True), ("geometry", False)])
 def test_only_edits_of_colors_are_propagated(kind: EditKind, followed: bool) -> None:
     scene = two_boards()
     region, views = half_seen(scene)

@@ -1,4 +1,4 @@
-"""Whether the higher SH bands are trained follows from how much the region's colours change with the view."""
+"""Whether the higher SH bands are trained follows from how much the region's colors change with the view."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_it_is_the_change_of_the_colors_that_are_drawn() -> None:
 
 
 def sheeny(scales: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:
-    """Members whose colours change alike with the view, so that only how much each counts differs."""
+    """Members whose colors change alike with the view, so that only how much each counts differs."""
     one = random_gaussians(1, sh_degree=1)
     many = one[torch.zeros(len(scales), dtype=torch.int64)]
     return replace(

@@ -45,7 +45,7 @@ def bear() -> scenes.DemoScene:
 
 
 def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
-    """The edit without training: each Gaussian recoloured by formula."""
+    """The edit without training: each Gaussian recolored by formula."""
     gaussians = load_ply(folder / "scene.ply")
     ids = [scene.label_names.index(part) for part in edit.parts]
     region = from_labels(edit.name, scene.labels, ids)

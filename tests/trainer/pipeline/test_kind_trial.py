@@ -20,7 +20,7 @@ from trainer.options import TrainOptions
 from trainer.pipeline.kind_trial import Approach, Trial, approaches, try_approaches
 from trainer.setup.training_setup import TrainingSetup
 
-COLOR, STYLE, FREE = Approach("colour"), Approach("style"), Approach("geometry")
+COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")
 IN_PARTS = Approach("geometry", 120)
 
 
@@ -98,7 +98,7 @@ def test_moving_is_taken_where_it_gains_nearly_as_much_as_paint() -> None:
 def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
     line = Trial(40, {COLOR: 18.0, FREE: 21.23}, 10.0).line()
     assert "40 steps with L1" in line
-    assert "colour 18.0, geometry 21.2 dB" in line
+    assert "color 18.0, geometry 21.2 dB" in line
     assert "taken: geometry (--kind geometry --group-steps 0 skips the trial)" in line
     assert "\n" not in line
 

@@ -18,7 +18,7 @@ GOOD = {"--region": "all", "--editor": "recolor:#3060d0"}
 
 FAULTS = {
     "no scene": ({"scene": "nowhere.ply"}, "nowhere.ply"),
-    "a colour that is none": ({"--editor": "recolor:blue"}, "'blue' is not a colour"),
+    "a color that is none": ({"--editor": "recolor:blue"}, "'blue' is not a color"),
     "a path that is none": ({"--editor": "stripes:#fff,path=green"}, "unknown color path 'green'"),
     "an option that is none": ({"--editor": "tint:#fff,way=hue"}, "'way=hue' is no option"),
     "no share of the light": ({"--editor": "darken:2"}, "no share of the light"),

@@ -59,9 +59,9 @@ def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too()
 
 def test_the_papers_trainer_is_as_printed() -> None:
     options = resolve_options(asked("--preset", "paper"))
-    assert loss_weights(options, "colour") == LossWeights(1.0, 1, "decay", 5.0, "paper", 1.0)
-    assert loss_weights(options, "geometry") == loss_weights(options, "colour"), "whatever the edit"
-    settings = pgs_settings(options, "colour", 23, 1.0, 1)
+    assert loss_weights(options, "color") == LossWeights(1.0, 1, "decay", 5.0, "paper", 1.0)
+    assert loss_weights(options, "geometry") == loss_weights(options, "color"), "whatever the edit"
+    settings = pgs_settings(options, "color", 23, 1.0, 1)
     assert bool((settings.rates > 0).all()), "all attributes are free"
     assert (settings.damped, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
     assert (settings.smoothing, settings.every) == (0.0, options.steps // 32)
@@ -75,45 +75,45 @@ def test_the_paper_can_tighten_instead_of_letting_go() -> None:
 
 
 def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
-    color, style, geometry = (loss_weights(asked(), kind) for kind in ("colour", "style", "geometry"))
+    color, style, geometry = (loss_weights(asked(), kind) for kind in ("color", "style", "geometry"))
     assert (color.perceptual, style.perceptual, geometry.perceptual) == (0.1, 0.3, 0.3)
     assert (color.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
 
 
 def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
-    asks = {kind: stage_count(resolve_options(asked()), kind) for kind in ("colour", "style", "geometry")}
-    assert asks == {"colour": 8, "style": 1, "geometry": 8}
+    asks = {kind: stage_count(resolve_options(asked()), kind) for kind in ("color", "style", "geometry")}
+    assert asks == {"color": 8, "style": 1, "geometry": 8}
     assert stage_count(resolve_options(asked("--stages", "4")), "style") == 4
-    assert stage_count(resolve_options(asked("--quick")), "colour") == 4
-    assert stage_count(resolve_options(asked("--steps", "200")), "colour") == 4, "a stage needs its steps"
-    assert stage_count(resolve_options(asked("--steps", "320")), "colour") == 8
+    assert stage_count(resolve_options(asked("--quick")), "color") == 4
+    assert stage_count(resolve_options(asked("--steps", "200")), "color") == 4, "a stage needs its steps"
+    assert stage_count(resolve_options(asked("--steps", "320")), "color") == 8
     assert stage_count(resolve_options(asked("--steps", "32")), "style") == 1
-    assert stage_count(resolve_options(asked("--quick", "--stages", "2")), "colour") == 2
+    assert stage_count(resolve_options(asked("--quick", "--stages", "2")), "color") == 2
 
 
 def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() -> None:
     options = asked("--perceptual-weight", "0", "--sharpness", "hinge")
-    for kind in ("colour", "style"):
+    for kind in ("color", "style"):
         weights = loss_weights(options, kind)
         assert (weights.perceptual, weights.sharpness, weights.sharpness_weight) == (0.0, "hinge", 0.1)
 
 
 def test_options_that_change_nothing_are_named() -> None:
-    assert idle_options(asked(), "colour") == []
-    assert idle_options(asked("--preset", "paper"), "colour") == []
-    assert idle_options(asked("--group-steps", "9"), "colour") == ["--group-steps"]
+    assert idle_options(asked(), "color") == []
+    assert idle_options(asked("--preset", "paper"), "color") == []
+    assert idle_options(asked("--group-steps", "9"), "color") == ["--group-steps"]
     assert idle_options(asked("--group-steps", "9"), "geometry") == []
 
 
 def test_only_the_warm_up_shortens_the_first_steps() -> None:
     for progressive, warm in (("warmup", True), ("decay", False), ("growth", False), ("off", False)):
-        settings = pgs_settings(asked("--progressive", progressive), "colour", 14, 1.0, 4)
+        settings = pgs_settings(asked("--progressive", progressive), "color", 14, 1.0, 4)
         assert settings.warmup == warm
 
 
 def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
-    ours = pgs_settings(asked(), "colour", 23, 1.0, 4).rates
-    plain = pgs_settings(asked("--preset", "paper"), "colour", 23, 1.0, 4).rates
+    ours = pgs_settings(asked(), "color", 23, 1.0, 4).rates
+    plain = pgs_settings(asked("--preset", "paper"), "color", 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
     assert float(plain[:11].min()) > 0
     assert float(ours[11]) > 10 * float(plain[11])

@@ -30,7 +30,7 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
     bear_folder: Path, uninterrupted: Path, tmp_path: Path
 ) -> None:
     draw = random.Random(7)
-    # among the views, among the edited ones, twice in the optimisation, at the end
+    # among the views, among the edited ones, twice in the optimization, at the end
     spans = ((2, 12), (14, 26), (19, 40), (30, 50), (9, 30))
     lines = killed(bear_folder, tmp_path, [float(draw.randint(*span)) for span in spans], save_every=0)
     assert sum(line.endswith("-9") for line in lines) >= 4, lines
@@ -45,7 +45,7 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
         {"save_every": 0, "kind": "geometry", "group_steps": 12},
         {"save_every": 0, "field": "neural", "fit": "joint", "size": "tiny", "quick": True},
     ],
-    ids=["colour", "parts", "joint"],
+    ids=["color", "parts", "joint"],
 )
 def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
     bear_folder: Path, tmp_path: Path, options: dict[str, object]
@@ -76,7 +76,7 @@ def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
     assert "going on at step 10 of 24" in gone_on(bear_folder, uninterrupted)
 
 
-def test_ctrl_c_before_the_optimisation_is_kept_too(
+def test_ctrl_c_before_the_optimization_is_kept_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:

@@ -122,8 +122,8 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
         "between": {f"{s:g}" for s in done.report["trajectory"]["stages_at"][:-1]},
         "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
         "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
-        "time": {"views", "edit", "optimise", "fit", "total"},
-        "memory_by_stage_mb": {"views", "edit", "optimise", "fit", "report"},
+        "time": {"views", "edit", "optimize", "fit", "total"},
+        "memory_by_stage_mb": {"views", "edit", "optimize", "fit", "report"},
         "options": {"scene", "editor", "seed"},
     }
     for part, keys in expected.items():
@@ -148,7 +148,7 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
     folder: Path, done: RunResult
 ) -> None:
     options = quick_options(
-        folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="colour"
+        folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="color"
     )
     result = train(options, quiet=True)
     assert result.report["edit"]["psnr_to_views"] > 32.0
@@ -203,7 +203,7 @@ def test_refitting_changes_the_field_and_nothing_that_was_optimized(folder: Path
     assert "the smallest of" in again.report["choice"]["why"]
     assert result.folder.trajectory.read_bytes() == before, "a recording is written once"
     assert again.report["edit"] == result.report["edit"]
-    for stage in ("optimise", "total"):
+    for stage in ("optimize", "total"):
         assert again.report["time"][stage] == result.report["time"][stage]
 
 
@@ -251,7 +251,7 @@ def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
         "{scene} --out r --region all --editor night --name a/b",
         "{scene} --out r --region all --editor night --cameras nowhere.json",
         "{scene} --out {scene} --region all --editor night",
-        "{scene} --out r --region all --editor night --colour blue",
+        "{scene} --out r --region all --editor night --color blue",
         "{scene} --out r --region all",
         "--out r",
     ],

@@ -44,7 +44,7 @@ def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_
 def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
     bear_folder: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with files_up_to(40_000):  # the pictures fit in, the optimiser's state does not
+    with files_up_to(40_000):  # the pictures fit in, the optimizer's state does not
         assert main(words(bear_folder, "--resume", "--save-every=0")) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "progdf: the disk of run is full; free some space, then go on with --resume"

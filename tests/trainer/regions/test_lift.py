@@ -63,7 +63,7 @@ def test_masks_of_a_part_lift_back_to_the_part(demo: DemoScene, cameras: list[Ca
     member = demo.labels == demo.label_names.index(part)
     masks = [label_mask(demo.gaussians, member, camera) for camera in cameras]
     region = lift_masks(demo.gaussians, cameras, masks)
-    assert overlap(region.members, member) > 0.94  # .955-1 when written, .68-.93 without the neighbours
+    assert overlap(region.members, member) > 0.94  # .955-1 when written, .68-.93 without the neighbors
 
 
 @pytest.mark.slow
@@ -131,11 +131,11 @@ def test_the_papers_rule_selects_nothing_at_the_papers_threshold(
     assert len(lift_masks(demo.gaussians, cameras[:4], white, rule="count")) > 0
 
 
-def test_grey_masks_count_in_part() -> None:
+def test_gray_masks_count_in_part() -> None:
     scene, camera = wall(3.0), front_camera(64, 64, 64.0)
-    grey = torch.full((64, 64), 0.6)
-    assert lift_masks(scene, [camera], [grey]).members.tolist() == []
-    assert len(lift_masks(scene, [camera], [grey], threshold=0.55)) == len(scene)
+    gray = torch.full((64, 64), 0.6)
+    assert lift_masks(scene, [camera], [gray]).members.tolist() == []
+    assert len(lift_masks(scene, [camera], [gray], threshold=0.55)) == len(scene)
 
 
 # --------------------------------------------------------------------------------------------- never seen
@@ -183,7 +183,7 @@ def test_nothing_in_reach_is_no_vote() -> None:
     assert surface_vote(scene, torch.ones(30, dtype=torch.bool), torch.arange(30)).tolist() == [0.0] * 30
 
 
-# ---------------------------------------------------------------------------------------------- neighbours
+# ---------------------------------------------------------------------------------------------- neighbors
 
 
 @pytest.mark.parametrize("count", [2, 5, 100, 700, 3001])

@@ -93,9 +93,9 @@ def test_masks_join_with_other_kinds_of_region(masks: Path, tmp_path: Path) -> N
     alone = set(region_of(f"masks:{masks}", settings(tmp_path)).members.tolist())
     np.save(tmp_path / "l.npy", DEMO.labels.numpy())
     head = DEMO.label_names.index("head")
-    labelled = set((DEMO.labels == head).nonzero()[:, 0].tolist())
+    labeled = set((DEMO.labels == head).nonzero()[:, 0].tolist())
     both = region_of(f"masks:{masks} + labels:{tmp_path}/l.npy:{head}", settings(tmp_path))
-    assert set(both.members.tolist()) == alone | labelled
+    assert set(both.members.tolist()) == alone | labeled
     rest = region_of(f"all - masks:{masks}", settings(tmp_path))
     assert set(rest.members.tolist()) == set(range(len(SCENE))) - alone
 

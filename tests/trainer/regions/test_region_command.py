@@ -84,7 +84,7 @@ def test_rows_of_another_scene_are_one_line(
 def test_the_picture_tints_the_region_and_takes_the_color_from_the_rest(demo: DemoScene) -> None:
     camera = demo.cameras[0].resize(64, 64)
     nothing = picture(demo.gaussians, from_mask("", torch.zeros(3000, dtype=torch.bool)), camera)
-    assert float((nothing.amax(dim=2) - nothing.amin(dim=2)).max()) < 1e-3, "grey"
+    assert float((nothing.amax(dim=2) - nothing.amin(dim=2)).max()) < 1e-3, "gray"
     assert float(nothing.min()) > 0.6, "pale"
     region = from_mask("", demo.labels == demo.labels[0])
     shown = picture(demo.gaussians, region, camera)

@@ -124,7 +124,7 @@ def test_a_smooth_change_that_colors_can_make_is_explained() -> None:
 
 @dataclass(frozen=True)
 class LinearSight:
-    """A view of which the picture is a known matrix [P,M] times the colours."""
+    """A view of which the picture is a known matrix [P,M] times the colors."""
 
     matrix: Tensor
     change: Tensor

@@ -82,7 +82,7 @@ def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> Non
     assert evaluator.psnr(beyond, truth) == 99.0
 
 
-def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_was_not_asked() -> None:
+def test_strips_show_the_same_view_at_five_strengths_and_gray_where_the_editor_was_not_asked() -> None:
     bear = small(count=3)
     evaluator = _judged(bear)
     columns = columns_of([(1.0, 1.0)])
@@ -91,8 +91,8 @@ def test_strips_show_the_same_view_at_five_strengths_and_grey_where_the_editor_w
     assert {picture.shape for picture in (*ours, *own)} == {ours[0].shape}
     assert torch.equal(ours[0], own[0])
     assert float(ours[4].mean()) < float(ours[2].mean()) < float(ours[0].mean())
-    grey = (own[1] - own[1].mean()).abs() < 0.02
-    assert float(grey.float().mean()) > 0.5
+    gray = (own[1] - own[1].mean()).abs() < 0.02
+    assert float(gray.float().mean()) > 0.5
     assert int(evaluator.pixels[best_view(evaluator)].sum()) == max(int(p.sum()) for p in evaluator.pixels)
 
 

@@ -37,7 +37,7 @@ def test_pictures_of_views_that_are_no_more_go(tmp_path: Path) -> None:
 
 def test_pictures_of_ones_own_stay_whatever_they_are_called(tmp_path: Path) -> None:
     folder = written(tmp_path)
-    own = {"edited/mine.png", "edited/mine.json", "edited/variants/a.png", "favourites/a.png"}
+    own = {"edited/mine.png", "edited/mine.json", "edited/variants/a.png", "favorites/a.png"}
     for name in own:
         (folder.views / name).parent.mkdir(exist_ok=True)
         (folder.views / name).write_text("mine")

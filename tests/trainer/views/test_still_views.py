@@ -1,4 +1,4 @@
-"""Views whose geometry stays: linear maps from colours to the same pictures."""
+"""Views whose geometry stays: linear maps from colors to the same pictures."""
 
 from __future__ import annotations
 

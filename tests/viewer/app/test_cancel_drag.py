@@ -74,13 +74,13 @@ def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig, call_o
     y = gain_row(hand)
     hand.frame(40)  # a press soon after the last would be a double click, which resets
     hand.drag((LEFT + 218, y), (LEFT + 150, y))
-    colour = hand.main_view.work.view.layers[0].gains.colour
-    assert 0.0 < colour < 1.0
+    color = hand.main_view.work.view.layers[0].gains.color
+    assert 0.0 < color < 1.0
     before = hand.main_view.work
     hand.move(LEFT + 150, y)
     hand.press()
     hand.move(LEFT + 180, y)
-    assert hand.main_view.work.view.layers[0].gains.colour != colour
+    assert hand.main_view.work.view.layers[0].gains.color != color
     call_off(hand)
     hand.move(LEFT + 120, y)
     hand.release()
@@ -89,11 +89,11 @@ def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig, call_o
 
 
 def gain_row(hand: Rig) -> float:
-    """Where the slider of the colour gain of the first layer stands."""
+    """Where the slider of the color gain of the first layer stands."""
     for y in range(200, 400, 6):
         before = hand.main_view.work
         hand.drag((LEFT + 218, y), (LEFT + 150, y))
-        moved = hand.main_view.work.view.layers[0].gains.colour != 1.0
+        moved = hand.main_view.work.view.layers[0].gains.color != 1.0
         hand.main_view.restart(before.view)
         hand.settle()
         if moved:

@@ -92,7 +92,7 @@ def test_a_place_chosen_in_the_desktops_dialog_is_saved_to(desktop: Desktop) -> 
     assert not desktop.app.file_actions.has_unsaved
 
 
-def test_cancelling_it_leaves_the_question_with_what_was_typed(desktop: Desktop) -> None:
+def test_canceling_it_leaves_the_question_with_what_was_typed(desktop: Desktop) -> None:
     press(desktop.app, "Ctrl+S")
     typed = question(desktop).text
     press(desktop.app, "Ctrl+B")

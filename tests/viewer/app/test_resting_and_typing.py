@@ -109,7 +109,7 @@ def test_escape_closes_the_list_of_keys_first(hand: Rig) -> None:
     assert hand.main_view.work.focus is None
 
 
-def test_the_chosen_segment_keeps_its_colour_under_the_mouse(hand: Rig) -> None:
+def test_the_chosen_segment_keeps_its_color_under_the_mouse(hand: Rig) -> None:
     y = 334.0  # Orbit of Orbit | Fly
     hand.move(200.0, 300.0)
     hand.settle()

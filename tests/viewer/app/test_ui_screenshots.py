@@ -24,7 +24,7 @@ Compare = Callable[[str, np.ndarray], None]
 
 @pytest.fixture(scope="module", autouse=True)
 def software_gpu() -> None:
-    """Goldens hold for one rasteriser of text and lines; elsewhere they would differ by a hair's breadth."""
+    """Goldens hold for one rasterizer of text and lines; elsewhere they would differ by a hair's breadth."""
     try:
         context = headless_context()
     except ProgdfError as error:

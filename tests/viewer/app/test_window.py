@@ -209,7 +209,7 @@ def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> 
 @pytest.mark.slow
 def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop: Desktop) -> None:
     first = desktop.shot()
-    desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimising does to a window
+    desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimizing does to a window
     desktop.until_idle("a window that draws nothing when nobody can see it")
     desktop.xdotool("windowmap", "--sync", desktop.window)
     desktop.xdotool("windowfocus", "--sync", desktop.window)
@@ -225,15 +225,15 @@ def test_the_real_mouse_paints_and_undo_takes_the_stroke_away(desktop: Desktop) 
     desktop.xdotool("key", "2")  # the lower card: the scarf
     clean = desktop.shot()
     desktop.xdotool("key", "b")
-    colours = desktop.rest()
-    assert changed(clean, colours) > 200, "the weights are shown"
+    colors = desktop.rest()
+    assert changed(clean, colors) > 200, "the weights are shown"
     x, y = scarf_on_screen()
     desktop.drag((x - 30, y), (x + 30, y))
     desktop.point(*slider(0, 0.5))
-    desktop.until("the stroke", lambda: changed(colours, desktop.shot()) > 100)
+    desktop.until("the stroke", lambda: changed(colors, desktop.shot()) > 100)
     painted = desktop.rest()
     desktop.xdotool("key", "ctrl+z")
-    assert changed(colours, desktop.rest()) == 0
+    assert changed(colors, desktop.rest()) == 0
     desktop.xdotool("key", "ctrl+shift+z")
     assert changed(painted, desktop.rest()) == 0
     desktop.xdotool("key", "b")

@@ -58,7 +58,7 @@ def test_an_edit_given_twice_is_refused_however_its_file_is_named(
     assert not list(here.glob("x.*"))
 
 
-@pytest.mark.parametrize("blend", ["normalised", "sum", "over"])
+@pytest.mark.parametrize("blend", ["normalized", "sum", "over"])
 def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) -> None:
     """Strengths, gains, paint, which layers show, their order and how they blend."""
     view = replace(full_view(), blend=blend)
@@ -96,7 +96,7 @@ def test_a_strength_said_beside_the_session_wins_under_the_layers_name_or_its_ed
 
 
 def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: Path) -> None:
-    view = replace(full_view(), blend="normalised")
+    view = replace(full_view(), blend="normalized")
     view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
     scene, _, ears = bear().save(here)
     opened = document.load(scene, [ears, ears])

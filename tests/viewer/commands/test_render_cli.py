@@ -208,7 +208,7 @@ def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: R
         (("--orbit", "0,91"), "--orbit 0,91: the elevation must be between -90 and 90 degrees, got 91"),
         (("--orbit", "0,0,0"), "--orbit 0,0,0: the distance must be above 0 and at most 1e+09, got 0"),
         (("--orbit", "0,0,1e300"), "--orbit 0,0,1e300: the distance must be above 0"),
-        (("--background", "pink"), "'pink' is not a colour"),
+        (("--background", "pink"), "'pink' is not a color"),
         (("--sweep", "scarf"), "x.png cannot hold an animation"),
         (("--sheet", "scarf,hat"), "--sheet hat: there is no edit of that name"),
         (("--sheet", "scarf,scarf"), "--sheet scarf,scarf does not name one or two different edits"),

@@ -79,7 +79,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("view", "layers", 0, "strength"), 3.0, "strength"),
     (("view", "layers", 0, "strength"), "1", "strength"),
     (("view", "layers", 0, "enabled"), 1, "enabled"),
-    (("view", "layers", 0, "gains", "colour"), -1.0, "gains"),
+    (("view", "layers", 0, "gains", "color"), -1.0, "gains"),
     (("view", "layers", 0, "paint"), "AAAA", "paint"),
     (("view", "brush", "mode"), "spray", "spray"),
     (("view", "brush", "radius"), 0.0, "radius"),

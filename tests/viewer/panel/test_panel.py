@@ -138,7 +138,7 @@ def test_a_drag_back_to_where_it_began_leaves_no_entry(hand: Hand) -> None:
     assert hand.work.past.past == ()
 
 
-def test_pressing_the_handle_off_its_centre_does_not_make_it_jump(hand: Hand) -> None:
+def test_pressing_the_handle_off_its_center_does_not_make_it_jump(hand: Hand) -> None:
     hand.move(at(0.5) + 4, TRACKS[0])
     hand.button(True)
     assert hand.strengths[0] == 0.5
@@ -258,7 +258,7 @@ def test_buttons_ask_for_the_actions_that_keys_have(hand: Hand) -> None:
     assert hand.actions == ["help", "picture"]
 
 
-def test_undo_is_greyed_while_there_is_nothing_to_undo(hand: Hand) -> None:
+def test_undo_is_grayed_while_there_is_nothing_to_undo(hand: Hand) -> None:
     hand.click(LEFT + 24, SIZE[1] - 22)
     assert hand.actions == []
     hand.click(at(0.3), TRACKS[1])

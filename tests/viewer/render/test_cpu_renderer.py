@@ -95,7 +95,7 @@ def test_a_random_session_of_sliders_gives_the_bits_of_whole_pictures(stack: Sta
         if step % 15 == 14:
             view = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 30.0))
         if step % 20 == 19:
-            view = replace(view, blend="sum" if view.blend == "normalised" else "normalised")
+            view = replace(view, blend="sum" if view.blend == "normalized" else "normalized")
         image = kept.image(view, SIZE)
         shares.append(kept.timings.share)
         fresh = ViewEngine(None, kept.gaussians(view))

@@ -52,7 +52,7 @@ class Edited:
         self.textures.write(scene)
         self.edit_pass = EditPass(ctx, self.textures, scene, gdfs)
 
-    def update(self, stack: Stack, blend: str = "normalised", changed: Sequence[int] | None = None) -> None:
+    def update(self, stack: Stack, blend: str = "normalized", changed: Sequence[int] | None = None) -> None:
         edits = frozenset(range(len(self.gdfs)) if changed is None else changed)
         self.edit_pass.run([(edit, layer) for edit, layer in stack if layer.active], blend, edits)
 
@@ -113,7 +113,7 @@ def gdf_of(scene: Gaussians, members: int, seed: int, **field: object) -> Gdf:
 
 @pytest.fixture(scope="module")
 def edited(ctx: moderngl.Context) -> Iterator[Edited]:
-    """Four overlapping edits: int8 bases, colour alone, float32 bases, places and SH without a basis."""
+    """Four overlapping edits: int8 bases, color alone, float32 bases, places and SH without a basis."""
     scene = signed_zeros(random_gaussians(COUNT, seed=3, sh_degree=2))
     gdfs = [
         gdf_of(scene, 400, 1),
@@ -145,7 +145,7 @@ def test_painted_weights_gains_and_overshoot_are_what_compose_gives(edited: Edit
     layers = [
         Layer(edited.gdfs[2], 1.2, gains=Gains(geometry=0.5), weights=painted(500)),
         Layer(edited.gdfs[0], 0.6, gains=Gains(geometry=0.0, opacity=0.3)),
-        Layer(edited.gdfs[3], 0.9, gains=Gains(colour=0.0), weights=painted(200, 1)),
+        Layer(edited.gdfs[3], 0.9, gains=Gains(color=0.0), weights=painted(200, 1)),
     ]
     edited.update(list(zip((2, 0, 3), layers, strict=True)), blend)
     assert edited.apart(compose_layers(edited.scene, layers, blend)) <= FEW_ULPS
@@ -273,7 +273,7 @@ def test_edits_without_members_and_tiny_scenes_are_survived(ctx: moderngl.Contex
     layers = [Layer(gdf, 0.5) for gdf in gdfs]
     made.update(list(enumerate(layers)))
     assert made.apart(compose_layers(scene, layers)) <= FEW_ULPS
-    assert EditSample(scene, gdfs).error(made.edit_pass, list(enumerate(layers)), "normalised") <= FEW_ULPS
+    assert EditSample(scene, gdfs).error(made.edit_pass, list(enumerate(layers)), "normalized") <= FEW_ULPS
     assert ctx.error == "GL_NO_ERROR"
     made.release()
 

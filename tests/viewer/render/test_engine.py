@@ -218,7 +218,7 @@ def test_whatever_changes_the_picture_needs_a_draw(engine: ViewEngine, stack: St
     view = view_of(stack, 0.5, 0.5)
     engine.image(view, SIZE)
     turned = replace(view, camera=replace(view.camera, azimuth=3.0))
-    weaker = replace(view.layers[0], gains=Gains(colour=0.5))
+    weaker = replace(view.layers[0], gains=Gains(color=0.5))
     assert engine.needs_draw(turned, SIZE)
     assert engine.needs_draw(view, (97, 72))
     assert engine.needs_draw(view_of(stack, 0.5, 0.501), SIZE)
@@ -253,7 +253,7 @@ def test_a_camera_move_composes_nothing(
 
 
 @pytest.mark.gl
-def test_a_change_of_colour_sorts_nothing_and_a_change_of_place_does(
+def test_a_change_of_color_sorts_nothing_and_a_change_of_place_does(
     gl_engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gl_engine.image(view_of(stack), SIZE)
@@ -321,7 +321,7 @@ def test_an_engine_without_a_context_draws_on_the_cpu(stack: Stack) -> None:
 
 
 @pytest.mark.gl
-def test_software_opengl_is_left_to_the_cpu_rasteriser(ctx: moderngl.Context, stack: Stack) -> None:
+def test_software_opengl_is_left_to_the_cpu_rasterizer(ctx: moderngl.Context, stack: Stack) -> None:
     engine = ViewEngine(ctx, stack.scene, stack.gdfs)
     assert engine.draws_with == ("cpu" if is_software(ctx) else "gl")
     engine.release()

@@ -109,7 +109,7 @@ def test_the_bear_looks_the_same_as_on_the_cpu(draw: Draw) -> None:
     demo = bear()
     for camera in demo.cameras[::16]:
         small = camera.resize(320, 320)
-        # the early stop at 1e-4 leaves at most 0.01 of a colour in a pixel: 76 dB and more
+        # the early stop at 1e-4 leaves at most 0.01 of a color in a pixel: 76 dB and more
         assert psnr(draw(demo.gaussians, small), render(demo.gaussians, small, WHITE).numpy()) >= 70.0
 
 

@@ -1,4 +1,4 @@
-"""Painted weights shown as colours: the ramp, both ways of drawing, and what does not show them."""
+"""Painted weights shown as colors: the ramp, both ways of drawing, and what does not show them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def shown(engine: ViewEngine, state: ViewState, ctx: moderngl.Context) -> np.nda
 
 
 def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
-    """The plain way: another scene, in which the members have the mixed colours."""
+    """The plain way: another scene, in which the members have the mixed colors."""
     members = bear().gdfs[shade.gdf].region.members
     over = torch.from_numpy(highlight.highlight_colors(shade, bear().gdfs).astype(np.float32)) / 255.0
     share = over[:, 3:]
@@ -60,7 +60,7 @@ def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
     return replace(scene, sh0=sh0, shN=shN)
 
 
-def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colours() -> None:
+def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colors() -> None:
     ramp = highlight.ramp_colors(np.linspace(0, 1, 256, dtype=np.float32)).astype(float)
     assert tuple(ramp[0]) == (0x2B, 0x3F, 0xA8)
     assert tuple(ramp[-1]) == (0xF9, 0xE5, 0x58)
@@ -71,7 +71,7 @@ def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colours() -> None:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_what_is_shown_is_the_scene_with_mixed_colours(ctx: moderngl.Context, draw: str) -> None:
+def test_what_is_shown_is_the_scene_with_mixed_colors(ctx: moderngl.Context, draw: str) -> None:
     shade = Highlight(SCARF, half_painted())
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
     plain = ViewEngine(ctx, highlighted(engine.gaussians(view(1.0, shade.paint)), shade), (), draw)
@@ -163,7 +163,7 @@ def test_c_hides_the_weights_and_saved_pictures_never_show_them() -> None:
         assert hand.main_view.work.past.past == (), "looking is no edit"
 
 
-def test_an_overlap_colours_what_both_edits_have_and_nothing_else() -> None:
+def test_an_overlap_colors_what_both_edits_have_and_nothing_else() -> None:
     scarf, ears = bear().gdfs
     moved = torch.cat([scarf.region.members[10:40], torch.arange(len(scarf.region) - 30)]).unique()
     assert len(moved) == len(scarf.region), "the bear's first splats are not of its scarf"

@@ -80,7 +80,7 @@ def test_rows_that_are_not_numbers_are_passed_over() -> None:
 @given(st.integers(0, 20), st.floats(0, 40), st.floats(0, 24))
 @example(1, 31.0, 10.0)  # a Gaussian beside the picture, close to the camera: its projection is clamped
 @settings(max_examples=40, deadline=None)
-def test_something_is_picked_exactly_where_the_rasteriser_draws_something(
+def test_something_is_picked_exactly_where_the_rasterizer_draws_something(
     seed: int, x: float, y: float
 ) -> None:
     camera, scene = orbit_camera(), random_gaussians(60, seed)

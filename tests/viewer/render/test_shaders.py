@@ -86,7 +86,7 @@ def test_every_scene_texture_is_declared_with_the_fields_of_its_dtype_in_order()
         assert places == sorted(places), f"{name}: {samplers[name]}"
 
 
-def test_the_shaders_constants_are_the_rasterisers() -> None:
+def test_the_shaders_constants_are_the_rasterizers() -> None:
     found = dict(re.findall(r"const float (\w+) = ([^;]+);", text_of("include/conventions.glsl")))
     assert len(found) == 5
     for name, value in found.items():
@@ -176,7 +176,7 @@ def test_a_mistake_after_an_include_is_told_with_the_stages_line(
     (folder / "fine.glsl").write_text("const float FINE = 1.0;\n")
     (folder / "a.vert").write_text("#version 330 core\nvoid main() { gl_Position = vec4(1.0); }\n")
     (folder / "a.frag").write_text(
-        '#version 330 core\nout vec4 colour;\n#include "fine.glsl"\nvoid main() { colour = nothing; }\n'
+        '#version 330 core\nout vec4 color;\n#include "fine.glsl"\nvoid main() { color = nothing; }\n'
     )
     monkeypatch.setattr(programs.resources, "files", lambda _: folder)
     with pytest.raises(ShaderError, match=r"shaders/a\.frag:4: .*nothing"):

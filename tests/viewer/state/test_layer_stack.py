@@ -125,7 +125,7 @@ def test_without_overshoot_nothing_stands_beyond_one() -> None:
     over = stack.with_overshoot(THREE, True)
     assert stack.nudge(over, 0, "strength", 0.6).layers[0].strength == 1.1
     assert stack.nudge(over, 0, "strength", 9.0).layers[0].strength == stack.OVERSHOOT
-    assert stack.nudge(over, 0, "colour", 9.0).layers[0].gains.colour == 1.0
+    assert stack.nudge(over, 0, "color", 9.0).layers[0].gains.color == 1.0
     back = stack.with_overshoot(stack.nudge(over, 0, "strength", 9.0), False)
     assert back.layers[0].strength == 1.0
     assert parse_strength("130%", stack.largest_strength(over)) == stack.OVERSHOOT
@@ -162,10 +162,10 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
 def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
     hand.key("2")
     hand.key("Tab")
-    assert hand.main_view.work.active_slider == "colour", "a change of colour has no other gain"
+    assert hand.main_view.work.active_slider == "color", "a change of color has no other gain"
     assert hand.main_view.work.view.unfolded == (0,)
     hand.key("Shift+Left")
-    assert layers(hand)[0].gains == Gains(colour=0.9)
+    assert layers(hand)[0].gains == Gains(color=0.9)
     assert hand.strengths == [0.5, 0.5]
     hand.key("Tab")
     assert hand.main_view.work.active_slider == "strength"
@@ -322,7 +322,7 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
     rows = layer_rows(made.scene, (made.gdfs[0], made.gdfs[1], made.gdfs[0]))
     scarf, ears = (len(gdf.region) for gdf in made.gdfs)
     assert [row.shared for row in rows] == [(scarf, 0, scarf), (0, ears, 0), (scarf, 0, scarf)]
-    assert [row.kinds for row in rows[:2]] == [{"colour"}, {"colour", "geometry"}]
+    assert [row.kinds for row in rows[:2]] == [{"color"}, {"color", "geometry"}]
 
 
 def test_the_curve_begins_at_nothing_reaches_all_at_one_and_goes_beyond() -> None:
@@ -371,11 +371,11 @@ def test_export_and_render_take_gains_solo_and_overshoot(
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"gains": ["scarf=0.5"]}, "write NAME:KIND=G, for example scarf:colour=0.5"),
-        ({"gains": ["scarf:shine=0.5"]}, "the gains are geometry, opacity, colour"),
-        ({"gains": ["scarf:colour=2"]}, "the gain '2' is not a number from 0 to 1"),
-        ({"gains": ["scarf:colour=nan"]}, "not a number from 0 to 1"),
-        ({"gains": ["hat:colour=1"]}, "there is no edit of that name"),
+        ({"gains": ["scarf=0.5"]}, "write NAME:KIND=G, for example scarf:color=0.5"),
+        ({"gains": ["scarf:shine=0.5"]}, "the gains are geometry, opacity, color"),
+        ({"gains": ["scarf:color=2"]}, "the gain '2' is not a number from 0 to 1"),
+        ({"gains": ["scarf:color=nan"]}, "not a number from 0 to 1"),
+        ({"gains": ["hat:color=1"]}, "there is no edit of that name"),
         ({"solo": ["hat"]}, "--solo hat: there is no edit of that name"),
         ({"settings": ["scarf=1.1"]}, "not a number from 0 to 1"),
         ({"settings": ["scarf=1.3"], "overshoot": True}, "not a number from 0 to 1.2"),

@@ -130,7 +130,7 @@ def test_smoothing_leaves_what_the_brush_has_not_touched_and_keeps_even_weights(
     assert result(even, brush, "smooth") == pytest.approx(np.full(80, 0.6), abs=0.003)
 
 
-def test_a_mean_of_neighbours_stays_within_them_and_does_not_depend_on_where_cells_begin() -> None:
+def test_a_mean_of_neighbors_stays_within_them_and_does_not_depend_on_where_cells_begin() -> None:
     rng = np.random.default_rng(0)
     points, values = rng.normal(size=(4000, 3)).astype(np.float32), rng.random(4000).astype(np.float32)
     means = [near_mean(points + np.float32(shift), values, 0.5) for shift in (0.0, 0.13, 0.31)]

@@ -14,7 +14,7 @@ from trainer.optimize.pgs import optimize
 from trainer.store.state import PeriodicSave, Saved, StateFolder
 
 
-def test_the_optimiser_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) -> None:
+def test_the_optimizer_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) -> None:
     case = small("body")
     wanted = course(case, steps=6)
     straight, original = list(optimize(*wanted)), wanted[0]

@@ -1,4 +1,4 @@
-"""Colour edits: shading survives, strength 0 is the input."""
+"""Color edits: shading survives, strength 0 is the input."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.color import edits as colour
+from progdf.color import edits as color
 from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.errors import ProgdfError
 
 ORANGE = torch.tensor([1.0, 0.55, 0.1])
-BLUE = colour.parse_color("#1133dd")
+BLUE = color.parse_color("#1133dd")
 
 
 def _random(n: int = 500) -> Tensor:
@@ -23,7 +23,7 @@ def _polar(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return lightness, torch.hypot(a, b), torch.rad2deg(torch.atan2(b, a))
 
 
-def test_oklab_there_and_back_is_the_same_colour() -> None:
+def test_oklab_there_and_back_is_the_same_color() -> None:
     rgb = _random()
     # single precision through two cubes and a power of 2.4
     assert (oklab_to_srgb(srgb_to_oklab(rgb)) - rgb).abs().max() < 1e-4
@@ -38,7 +38,7 @@ def test_strength_zero_is_the_input_bit_for_bit(edit: str) -> None:
 
 
 @pytest.mark.parametrize("edit", ["recolor", "tint", "darken", "night", "stripes"])
-def test_small_steps_of_strength_are_small_steps_of_colour(edit: str) -> None:
+def test_small_steps_of_strength_are_small_steps_of_color(edit: str) -> None:
     rgb = torch.cat([_random(), torch.full((4, 3), 0.5), torch.tensor([[-0.3, 1.4, 0.5]])])
     steps = torch.stack([_edited(edit, rgb, float(s)) for s in torch.linspace(0, 1, 101)])
     largest = (steps[1:] - steps[:-1]).abs().amax(dim=(1, 2))
@@ -48,45 +48,45 @@ def test_small_steps_of_strength_are_small_steps_of_colour(edit: str) -> None:
 
 def _edited(edit: str, rgb: Tensor, strength: float) -> Tensor:
     if edit == "stripes":
-        return colour.stripes(rgb, torch.ones(len(rgb)), BLUE, strength)
+        return color.stripes(rgb, torch.ones(len(rgb)), BLUE, strength)
     if edit == "darken":
-        return colour.darken(rgb, strength)
+        return color.darken(rgb, strength)
     if edit == "night":
-        return colour.night(rgb, strength)
-    return (colour.recolor if edit == "recolor" else colour.tint)(rgb, BLUE, strength)
+        return color.night(rgb, strength)
+    return (color.recolor if edit == "recolor" else color.tint)(rgb, BLUE, strength)
 
 
-def test_recolouring_takes_the_reference_to_the_target() -> None:
-    assert torch.allclose(colour.recolor(ORANGE[None], BLUE)[0], BLUE, atol=2e-3)
+def test_recoloring_takes_the_reference_to_the_target() -> None:
+    assert torch.allclose(color.recolor(ORANGE[None], BLUE)[0], BLUE, atol=2e-3)
     black = torch.full((1, 3), 0.03)
-    assert torch.allclose(colour.recolor(black, ORANGE)[0], ORANGE, atol=2e-3)
+    assert torch.allclose(color.recolor(black, ORANGE)[0], ORANGE, atol=2e-3)
 
 
-def test_recolouring_keeps_the_order_of_lightness() -> None:
+def test_recoloring_keeps_the_order_of_lightness() -> None:
     shades = torch.linspace(0.1, 1.0, 30)[:, None] * ORANGE
     before = _polar(shades)[0]
-    after = _polar(colour.recolor(shades, BLUE, 1.0))[0]
+    after = _polar(color.recolor(shades, BLUE, 1.0))[0]
     assert (before.diff() > 0).all()
     assert (after.diff() > 0).all()
 
 
-def test_grey_takes_the_hue_of_the_target() -> None:
-    grey = torch.full((1, 3), 0.5)
+def test_gray_takes_the_hue_of_the_target() -> None:
+    gray = torch.full((1, 3), 0.5)
     for s in (0.2, 0.6, 1.0):
-        hue = _polar(colour.recolor(grey, BLUE, s))[2]
+        hue = _polar(color.recolor(gray, BLUE, s))[2]
         assert torch.allclose(hue, _polar(BLUE[None])[2], atol=3.0)
 
 
-def test_a_grey_target_keeps_the_source_hue_on_the_way() -> None:
-    half = colour.recolor(ORANGE[None], torch.full((3,), 0.6), 0.5)
+def test_a_gray_target_keeps_the_source_hue_on_the_way() -> None:
+    half = color.recolor(ORANGE[None], torch.full((3,), 0.6), 0.5)
     assert torch.allclose(_polar(half)[2], _polar(ORANGE[None])[2], atol=3.0)
-    assert float(_polar(colour.recolor(ORANGE[None], torch.full((3,), 0.6)))[1]) < 0.01
+    assert float(_polar(color.recolor(ORANGE[None], torch.full((3,), 0.6)))[1]) < 0.01
 
 
-def test_edited_colours_can_be_shown() -> None:
+def test_edited_colors_can_be_shown() -> None:
     for strength in (0.3, 1.0):
         for target in (BLUE, ORANGE, torch.ones(3), torch.zeros(3)):
-            out = colour.recolor(_random(), target, strength)
+            out = color.recolor(_random(), target, strength)
             assert out.isfinite().all()
             assert out.min() >= 0
             assert out.max() <= 1
@@ -94,43 +94,43 @@ def test_edited_colours_can_be_shown() -> None:
 
 def test_tinting_keeps_lightness() -> None:
     rgb = 0.2 + 0.6 * _random()
-    assert (_polar(colour.tint(rgb, BLUE))[0] - _polar(rgb)[0]).abs().max() < 0.01
+    assert (_polar(color.tint(rgb, BLUE))[0] - _polar(rgb)[0]).abs().max() < 0.01
 
 
 def test_a_stop_halves_the_light() -> None:
-    grey = torch.full((1, 3), 0.8)
+    gray = torch.full((1, 3), 0.8)
     linear = ((0.8 + 0.055) / 1.055) ** 2.4
-    darker = ((colour.darken(grey, 1.0, stops=1.0) + 0.055) / 1.055) ** 2.4
+    darker = ((color.darken(gray, 1.0, stops=1.0) + 0.055) / 1.055) ** 2.4
     assert torch.allclose(darker, torch.full((1, 3), linear / 2), rtol=1e-3)
 
 
 def test_strength_may_differ_from_pixel_to_pixel() -> None:
     image = _random(64).reshape(8, 8, 3)
     strength = torch.linspace(0, 1, 64).reshape(8, 8)
-    reference = colour.typical_color(image)
-    whole = colour.recolor(image, BLUE, strength, reference)
-    one = colour.recolor(image[3, 5], BLUE, float(strength[3, 5]), reference)
+    reference = color.typical_color(image)
+    whole = color.recolor(image, BLUE, strength, reference)
+    one = color.recolor(image[3, 5], BLUE, float(strength[3, 5]), reference)
     assert torch.allclose(whole[3, 5], one, atol=1e-5)
 
 
 def test_stripes_are_a_function_of_place() -> None:
     along = torch.tensor([0.0, 0.25, 0.5, 1.0, 1.5])
     points = torch.stack([7 * along, 0.3 * along, along], dim=1)
-    pattern = colour.stripe_pattern(points, torch.tensor([0.0, 0.0, 3.0]), period=1.0)
+    pattern = color.stripe_pattern(points, torch.tensor([0.0, 0.0, 3.0]), period=1.0)
     assert torch.allclose(pattern, torch.tensor([1.0, 0.5, 0.0, 1.0, 0.0]), atol=1e-5)
 
 
-def test_typical_colour_counts_only_where_the_weights_are() -> None:
+def test_typical_color_counts_only_where_the_weights_are() -> None:
     rgb = torch.stack([ORANGE, BLUE])
-    assert torch.allclose(colour.typical_color(rgb, torch.tensor([1.0, 0.0])), ORANGE, atol=1e-3)
+    assert torch.allclose(color.typical_color(rgb, torch.tensor([1.0, 0.0])), ORANGE, atol=1e-3)
 
 
-def test_colours_are_read_from_hex() -> None:
-    assert torch.equal(colour.parse_color("#ff0033"), torch.tensor([1.0, 0.0, 0.2]))
-    assert torch.equal(colour.parse_color("f03"), colour.parse_color("#ff0033"))
+def test_colors_are_read_from_hex() -> None:
+    assert torch.equal(color.parse_color("#ff0033"), torch.tensor([1.0, 0.0, 0.2]))
+    assert torch.equal(color.parse_color("f03"), color.parse_color("#ff0033"))
 
 
 @pytest.mark.parametrize("text", ["", "#12", "gold", "#gggggg", "#1234567"])
-def test_what_is_no_colour_is_refused_in_one_line(text: str) -> None:
-    with pytest.raises(ProgdfError, match="is not a colour; write it as #rrggbb"):
-        colour.parse_color(text)
+def test_what_is_no_color_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(ProgdfError, match="is not a color; write it as #rrggbb"):
+        color.parse_color(text)
