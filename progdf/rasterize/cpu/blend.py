@@ -100,12 +100,12 @@ def _blend_tile(
 
 @kernel(cache=True)
 def blend(
-    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    begin: int, end: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     background: Array, out: Picture,
 ) -> None:  # fmt: skip
-    """Blend every `step`-th tile from the first on into the picture. background: [3] float32"""
+    """Blend tiles begin … end − 1 into the picture. background: [3] float32"""
     state, batch, bounds = scratch
-    for tile in range(first, lists.starts.size - 1, step):
+    for tile in range(begin, end):
         x, y = spans.tile_corner(camera, tile)
         spans.tile_bounds(camera, x, y, bounds)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]

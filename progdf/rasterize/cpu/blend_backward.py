@@ -127,7 +127,7 @@ def _blend_tile_backward(
 
 @kernel(cache=True)
 def blend_backward(
-    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    begin: int, end: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     background: Array, out: Picture, gradients: Picture, wanted: Array, sums: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same first arguments.
@@ -141,7 +141,7 @@ def blend_backward(
     plane = np.int64(spans.PLANE)
     state, batch, bounds = scratch
     by_image, by_transmittance = gradients.image, gradients.transmittance
-    for tile in range(first, lists.starts.size - 1, step):
+    for tile in range(begin, end):
         x, y = spans.tile_corner(camera, tile)
         state[:plane] = _ONE
         state[plane : 5 * plane] = _ZERO

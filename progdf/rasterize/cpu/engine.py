@@ -38,6 +38,7 @@ MOST_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 _LEAST_TILES = 4  # fewer are not worth a call
+_CHUNKS = 8  # for each thread: tiles take unequally long
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
 _ALL = np.empty(0, np.bool_)
 
@@ -105,18 +106,21 @@ def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, Ti
 
 
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
-    """Run `kernel(first, step, scratch, *arguments)` so that every tile is one kernel's."""
+    """Run `kernel(begin, end, scratch, *arguments)` so that every tile is one kernel's."""
     tiles = camera.grid[2] * camera.grid[3]
-    # odd, so that one kernel's tiles are not those of one column
-    chunks = 1 if threads() == 1 else min(-(-tiles // _LEAST_TILES), 4 * threads() + 1)
-    run_chunks(lambda chunk: kernel(chunk, chunks, new_scratch(), *arguments), chunks)
+    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES)
 
 
 def _share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
     """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
-    blocks = max(1, -(-count // BLOCK))
-    chunks = 1 if threads() == 1 else min(blocks, 4 * threads())
-    cuts = [min(count, blocks * chunk // chunks * BLOCK) for chunk in range(chunks + 1)]
+    return _share(kernel, count, BLOCK)
+
+
+def _share(kernel: Callable[[int, int], _T], count: int, block: int) -> list[_T]:
+    """Run `kernel(begin, end)` over `count` things in ranges of whole blocks."""
+    blocks = max(1, -(-count // block))
+    chunks = 1 if threads() == 1 else min(blocks, _CHUNKS * threads())
+    cuts = [min(count, blocks * chunk // chunks * block) for chunk in range(chunks + 1)]
     return run_chunks(lambda chunk: kernel(cuts[chunk], cuts[chunk + 1]), chunks)
 
 

@@ -86,10 +86,10 @@ def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
 
 @kernel(cache=True)
 def accumulate_weights(
-    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    begin: int, end: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     mask: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """Add up the weights of every (splat, tile) intersection in every `step`-th tile from the first on.
+    """Add up the weights of every (splat, tile) intersection in tiles begin … end − 1.
 
     Args:
         mask: of the full image. [H,W] float32
@@ -97,18 +97,18 @@ def accumulate_weights(
     """
     plane = np.int64(spans.PLANE)
     state, batch, bounds = scratch
-    for tile in range(first, lists.starts.size - 1, step):
+    for tile in range(begin, end):
         x, y = spans.tile_corner(camera, tile)
         state[: 2 * plane] = _ONE
         spans.tile_bounds(camera, x, y, bounds)
         for row in range(bounds[1], bounds[3]):
             for column in range(bounds[0], bounds[2]):
                 state[plane + row * TILE_W + column] = mask[y + row, x + column]
-        for begin in range(lists.starts[tile], lists.starts[tile + 1], spans.BATCH):
-            end = min(begin + spans.BATCH, lists.starts[tile + 1])
-            spans.find_spans(lists.members, begin, end, splats, x, y, bounds, batch)
-            for place in range(begin, end):
-                _add_weights(state, batch, np.uint64(place - begin) * spans.SPLAT, sums[lists.slots[place]])
+        for first in range(lists.starts[tile], lists.starts[tile + 1], spans.BATCH):
+            last = min(first + spans.BATCH, lists.starts[tile + 1])
+            spans.find_spans(lists.members, first, last, splats, x, y, bounds, batch)
+            for place in range(first, last):
+                _add_weights(state, batch, np.uint64(place - first) * spans.SPLAT, sums[lists.slots[place]])
 
 
 @kernel(cache=True)
@@ -171,10 +171,10 @@ def _list_tile(
 
 @kernel(cache=True)
 def list_weights(
-    first: int, step: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    begin: int, end: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     rows: Array, write: bool, places: Array, out: Runs,
 ) -> None:  # fmt: skip
-    """List what the splats weigh, in every `step`-th tile from the first on.
+    """List what the splats weigh in tiles begin … end − 1.
 
     Args:
         rows: the row under which a Gaussian is listed, −1: not at all. [N] int32
@@ -182,7 +182,7 @@ def list_weights(
         places: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
         out: where `write`
     """
-    for tile in range(first, lists.starts.size - 1, step):
+    for tile in range(begin, end):
         run, entry = (places[tile, 0], places[tile, 1]) if write else (0, 0)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         run, entry = _list_tile(tile, splats, rows, camera, members, scratch.state, write, run, entry, out)

@@ -112,3 +112,18 @@ def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
     rows = np.flatnonzero(visible)
     expected = rows[np.argsort(depths[visible], kind="stable")]
     np.testing.assert_array_equal(depth_order(depths, visible), expected)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="threads cannot be placed here")
+@pytest.mark.skipif(len(getattr(os, "sched_getaffinity", lambda _: ())(0)) < 2, reason="one core")
+def test_pool_threads_stay_off_a_core_of_the_caller_and_the_caller_stays_free() -> None:
+    cores = os.sched_getaffinity(0)
+    met = threading.Barrier(2, timeout=60)
+
+    def allowed(_: int) -> set[int]:
+        met.wait()
+        return os.sched_getaffinity(0)
+
+    found = run_chunks(allowed, 2)
+    assert sorted(map(len, found)) == [len(cores) - 1, len(cores)]
+    assert os.sched_getaffinity(0) == cores
