@@ -75,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
         raise ProgdfError("--seconds is how long the window is dragged; use python -m benchmarks window")
     for output in (options.json, options.plot):  # told now, not when an hour has been measured
         if output is not None and not output.parent.is_dir():
-            raise ProgdfError(f"the folder {output.parent} does not exist; make it first")
+            raise ProgdfError(f"the folder {output.parent} does not exist; create it first")
     if options.markdown is not None and not options.markdown.is_file():
         raise ProgdfError(f"{options.markdown} does not exist; check the name and the folder")
     given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}

@@ -77,11 +77,9 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
         return _report_failure(f"interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", 130)
     except Exception as error:
         if _is_out_of_memory(error):
-            return _report_failure(
-                "this takes more memory than there is; close other programs, or take a smaller scene"
-            )
+            return _report_failure("out of memory; close other programs or use a smaller scene")
         told = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        return _report_failure(f"a mistake in progdf itself ({told[:200]}); {_save_traceback()}", 70)
+        return _report_failure(f"internal error in progdf ({told[:200]}); {_save_traceback()}", 70)
 
 
 def _run(arguments: Sequence[str]) -> int:

@@ -77,7 +77,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "cameras"
     if path.suffix.lower() == ".gdf":
         return "gdf"  # its reader knows best what is wrong
-    raise ProgdfError(f"{path} is nothing progdf knows; give a scene, a .gdf edit or a camera file")
+    raise ProgdfError(f"{path} is not a file progdf knows; give a scene, a .gdf edit or a camera file")
 
 
 def _scene_lines(path: Path) -> Iterator[str]:
@@ -124,7 +124,7 @@ def _timeline_lines(path: Path) -> Iterator[str]:
     try:
         keys = [key.frame for key in convert_json(decode_json(path.read_bytes()), _Timeline).keys]
     except ValueError:
-        raise ProgdfError(f"{path} is a damaged timeline; save it anew with Ctrl+K in the window") from None
+        raise ProgdfError(f"{path} is a damaged timeline; save it again with Ctrl+K in the window") from None
     yield f"{path.name}: a timeline of the window, {format_count(len(keys), 'key')}"
     yield f"keys at frames: {_short_text(keys)}"
 

@@ -53,7 +53,7 @@ def read_compressed_ply(path: str | os.PathLike[str], header: PlyHeader) -> Gaus
     words = {column.name for column in vertex.properties if column.type == "u4"}
     missing = [n for n in wanted if n not in chunk.names] + [n for n in _PACKED if n not in words]
     if missing:
-        raise ProgdfError(f"{name} is a compressed .ply that lacks {missing[0]}; export it again")
+        raise ProgdfError(f"{name} is a compressed .ply without {missing[0]}; export it again")
     at = np.arange(vertex.count) // _CHUNK
     ranges, packed = _rows(name, header, chunk), _rows(name, header, vertex)
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
@@ -84,7 +84,7 @@ def _rows(name: str, header: PlyHeader, element: Element) -> npt.NDArray[np.void
     kind = np.dtype([(column.name, header.byte_order + column.type) for column in element.properties])
     rows = np.fromfile(name, kind, element.count, offset=start)
     if len(rows) < element.count:
-        raise ProgdfError(f"{name} ends within element '{element.name}'; it is cut short: copy it again")
+        raise ProgdfError(f"{name} ends within element '{element.name}'; it is truncated: copy it again")
     return rows
 
 
@@ -123,7 +123,7 @@ def _higher_bands(name: str, rows: npt.NDArray[np.void], count: int) -> Floats:
     names = [f"f_rest_{i}" for i in range(count)]
     absent = next((column for column in names if column not in (rows.dtype.names or ())), None)
     if absent:
-        raise ProgdfError(f"{name} is a compressed .ply that lacks {absent}; export it again")
+        raise ProgdfError(f"{name} is a compressed .ply without {absent}; export it again")
     values = np.stack([rows[column] for column in names], axis=1).astype(np.float32)
     share = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256.0))
     return ((share - 0.5) * 8.0).reshape(len(rows), 3, -1).transpose(0, 2, 1).astype(np.float32)

@@ -57,7 +57,7 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     """The scene as it stands in the file, and its compression level 0..2.
 
     Raises:
-        ProgdfError: it is no .ksplat, or cut short or damaged.
+        ProgdfError: it is no .ksplat, or truncated or damaged.
     """
     try:
         content = Path(path).read_bytes()
@@ -179,4 +179,4 @@ def _number(content: bytes, at: int, kind: str) -> int:
 
 
 def _damage_error(path: str | os.PathLike[str]) -> ProgdfError:
-    return ProgdfError(f"{path} is a .ksplat that is cut short or damaged; copy or export it again")
+    return ProgdfError(f"{path} is a .ksplat that is truncated or damaged; copy or export it again")

@@ -138,7 +138,7 @@ def _header_lines(name: str, file: BinaryIO) -> list[str]:
         if not line.endswith(b"\n"):
             break
         lines.append(text)
-    raise ProgdfError(f"{name} has a header without 'end_header'; the file is cut short or no .ply")
+    raise ProgdfError(f"{name} has a header without 'end_header'; the file is truncated or not a .ply")
 
 
 def _parse(name: str, lines: list[str], length: int, size: int) -> PlyHeader:
@@ -165,9 +165,7 @@ def _parse(name: str, lines: list[str], length: int, size: int) -> PlyHeader:
             case ["property", kind, column] if tables and kind in TYPES:
                 _add(name, columns, Property(column, TYPES[kind]))
             case _:
-                raise ProgdfError(
-                    f"{name} has a header line no .ply may have: {line[:60]!r}; export it again"
-                )
+                raise ProgdfError(f"{name} has an invalid header line: {line[:60]!r}; export it again")
     if not form:
         raise ProgdfError(f"{name} does not name its format; its second line should be 'format … 1.0'")
     elements = tuple(Element(table, count, tuple(found.values())) for table, (count, found) in tables.items())
@@ -193,8 +191,8 @@ def _check_counts(name: str, header: PlyHeader) -> None:
         if element.count * least > room + slack:
             what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
             raise ProgdfError(
-                f"{name} promises {element.count} {what} of {'at least ' if slack else ''}{least} bytes but "
-                f"has room for {max(room, 0) // least}, so it is cut short or its header is wrong; "
+                f"{name} declares {element.count} {what} of {'at least ' if slack else ''}{least} bytes but "
+                f"has room for {max(room, 0) // least}, so it is truncated or its header is wrong; "
                 f"copy or export it again"
             )
         room -= element.count * least

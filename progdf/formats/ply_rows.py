@@ -102,7 +102,7 @@ def _skip(name: str, file: BinaryIO, header: PlyHeader, element: Element) -> Non
 
 def _truncation_error(name: str, element: Element) -> ProgdfError:
     return ProgdfError(
-        f"{name} ends within element '{element.name}'; it is cut short or damaged: copy or export it again"
+        f"{name} ends within element '{element.name}'; it is truncated or damaged: copy or export it again"
     )
 
 
@@ -149,7 +149,7 @@ def _fill(name: str, file: BinaryIO, rows: npt.NDArray[np.void]) -> None:
         got = file.readinto(view[done:])  # type: ignore[attr-defined]
         if not got:
             raise ProgdfError(
-                f"{name} became shorter while it was read; wait until it is written and try again"
+                f"{name} shrank while it was being read; wait until it has been written and try again"
             )
         done += got
 
@@ -172,7 +172,7 @@ def _read_ascii(name: str, file: BinaryIO, element: Element, wanted: tuple[str, 
             if found != len(element.properties):
                 raise ProgdfError(
                     f"{name} has {found} numbers in row {first + i}, its header names "
-                    f"{len(element.properties)}; it is cut short or damaged: copy or export it again"
+                    f"{len(element.properties)}; it is truncated or damaged: copy or export it again"
                 )
         try:
             table = np.array([[line[p] for p in places] for line in words]).astype(np.float64)

@@ -178,13 +178,13 @@ def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise _read_error(path, kind, f"gave no answer in {2 * seconds} s") from None
+            raise _read_error(path, kind, f"did not answer within {2 * seconds} s") from None
         if ended.returncode or not target.is_file():
             raise _read_error(path, kind, _reason(ended.returncode, ended.stderr))
         try:
             return load_ply_with_report(target)
         except ProgdfError:
-            raise _read_error(path, kind, "gave no scene") from None
+            raise _read_error(path, kind, "returned no scene") from None
 
 
 def _reason(status: int, stderr: bytes) -> str:
@@ -225,7 +225,7 @@ def _spz_header(path: Path) -> tuple[int, bool]:
         start = file.read(4096)
     head = start if start[:4] == b"NGSP" else _inflate(start)
     if len(head) < 16:
-        raise _read_error(path, "spz", "finds no header")
+        raise _read_error(path, "spz", "found no header")
     return int.from_bytes(head[4:8], "little"), bool(head[14] & 1)
 
 

@@ -168,7 +168,7 @@ def read_head(path: str | os.PathLike[str]) -> GdfHead:
     """Open a .gdf: read its header, and see that it and the file's length are what was saved.
 
     Raises:
-        ProgdfError: it is no .gdf, from a newer version, cut short, or its header is damaged.
+        ProgdfError: it is no .gdf, from a newer version, truncated, or its header is damaged.
     """
     check_regular(path)
     try:
@@ -183,7 +183,7 @@ def read_head(path: str | os.PathLike[str]) -> GdfHead:
                 )
             if 8 + size > length:
                 raise ProgdfError(
-                    f"{name} is cut short: {length} bytes are not even its header; copy it again"
+                    f"{name} is truncated: {length} bytes are less than its header; copy it again"
                 )
             header = start[8:] + file.read(size - 1)
     except OSError as error:
@@ -216,7 +216,7 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
     needed = 8 + len(header) + max((tensor.data_offsets[1] for tensor in table.values()), default=0)
     if needed > length:
         raise ProgdfError(
-            f"{name} is cut short: it has {length} of {needed} bytes; copy it again or make it again"
+            f"{name} is truncated: it has {length} of {needed} bytes; copy it again or make it again"
         )
     tensors = {key: (tuple(tensor.shape), tensor.dtype) for key, tensor in table.items()}
     if version < FORMAT or metadata.get("header_sha256") != head_checksum(text, tensors):
@@ -226,7 +226,7 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
         if found.field.network is not None:
             strange = set(content["field"]["network"]["shape"]) - {part.name for part in fields(NeuralShape)}
             if strange:  # of a later version, perhaps, which reads the network in another way
-                raise ValueError(f"the network has {min(strange)}, which is unknown here")
+                raise ValueError(f"the network has an unknown {min(strange)}")
         _check(found, tensors)
     except ValueError as error:
         raise contradiction_error(name, error) from error
@@ -278,7 +278,7 @@ def head_checksum(text: str, tensors: Mapping[str, tuple[tuple[int, ...], str]])
 
 def damage_error(name: str) -> ProgdfError:
     """The line for a file that is not what was saved."""
-    return ProgdfError(f"{name} is damaged: its checksum does not match; copy it again or make it again")
+    return ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or make it again")
 
 
 def contradiction_error(name: str, error: Exception) -> ProgdfError:

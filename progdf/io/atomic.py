@@ -49,7 +49,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.is_symlink():
         target = Path(os.path.realpath(target))
     if not target.parent.is_dir():
-        raise ProgdfError(f"the folder {target.parent} does not exist; make it first")
+        raise ProgdfError(f"the folder {target.parent} does not exist; create it first")
     remove_abandoned(target.parent)
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
     temporary_file = target.parent / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}"
@@ -140,7 +140,7 @@ def make_folder(path: str | os.PathLike[str]) -> None:
 def write_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     """The one line for a file or a folder that cannot be written."""
     reason = error.strerror or error
-    return ProgdfError(f"{path} cannot be written ({reason}); give a place that can be written to")
+    return ProgdfError(f"{path} cannot be written ({reason}); choose a place that can be written to")
 
 
 def disk_full(error: BaseException) -> OSError | None:

@@ -146,7 +146,7 @@ def _lens(where: str, image: _Image) -> Lens | None:
     names = _LENSES[kind]
     if any(numbers[len(names) :]):
         raise ProgdfError(
-            f"{where} has a lens with k4, k5 or k6, which cannot be straightened here; "
+            f"{where} has a lens with k4, k5 or k6, which cannot be undistorted here; "
             "run colmap image_undistorter and give its sparse folder"
         )
     lens = Lens(**dict(zip(names, numbers, strict=False)))

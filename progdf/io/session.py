@@ -138,17 +138,17 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
         raise open_error(path, error) from None
     if len(content) > _LARGEST:
         raise ProgdfError(
-            f"{name} has more than {_LARGEST >> 20} MB, too much for a session; give one saved with Ctrl+S"
+            f"{name} is larger than {_LARGEST >> 20} MB, too large for a session; give one saved with Ctrl+S"
         )
     try:
         table = decode_json(content)
     except ValueError as error:
-        raise ProgdfError(f"{name} is not valid JSON ({error}); save the session anew") from None
+        raise ProgdfError(f"{name} is not valid JSON ({error}); save the session again") from None
     if not isinstance(table, dict) or MARK not in table:
         raise ProgdfError(f"{name} is not a session; give a file that progdf view saved with Ctrl+S")
     version = table.pop(MARK)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise ProgdfError(f"{name} is a damaged session: its version is {version!r}; save it anew")
+        raise ProgdfError(f"{name} is a damaged session: its version is {version!r}; save it again")
     if version > VERSION:
         raise ProgdfError(
             f"{name} is a session of version {version}; this progdf reads up to {VERSION}, update it"
@@ -156,7 +156,7 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
     try:
         found = convert_json(table, _Table)
     except ValueError as error:
-        raise ProgdfError(f"{name} is a damaged session ({error}); save it anew or update progdf") from None
+        raise ProgdfError(f"{name} is a damaged session ({error}); save it again or update progdf") from None
     return SessionFile(found.scene, tuple(found.edits), found.view, tuple(found.snapshots))
 
 
@@ -170,7 +170,9 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
     for ref in (session.scene, *session.edits):
         file = ref.path(path.resolve().parent)
         if not os.path.isfile(file):  # pathlib's raises where a name is too long
-            raise ProgdfError(f"{path.name} needs {file}, which is not there; put it back or save anew")
+            raise ProgdfError(
+                f"{path.name} needs {file}, which does not exist; put it back or save the session again"
+            )
         if sha256(file) != ref.sha256.lower():
             raise ProgdfError(
                 f"{path.name} was saved with another {file.name} than {file} holds now; "

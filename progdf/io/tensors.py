@@ -89,7 +89,7 @@ def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Ten
         raise ValueError(" ".join(str(error).split())) from None
     sum_ = metadata.pop(_CHECKSUM, None)
     if not names and sum_ is not None and sum_ != _checksum(metadata, tensors):
-        raise ValueError("its checksum does not fit")
+        raise ValueError("checksum mismatch")
     return tensors, metadata
 
 

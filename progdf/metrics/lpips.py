@@ -193,13 +193,13 @@ class ArraysOnlyUnpickler(pickle.Unpickler):
             return _empty_array
         if module == "numpy" and name in ("ndarray", "dtype"):
             return getattr(np, name)
-        raise pickle.UnpicklingError(f"{module}.{name} has no business in weights")
+        raise pickle.UnpicklingError(f"{module}.{name} is not allowed in weights")
 
 
 def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray[Any, Any]:
     """What numpy's `_reconstruct` makes of a pickled array before its state is set."""
     if kind is not np.ndarray:
-        raise pickle.UnpicklingError(f"{kind.__name__} has no business in weights")
+        raise pickle.UnpicklingError(f"{kind.__name__} is not allowed in weights")
     del code  # type and shape come with the state
     return np.zeros(shape, np.float32)
 
@@ -234,6 +234,4 @@ def _refuse(reason: str) -> NoReturn:
 
 
 def _format_error(reason: str) -> ProgdfError:
-    return ProgdfError(
-        f"LPIPS' file of weights is not what was expected ({reason}); {REMEDY} --force-reinstall"
-    )
+    return ProgdfError(f"the LPIPS weights file is not as expected ({reason}); {REMEDY} --force-reinstall")

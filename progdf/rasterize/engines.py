@@ -60,5 +60,5 @@ class RasterEngine(Protocol):
 def get_engine(name: str) -> RasterEngine:
     """The engine of that name."""
     if name not in ENGINES:
-        raise ValueError(f"there is no rasterizer '{name}', expected one of {', '.join(ENGINES)}")
+        raise ValueError(f"unknown rasterizer '{name}'; use one of {', '.join(ENGINES)}")
     return cast(RasterEngine, importlib.import_module(ENGINES[name]))

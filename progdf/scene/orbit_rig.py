@@ -58,7 +58,7 @@ def orbit_rig(
         raise ProgdfError(f"the rig needs at least 1 camera, got {count}")
     if not -89 <= lowest <= highest <= 89:
         raise ProgdfError(
-            f"the rig's elevations {lowest:g} to {highest:g} are no band within -89 to 89 degrees"
+            f"the rig's elevations must ascend within -89 to 89 degrees, got {lowest:g} to {highest:g}"
         )
     up = guess_up(scene) if up is None else up.float() / up.float().norm()
     if is_surrounding(scene, up):

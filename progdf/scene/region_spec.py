@@ -99,7 +99,7 @@ def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
 
 def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
     choice = ", ".join(["all", *(f"{word}:…" for word in known)])
-    return ProgdfError(f"region '{part}' is of no known kind; write {choice}")
+    return ProgdfError(f"unknown region '{part}'; write {choice}")
 
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
@@ -108,7 +108,7 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     joint = re.compile(rf"\s*([+-])\s*(?=(?:{words}):|all\s*(?:$|[+-]))")
     pieces = joint.split(spec.strip())
     if not all(pieces[0::2]):
-        raise ProgdfError(f"region '{spec}' lacks a part; write for example all-sphere:0,0,0,1")
+        raise ProgdfError(f"region '{spec}' is missing a part; write, for example, all-sphere:0,0,0,1")
     return list(zip(["+", *pieces[1::2]], (piece.strip() for piece in pieces[0::2]), strict=True))
 
 
@@ -156,7 +156,7 @@ def _open_members(path: str) -> NDArray[Any]:
 
 def _check_file(rest: str) -> None:
     if not rest:
-        raise ProgdfError("file: names no file; write file:MEMBERS.npy, as progdf region … -o writes it")
+        raise ProgdfError("file: needs a file; write file:MEMBERS.npy, as progdf region … -o writes it")
     _open_members(rest)
 
 
@@ -182,7 +182,7 @@ def _parse_labels(rest: str) -> tuple[str, list[int]]:
     """The file and the labels of FILE.npy:ID[,ID…]."""
     path, colon, ids = rest.rpartition(":")
     if not colon or not path:
-        raise ProgdfError(f"region 'labels:{rest}' names no label; write labels:FILE.npy:ID[,ID…]")
+        raise ProgdfError(f"region 'labels:{rest}' has no label; write labels:FILE.npy:ID[,ID…]")
     try:
         return path, [int(word) for word in ids.split(",")]
     except ValueError:

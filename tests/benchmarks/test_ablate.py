@@ -124,7 +124,7 @@ def test_variants_of_the_slider_share_one_optimization_and_end_alike(run: Path) 
     assert linear["between"] != base["between"]
     assert by_time["between"] == base["between"], "judged where each shows it"
     assert by_time["uniformity"] < base["uniformity"]
-    assert "going on at step 25 of 25" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
+    assert "continuing at step 25 of 25" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
     assert "going on" not in (run / "ablation/one-target/log.txt").read_text(encoding="utf-8")
 
 
@@ -171,7 +171,7 @@ def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
 
 def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> object:
-        raise ProgdfError("training broke down") from FloatingPointError("the loss is nan at step 7")
+        raise ProgdfError("training failed") from FloatingPointError("the loss is nan at step 7")
 
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", broken)
     done = ablate(AblateOptions(run, only="paper", threads=1), quiet=True)

@@ -59,7 +59,7 @@ class KeptPictures:
         path = self.folder / place / f"{name}.png" if self.folder is not None else None
         if source is None:
             if path is None or not path.is_file():
-                raise ProgdfError(f"the painted picture {path} is gone; train again without --resume")
+                raise ProgdfError(f"the painted picture {path} is missing; train again without --resume")
             return read_picture(path)
         if path is None:
             return _eight_bits(paint(source))

@@ -86,7 +86,7 @@ class FolderEditor:
 def folder_of(what: str) -> Path:
     """The DIR of `folder:DIR`; ProgdfError where there is no such folder."""
     if not what:
-        raise ProgdfError("folder: names no folder; write folder:DIR with the edited views in DIR")
+        raise ProgdfError("folder: needs a folder; write folder:DIR with the edited views in DIR")
     root = Path(what).expanduser()
     if not root.is_dir():
         raise ProgdfError(f"{root} is not a folder; {_EDITED}")
@@ -100,7 +100,7 @@ def photograph_folders(what: str) -> tuple[Path, Path | None]:
     roots = [Path(name).expanduser() for name in names]
     for name, root in zip(names, roots, strict=True):
         if not name:
-            raise ProgdfError("photographs: names no folder; write photographs:EDITED,ORIGINALS")
+            raise ProgdfError("photographs: needs a folder; write photographs:EDITED,ORIGINALS")
         if not root.is_dir():
             raise ProgdfError(f"{root} is not a folder; {_TAKEN}")
     return roots[0], roots[1] if len(roots) > 1 else None

@@ -84,7 +84,7 @@ class InstructEditor:
 
     def _paint(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:
         if self.stages and strength not in self.stages:
-            raise ValueError(f"this editor pictures strength {list(self.stages)}, not {strength:g}")
+            raise ValueError(f"this editor edits at strengths {list(self.stages)}, not {strength:g}")
         # guidance 1 is none, and pipelines skip it altogether below
         guidance = self.guidance if strength == 1.0 else 1.0 + strength * (self.guidance - 1.0)
         recipe = {**self.recipe, "guidance": guidance}
@@ -127,7 +127,7 @@ def check_instruct(what: str, settings: EditorSettings) -> None:
     """What `instruct` and its pipeline would raise, as far as it is to be known without loading a network.
 
     Raises:
-        ProgdfError: nothing is said, a package or weights are missing or cut short, an option is not known.
+        ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known.
     """
     model, kind, _ = _resolve_request(what, settings)
     try:
@@ -147,7 +147,7 @@ def _resolve_request(what: str, settings: EditorSettings) -> tuple[str, str, _Re
     """The model, its pipeline's class, and what it will be asked."""
     prompt = what.strip().strip("\"'").strip()
     if not prompt:
-        raise ProgdfError('instruct: says nothing; write instruct:"turn him into Batman"')
+        raise ProgdfError('instruct: needs an instruction; write instruct:"turn him into Batman"')
     model = settings.model or DEFAULT_MODEL
     kind = pipeline_class(model)
     return model, kind, _make_request(prompt, model, kind, settings)
@@ -170,7 +170,7 @@ def pipeline_class(model: str) -> str:
     except BROKEN as error:
         raise _missing(model) from error
     if kind not in ADAPTERS:
-        raise ProgdfError(f"{model} is a {kind}, which edits no pictures here; use one of {_models()}")
+        raise ProgdfError(f"{model} is a {kind}, which cannot edit pictures here; use one of {_models()}")
     for package in ADAPTERS[kind].needs:
         if find_spec(package) is None:
             raise ProgdfError(f"{model} needs the package {package}; pip install {package}")
@@ -224,7 +224,9 @@ def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) 
     """The settings, with the model's own values where nothing was said."""
     adapter = ADAPTERS[kind]
     if settings.image_guidance is not None and "image_guidance" not in adapter.words:
-        raise ProgdfError(f"{model} knows no --image-guidance; leave it out, or use --model {DEFAULT_MODEL}")
+        raise ProgdfError(
+            f"{model} does not support --image-guidance; leave it out, or use --model {DEFAULT_MODEL}"
+        )
     return _Request(
         prompt,
         adapter,
@@ -239,11 +241,11 @@ def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) 
 def _missing(model: str) -> ProgdfError:
     if model.startswith((".", "/", "~")) or Path(model).is_dir():
         return ProgdfError(
-            f"{model} holds no whole diffusers pipeline with safetensors weights; "
+            f"{model} does not hold a complete diffusers pipeline with safetensors weights; "
             f"give --model such a folder, or one of {_models()}"
         )
     return ProgdfError(
-        f"the weights of {model} are not on this machine, or not whole; download them with "
+        f"the weights of {model} are not on this machine or are incomplete; download them with "
         f"'hf download {model}', or give --model the folder of a saved pipeline"
     )
 

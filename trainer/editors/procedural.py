@@ -153,7 +153,7 @@ def paint_of(what: str) -> tuple[Tensor, ColorPath]:
         return target, "bowed"
     key, _, name = option.partition("=")
     if key.strip() != "path":
-        raise ProgdfError(f"'{option}' is no option of a color; write {text},path=hue or {text} alone")
+        raise ProgdfError(f"'{option}' is not an option of a color; write {text},path=hue or {text} alone")
     return target, path_of(name.strip())
 
 
@@ -165,6 +165,6 @@ def stops_of(what: str, editor: str) -> float:
         amount = math.nan
     if not 0.0 < amount < 1.0:
         raise ProgdfError(
-            f"{editor}:{what} is no share of the light; write a number between 0 and 1, as {editor}:0.7"
+            f"{editor}:{what} is not a number between 0 and 1; write, for example, {editor}:0.7"
         )
     return -math.log2(1.0 - amount)

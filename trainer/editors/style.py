@@ -101,7 +101,7 @@ def style_number(what: str) -> int:
     if not 0 <= number < STYLES:
         calm = ", ".join(map(str, CALM))
         raise ProgdfError(
-            f"style:{what} is no style; write style:N with N from 0 to {STYLES - 1}, best one of {calm}"
+            f"unknown style '{what}'; use style:N with N from 0 to {STYLES - 1}, best one of {calm}"
         )
     return number
 

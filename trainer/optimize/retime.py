@@ -61,7 +61,7 @@ def retime(
         samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
     if slider == "auto":
-        raise ValueError("'auto' says no slider; see settings.resolve_slider")
+        raise ValueError("'auto' is not resolved; see settings.resolve_slider")
     if slider == "time":
         return replace(trajectory, s=_place_between(0.0, 1.0, trajectory.steps.double()).float())
     if slider == "stages":

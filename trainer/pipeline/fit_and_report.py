@@ -222,7 +222,7 @@ def load_result(folder: RunFolder, options: TrainOptions, scene: Gaussians, log:
     path = folder.gdf(options.name)
     gdf = load_gdf(path, scene)
     trajectory, _, _ = load_trajectory(folder.trajectory)
-    log.say(f"{folder.root} is finished: nothing is left to do, and {path} is whole")
+    log.say(f"{folder.root} is finished: there is nothing left to do, and {path} is complete")
     try:
         report = convert_json(decode_json(folder.report.read_bytes()), dict[str, Any])
     except ValueError as error:

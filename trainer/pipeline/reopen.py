@@ -85,7 +85,7 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
         try:
             check_name(name)
         except ProgdfError:
-            raise ValueError("its name is none") from None
+            raise ValueError("its name is not valid") from None
         members, score = extra["members"], extra["score"]
         path = scene or Path(kept.scene)
         if not os.path.isfile(scene_file(path)):
@@ -123,7 +123,7 @@ def options_of(about: Mapping[str, Any]) -> TrainOptions:
 def _path(kind: type, value: object) -> object:
     if kind is Path and isinstance(value, str):
         return Path(value)
-    raise ValueError(f"{value!r} is no {kind.__name__}")
+    raise ValueError(f"{value!r} is not a {kind.__name__}")
 
 
 def render_run_views(run: FinishedRun) -> TrainingSetup:

@@ -69,18 +69,18 @@ def decide_resume(
     """
     saved = _saved_identity(folder)
     if options.resume and saved is None and folder.report.is_file():
-        _check_options(folder, _finished_options(folder), options, "leave --resume away to train anew")
+        _check_options(folder, _finished_options(folder), options, "leave out --resume to train again")
         return ResumeDecision("nothing", threads)
     remove_leftovers(folder)
     now = _identity(options, threads)
     if options.resume and saved is not None:
-        remedy = "give --resume the run's own options, or train anew in another folder"
+        remedy = "give --resume the run's own options, or train again in another folder"
         _check_options(folder, saved.options, options, remedy)
         for what, was in (("scene", saved.scene), ("cameras", saved.cameras)):
             if was != now[what]:
                 raise ProgdfError(
-                    f"the {what} is no longer what {folder.root} was begun with; bring it back and go on "
-                    "with --resume, or train anew in another folder"
+                    f"the {what} has changed since {folder.root} was started; restore it and continue "
+                    "with --resume, or train again in another folder"
                 )
         notes = []
         if saved.torch != now["torch"]:
@@ -91,7 +91,7 @@ def decide_resume(
     if saved is not None and (step := _saved_step(folder)):
         raise ProgdfError(
             f"{folder.root} holds a run that was stopped at step {step} of {saved.options.get('steps')}; "
-            f"add --resume to go on with it, or delete {folder.state.path} to start over"
+            f"add --resume to continue it, or delete {folder.state.path} to start over"
         )
     begin_log(folder, edit)
     folder.state.begin(now)
@@ -131,7 +131,7 @@ def explain_stop(folder: RunFolder) -> Iterator[None]:
             trouble = f"{folder.root} cannot be written ({error.strerror or error}); make it writable"
         else:
             raise
-        raise ProgdfError(f"{trouble}, then go on with --resume") from error
+        raise ProgdfError(f"{trouble}, then continue with --resume") from error
 
 
 @contextmanager
@@ -183,14 +183,14 @@ def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOp
             was, now = (str(Path(path).resolve()) for path in (was, now))
         if was != now and name not in _ABOUT_THE_COMMAND:
             option = "--" + name.replace("_", "-")
-            raise ProgdfError(f"{folder.root} was begun with {option} {was}, not {now}; {remedy}")
+            raise ProgdfError(f"{folder.root} was started with {option} {was}, not {now}; {remedy}")
 
 
 def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
     try:
         return convert_json(decode_json(folder.report.read_bytes())["options"], dict[str, Any])
     except (ValueError, KeyError, TypeError) as error:
-        raise ProgdfError(f"{folder.report} is damaged; leave --resume away to train anew") from error
+        raise ProgdfError(f"{folder.report} is damaged; leave out --resume to train again") from error
 
 
 def _saved_step(folder: RunFolder) -> int:

@@ -115,7 +115,7 @@ def optimize_members(
     if kept.restore():
         if beside is not None:
             beside.refill([(made.step, made.offsets) for made in recordings.made])
-        log.say(f"going on at step {state.step} of {steps}, with {len(recordings.made)} recordings")
+        log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
     with log.steps("optimize", steps) as advance, defer_signals() as stopped:
 
         def step_done(step: int, left: float) -> None:
@@ -142,7 +142,7 @@ def optimize_members(
         except FloatingPointError as error:
             kept.save()
             raise ProgdfError(
-                f"training broke down: {error}; the state before it is kept: mend the edited views and go on "
+                f"training failed: {error}; the state before it is kept: fix the edited views and continue "
                 "with --resume, or try --kind style in another folder"
             ) from error
     kept.save()
@@ -166,7 +166,7 @@ def optimize_members(
             log.say(f"{count} members that no view shows follow their neighbors")
         else:
             log.say(
-                f"{count} members that hardly show keep what they learnt: "
+                f"{count} members that hardly show keep what they learned: "
                 "following their neighbors would take the training views away from the edit"
             )
     if groups is not None:
@@ -232,7 +232,7 @@ def _groups(
             )
     except FloatingPointError as error:
         raise ProgdfError(
-            f"training broke down: {error}; mend the edited views and go on with --resume"
+            f"training failed: {error}; fix the edited views and continue with --resume"
         ) from error
     folder.save("groups", groups.capture_state(), {})
     for line in groups.lines():

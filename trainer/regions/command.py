@@ -50,10 +50,10 @@ def show(options: RegionOptions) -> str:
     suffix = options.out.suffix.lower()
     if suffix not in (".png", ".npy"):
         raise ProgdfError(
-            f"{options.out} is no .png or .npy file; a region is shown in the one or kept in the other"
+            f"{options.out} is not a .png or .npy file; use .png to show the region, .npy to keep it"
         )
     if options.camera is not None and options.orbit is not None:
-        raise ProgdfError("--camera and --orbit were both given; give one of them")
+        raise ProgdfError("--camera and --orbit cannot be combined; give only one of them")
     check_ranges(("--lift-threshold", options.lift_threshold, 0, 1))
     size = _size(options.size)
     scene = load_scene(options.scene)
@@ -104,7 +104,7 @@ def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[i
         numbers = []
     if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)) or not -90 <= numbers[1] <= 90:
         raise ProgdfError(
-            f"--orbit {options.orbit} is no AZIMUTH,ELEVATION[,DISTANCE] with an elevation of -90 to 90; "
+            f"--orbit {options.orbit} is not AZIMUTH,ELEVATION[,DISTANCE] with an elevation of -90 to 90; "
             "write for example --orbit 30,15"
         )
     away = numbers[2] if len(numbers) == 3 else None
@@ -145,5 +145,7 @@ def _size(text: str) -> tuple[int, int]:
     if not (cross and width.isdecimal() and height.isdecimal()) or not all(
         1 <= int(side) <= 8192 for side in (width, height)
     ):
-        raise ProgdfError(f"--size {text} is no size; write WIDTHxHEIGHT of up to 8192, for example 640x480")
+        raise ProgdfError(
+            f"--size {text} is not a size; write WIDTHxHEIGHT of up to 8192, for example 640x480"
+        )
     return int(width), int(height)

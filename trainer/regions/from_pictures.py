@@ -163,7 +163,7 @@ def region_checks(settings: RegionSettings) -> dict[str, Check]:
 def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, Path]:
     """The folder of masks, and the file of their cameras."""
     if not rest:
-        raise ProgdfError(f"{kind}: names no folder; write {kind}:DIR with a mask for each camera in DIR")
+        raise ProgdfError(f"{kind}: needs a folder; write {kind}:DIR with a mask for each camera in DIR")
     folder = Path(rest).expanduser()
     if not folder.is_dir():
         raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
@@ -180,7 +180,7 @@ def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, 
 def _prompt(rest: str) -> str:
     prompt = rest.strip().strip("\"'“”").strip()
     if not prompt:
-        raise ProgdfError('text: names nothing; write text:"the man\'s shirt"')
+        raise ProgdfError('text: needs a prompt; write text:"the man\'s shirt"')
     return prompt
 
 
@@ -219,7 +219,7 @@ def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, settings: RegionSet
     found = [mask if bool(mask.any()) else None for mask in masks]
     if all(mask is None for mask in found):
         raise ProgdfError(
-            f"'{prompt}' is found in none of {len(masks)} views; say it otherwise, or lower "
+            f"'{prompt}' is found in none of {len(masks)} views; rephrase it, or lower "
             f"--box-threshold (now {settings.segmenter.box_threshold:g})"
         )
     return found

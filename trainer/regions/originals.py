@@ -40,7 +40,7 @@ def write(options: ViewsOptions) -> str:
     check_ranges(("--views", options.views, 1, 96), ("--image-size", options.image_size, 32, 4096))
     out, background = options.out, torch.tensor(BACKGROUND)
     if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
-        raise ProgdfError(f"{out / 'cameras.json'} is there already; give --out another folder")
+        raise ProgdfError(f"{out / 'cameras.json'} already exists; give --out another folder")
     scene = load_scene(options.scene)
     given = [] if options.cameras is None else load_cameras(options.cameras)
     up = find_up(scene, given, options.up).direction

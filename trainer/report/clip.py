@@ -81,7 +81,7 @@ def load_clip(model: str = CLIP_MODEL) -> Clip:
     except BROKEN as error:
         raise ProgdfError(_missing(model)) from error
     if config.model_type != "clip":
-        raise ProgdfError(f"{model} is a {config.model_type} model, no CLIP; give --clip-model {CLIP_MODEL}")
+        raise ProgdfError(f"{model} is a {config.model_type} model, not CLIP; give --clip-model {CLIP_MODEL}")
     try:
         network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
         tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
@@ -132,8 +132,8 @@ def _name(model: str) -> str:
 
 def _missing(model: str) -> str:
     if Path(model).is_dir() or model.startswith((".", "/", "~")):
-        return f"{model} holds no whole CLIP model with safetensors weights; give --clip-model such a folder"
+        return f"{model} does not hold a complete CLIP model with safetensors weights; give --clip-model one"
     return (
-        f"the weights of {model} are not on this machine, or not whole; download them with "
+        f"the weights of {model} are not on this machine or are incomplete; download them with "
         f"'hf download {model}', or give --clip-model the folder of a saved model"
     )

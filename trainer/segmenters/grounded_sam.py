@@ -143,7 +143,7 @@ def check_grounded_sam(settings: SegmenterSettings) -> None:
 
 def _check_kind(config: Any, model: str, kind: str, option: str, usual: str) -> None:
     if config.model_type != kind:
-        raise ProgdfError(f"{model} is a {config.model_type} model, no {kind}; give {option} {usual}")
+        raise ProgdfError(f"{model} is a {config.model_type} model, not {kind}; give {option} {usual}")
 
 
 def _import_failure(error: ImportError) -> ProgdfError:
@@ -152,8 +152,8 @@ def _import_failure(error: ImportError) -> ProgdfError:
 
 def _missing(model: str, option: str) -> str:
     if Path(model).is_dir() or model.startswith((".", "/", "~")):
-        return f"{model} holds no whole model with safetensors weights; give {option} such a folder"
+        return f"{model} does not hold a complete model with safetensors weights; give {option} such a folder"
     return (
-        f"the weights of {model} are not on this machine, or not whole; download them with "
+        f"the weights of {model} are not on this machine or are incomplete; download them with "
         f"'hf download {model}', or give {option} the folder of a saved model"
     )

@@ -35,7 +35,7 @@ def check_weights_here(folder: Path) -> None:
     """Read the heads of a network's weights.
 
     Raises:
-        one of `BROKEN`: there are none, one of several files is missing, or one is cut short.
+        one of `BROKEN`: there are none, one of several files is missing, or one is truncated.
     """
     files = set(folder.glob("*.safetensors"))
     for index in folder.glob("*.safetensors.index.json"):

@@ -117,7 +117,7 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
             else ""
         )
         if not first.startswith(_SIGNATURE):
-            raise ProgdfError(f"{root} is not empty and no run of progdf train; give --out another folder")
+            raise ProgdfError(f"{root} is neither empty nor a run of progdf train; give --out another folder")
         earlier = _json_or_nothing(first.removeprefix(_SIGNATURE))
         for what, value in edit.items():
             if earlier.get(what) != value:
@@ -135,7 +135,7 @@ def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
-        raise ProgdfError(f"{root} cannot be made ({reason}); give --out a place to write to") from error
+        raise ProgdfError(f"{root} cannot be created ({reason}); give --out a writable place") from error
     return folder
 
 
@@ -198,7 +198,7 @@ def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: flo
         try:
             pictures.append(read_picture(path))
         except ProgdfError as error:
-            what = "is damaged" if path.is_file() else "is gone"
+            what = "is damaged" if path.is_file() else "is missing"
             raise ProgdfError(f"{path} {what}; train again, with --resume if the run was stopped") from error
     return pictures
 

@@ -96,7 +96,7 @@ class StateFolder:
             ProgdfError: the folder is a link, behind which nothing of the run's can be.
         """
         if self.path.is_symlink():
-            raise ProgdfError(f"{self.path} is a link, and nothing behind it is touched; remove the link")
+            raise ProgdfError(f"{self.path} is a link, which is not followed; remove the link")
         self.clear()
         self.path.mkdir(exist_ok=True)
         with atomic_write(self._run) as temporary_file:

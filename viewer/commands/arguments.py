@@ -57,7 +57,9 @@ def strengths_of(edits: Sequence[Named], settings: Sequence[str], most: float = 
     for setting in settings:
         name, equals, text = setting.rpartition("=")
         if not equals or not name:
-            raise ProgdfError(f"--set {setting} has no NAME=S; write for example --set {_example(edits)}=0.7")
+            raise ProgdfError(
+                f"--set {setting} is not NAME=S; write, for example, --set {_example(edits)}=0.7"
+            )
         strengths[known_edit(name, edits, "--set")] = _strength(setting, text, most)
     return strengths
 
@@ -138,13 +140,11 @@ def parse_comparison(split: str | None, amplify: str | None) -> Comparison:
     """
     if split is not None:
         if not is_number(split) or not 0.0 <= float(split) <= 1.0:
-            raise ProgdfError(f"--split {split} is no place in the picture; give a number from 0 to 1")
+            raise ProgdfError(f"--split must be between 0 and 1, got {split}")
         return Comparison("split", divider=float(split))
     if amplify is not None:
         if not is_number(amplify) or not 1.0 <= float(amplify) <= MOST_AMPLIFIED:
-            raise ProgdfError(
-                f"--difference {amplify} cannot be drawn; give a factor from 1 to {MOST_AMPLIFIED:g}"
-            )
+            raise ProgdfError(f"--difference must be between 1 and {MOST_AMPLIFIED:g}, got {amplify}")
         return Comparison("difference", amplify=float(amplify))
     return Comparison()
 

@@ -40,10 +40,10 @@ def choose_camera(
         ProgdfError: options that contradict each other or name nothing.
     """
     if options.camera is not None and options.orbit is not None:
-        raise ProgdfError("--camera and --orbit were both given; give one of them")
+        raise ProgdfError("--camera and --orbit cannot be combined; give only one of them")
     if options.camera is not None:
         if options.frame is not None:
-            raise ProgdfError("--camera and --frame were both given; give one of them")
+            raise ProgdfError("--camera and --frame cannot be combined; give only one of them")
         camera = read_camera(options.camera)
         return camera if size is None else arguments.fit_camera(camera, size)
     width, height = size or DEFAULT_SIZE

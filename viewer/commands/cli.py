@@ -83,7 +83,7 @@ def _check_reloaded(written: Gaussians, read: Gaussians) -> None:
         else:
             same = torch.equal(expected, found)
         if not same:
-            raise ProgdfError(f"the written file does not give back its {name}; check the disk and try again")
+            raise ProgdfError(f"the written file does not match in its {name}; check the disk and try again")
 
 
 def _check_by_plyfile(written: Gaussians, path: Path) -> None:
@@ -92,4 +92,6 @@ def _check_by_plyfile(written: Gaussians, path: Path) -> None:
     for name, columns in GEOMETRY.items():
         found = np.stack([vertex[column] for column in columns], axis=1)
         if not np.array_equal(found, getattr(written, name).reshape(len(written), -1).numpy()):
-            raise ProgdfError(f"plyfile reads other {name} than were written; check the disk and try again")
+            raise ProgdfError(
+                f"plyfile reads different {name} from those written; check the disk and try again"
+            )

@@ -87,7 +87,7 @@ def _gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
     left, equals, number = text.rpartition("=")
     name, colon, kind = left.rpartition(":")
     if not equals or not colon or not name:
-        raise ProgdfError(f"--gain {text} is no gain; {right}")
+        raise ProgdfError(f"--gain {text} is not a gain; {right}")
     known_edit(name, gdfs, "--gain")
     kind = {"color": "color"}.get(kind, kind)
     if kind not in kinds:

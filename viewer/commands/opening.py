@@ -99,7 +99,7 @@ def drop_option_name(argv: Sequence[str]) -> list[str]:
         if argument == NAME:
             file = next(rest, None)
             if file is None:
-                raise ProgdfError(f"{NAME} names no file; write {NAME} FILE")
+                raise ProgdfError(f"{NAME} needs a file; write {NAME} FILE")
             first.append(file)
         elif argument.startswith(f"{NAME}="):
             first.append(argument.removeprefix(f"{NAME}="))
@@ -125,7 +125,7 @@ def _session(options: StackOptions) -> OpenStack:
         if name in defaults and getattr(options, name) != defaults[name]:
             what = "an edit was given" if name == "gdfs" else f"--{name} was given"
             raise ProgdfError(
-                f"{what} with the session {options.scene.name}, which says it too; leave it out"
+                f"{what} with the session {options.scene.name}, which already sets it; leave it out"
             )
     kept = session.open_session(options.scene)
     found = OpenStack(kept.document, kept.view, options.scene, kept.snapshots, _up_option(options))

@@ -99,7 +99,9 @@ def _render_still(
     where = found.document.recordings()
     missing = recordings.obstacle(where)
     if view.compare.mode != "off" and view.compare.against == "recorded" and missing:
-        raise ProgdfError(f"nothing recorded to compare with: {missing}; give the .gdf in its run folder")
+        raise ProgdfError(
+            f"there is nothing recorded to compare with: {missing}; give the .gdf in its run folder"
+        )
     comparer = Comparer(engine, engine.ctx, where)
     try:
         image = comparer.image(view, camera=camera)
@@ -122,7 +124,7 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
     if options.against is None:
         return asked
     if asked.mode == "off":
-        raise ProgdfError(f"--against {options.against} alone compares nothing; add --split or --difference")
+        raise ProgdfError(f"--against {options.against} needs a comparison; add --split or --difference")
     return replace(asked, against=options.against)
 
 
@@ -144,7 +146,7 @@ def _count(sheet: str | None) -> int:
         return 0
     if not (sheet.isdecimal() and len(sheet) < 9) or not 1 <= int(sheet) <= timeline_film.MOST_SHOWN:
         most = timeline_film.MOST_SHOWN
-        raise ProgdfError(f"--sheet {sheet} is no number of a film's pictures; give one from 1 to {most}")
+        raise ProgdfError(f"--sheet {sheet} is not a number of pictures; give one from 1 to {most}")
     return int(sheet)
 
 
@@ -199,7 +201,7 @@ def _check_output(options: RenderOptions) -> None:
     suffix = options.out.suffix.lower()
     given = [name for name in ONE_OF if getattr(options, name) is not None]
     if len(given) > 1 and given != ["sheet", "timeline"]:
-        raise ProgdfError(f"--{given[0]} and --{given[1]} were both given; give one of them")
+        raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
     films = options.timeline is not None and options.sheet is None
     if films:
         timeline_film.check_output(options.out)

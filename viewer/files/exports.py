@@ -62,7 +62,7 @@ def camera(place: Path, seen: Camera) -> tuple[Path, int]:
     name = place.name.removesuffix(SUFFIX) if place.name.endswith(SUFFIX) else place.stem
     path = place.with_name(f"{name}{CAMERAS}")
     if path.exists() and kind_of_cameras(path) != "own":
-        raise ProgdfError(f"{path} was not made with F4; move it elsewhere, as it would be written anew")
+        raise ProgdfError(f"{path} was not made with F4; move it elsewhere, as it would be overwritten")
     kept = load_cameras(path) if path.exists() else []
     number = 1 + max((int(c.name[5:]) for c in kept if re.fullmatch(r"view_\d{1,9}", c.name)), default=-1)
     save_cameras(path, [*kept, replace(seen, name=f"view_{number:03d}")])

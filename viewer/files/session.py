@@ -43,7 +43,7 @@ def save(path: Path, session: WindowSession) -> None:
         raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
     scene, session = session.document.path, prune(session)
     if not path.parent.is_dir():
-        raise ProgdfError(f"the folder {path.parent} does not exist; make it first")
+        raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
     folder = path.parent
     state = SessionFile(
         reference(scene, folder),
@@ -136,7 +136,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapsh
             _check_camera(f"snapshots[{i}].camera", snapshot.camera)
             _check_edit(f"snapshots[{i}].edit", snapshot.edit, count)
     except JsonFormError as error:
-        raise ProgdfError(f"{name} cannot be opened: {error}; save it anew, or update progdf") from None
+        raise ProgdfError(f"{name} cannot be opened: {error}; save it again, or update progdf") from None
     return view, snapshots
 
 
@@ -168,4 +168,4 @@ def _check(where: str, values: Sequence[float], least: float, most: float) -> No
 
 def _check_known(where: str, value: Any, known: Sequence[str]) -> None:
     if value not in known:
-        raise JsonFormError(f"{where} is '{value}', none of {', '.join(known)}")
+        raise JsonFormError(f"{where} is '{value}', not one of {', '.join(known)}")

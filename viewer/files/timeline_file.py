@@ -107,7 +107,7 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
         found = _of_layers(file, layers)
         check(found, "keys")
     except JsonFormError as error:
-        raise ProgdfError(f"{path} cannot be read: {error}; correct it, or write it anew") from None
+        raise ProgdfError(f"{path} cannot be read: {error}; correct it, or write it again") from None
     return found
 
 
@@ -119,15 +119,15 @@ def check(found: Timeline, where: str = "timeline.keys") -> None:
     """
     if not 1 <= found.length <= timeline.LONGEST or not 1 <= found.fps <= timeline.FASTEST:
         raise JsonFormError(
-            f"length is {found.length} and fps {found.fps}; 1 to {timeline.LONGEST} and 1 to "
-            f"{timeline.FASTEST} can be"
+            f"length is {found.length} and fps {found.fps}; at most "
+            f"{timeline.LONGEST} and {timeline.FASTEST} are allowed, at least 1"
         )
     for i, key in enumerate(found.keys):
         at = f"{where}[{i}]"
         if not 0 <= key.frame <= found.length:
             raise JsonFormError(f"{at}.frame is {key.frame}, outside 0 to the length, {found.length}")
         if key.easing not in timeline.EASINGS:
-            raise JsonFormError(f"{at}.easing is '{key.easing}', none of {', '.join(timeline.EASINGS)}")
+            raise JsonFormError(f"{at}.easing is '{key.easing}', not one of {', '.join(timeline.EASINGS)}")
         for _, strength in key.strengths:
             if not 0.0 <= strength <= OVERSHOOT:
                 raise JsonFormError(f"{at}.strengths has {strength:g}, outside 0 to {OVERSHOOT:g}")

@@ -20,7 +20,7 @@ def parse_path(text: str) -> Path:
     except UnicodeEncodeError:
         possible = False
     if not possible:
-        raise ProgdfError(f"no file can be called {text}; type another name")
+        raise ProgdfError(f"{text} cannot be a file name; type another name")
     return Path(os.path.expanduser(text))  # pathlib's raises for an unknown user
 
 

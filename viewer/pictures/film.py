@@ -137,7 +137,7 @@ def check_sequence(folder: Path) -> None:
     if taken:
         raise ProgdfError(f"{folder} exists and is not an empty folder; give a new name for the frames")
     if not folder.absolute().parent.is_dir():
-        raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; make it first")
+        raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; create it first")
 
 
 def _quantize(frames: Iterable[Pixels]) -> list[Image.Image]:

@@ -280,7 +280,7 @@ class ViewEngine:
     def _gdf(self, index: int) -> Gdf:
         if not 0 <= index < len(self.gdfs):
             raise ProgdfError(
-                f"a layer asks for edit {index + 1} of {len(self.gdfs)}; open its .gdf file too"
+                f"a layer refers to edit {index + 1} of {len(self.gdfs)}; open its .gdf file too"
             )
         return self.gdfs[index]
 

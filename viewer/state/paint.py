@@ -100,9 +100,9 @@ def decode(paint: str, members: int) -> Tensor | None:
     try:
         levels = unpacker.decompress(base64.b64decode(paint, validate=True), members + 1)
     except (ValueError, binascii.Error, zlib.error):
-        raise ProgdfError("the painted weights of a layer are damaged; paint it anew") from None
+        raise ProgdfError("the painted weights of a layer are damaged; paint it again") from None
     if len(levels) != members:
-        raise ProgdfError(f"a layer's painted weights do not fit its {members} members; paint it anew")
+        raise ProgdfError(f"a layer's painted weights do not fit its {members} members; paint it again")
     return torch.from_numpy(np.frombuffer(levels, np.uint8).astype(np.float32) / 255.0)
 
 

@@ -277,7 +277,7 @@ class _GlfwLoader:
 
 def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
     why = f" ({errors[-1]})" if errors else ""
-    return ProgdfError(f"{what}{why}; `progdf render` makes pictures without one")
+    return ProgdfError(f"{what}{why}; `progdf render` works without a window")
 
 
 def _decode(text: str | bytes) -> str:

@@ -100,8 +100,8 @@ def test_check_of_a_broken_file_is_one_line(tmp_path: Path, capsys: pytest.Captu
     path = tmp_path / "scene.ply"
     save_ply(path, tidy())
     path.write_bytes(path.read_bytes()[:-10])
-    assert "cut short" in error_of(capsys, "check", str(path))
-    assert "cut short" in error_of(capsys, "info", str(path))
+    assert "truncated" in error_of(capsys, "check", str(path))
+    assert "truncated" in error_of(capsys, "info", str(path))
 
 
 def test_info_tells_files_by_content_and_not_by_name(
@@ -140,7 +140,7 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
 
 def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    assert "nothing progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.png"))
+    assert "is not a file progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.png"))
     (tmp_path / "a.gdf").write_bytes(b"")
     assert "not a .gdf" in error_of(capsys, "info", str(tmp_path / "a.gdf"))
     (tmp_path / "a.ply").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")

@@ -150,7 +150,7 @@ def test_a_mistake_of_ours_is_one_line_and_a_file_with_the_details(
     assert main(["check", "scene.ply"]) == 70
     told = capsys.readouterr().err
     assert told.count("\n") == 1
-    assert told.startswith("progdf: a mistake in progdf itself (IndexError: list index out of range); ")
+    assert told.startswith("progdf: internal error in progdf (IndexError: list index out of range); ")
     details = (tmp_path / "progdf" / "crash.txt").read_text()
     assert str(tmp_path / "progdf" / "crash.txt") in told
     assert "Traceback" in details
@@ -174,7 +174,7 @@ def test_too_little_memory_is_one_line(
         raise error
 
     monkeypatch.setattr("progdf.cli.check.main", large)
-    assert "more memory than there is; " in stderr_of(capsys, "check", "scene.ply")
+    assert "out of memory; " in stderr_of(capsys, "check", "scene.ply")
 
 
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])

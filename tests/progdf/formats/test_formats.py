@@ -197,11 +197,11 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
     monkeypatch.setattr(formats, "SECONDS", (1, 0.0))
     for body, said in (
         ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
-        ("import time; time.sleep(60)", "gave no answer in 2 s"),
+        ("import time; time.sleep(60)", "did not answer within 2 s"),
         ("raise SystemExit(3)", "said nothing"),
         ("import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)", "said: worse"),
         ("pass", "said nothing"),
-        ("import sys; open(sys.argv[3], 'w').write('ply')", "gave no scene"),
+        ("import sys; open(sys.argv[3], 'w').write('ply')", "returned no scene"),
     ):
         script.write_text(body)
         message = refusal(load_scene, path)

@@ -49,7 +49,7 @@ def test_a_gap_in_the_sh_properties_is_named(tmp_path: Path) -> None:
 def test_an_element_after_the_gaussians_must_fit_behind_them(tmp_path: Path) -> None:
     path = write(tmp_path / "scene.ply", table_of(scene_of()), after=[camera_element()])
     path.write_bytes(path.read_bytes().replace(b"camera 1", b"camera 2"))
-    assert "promises 2 rows of 'camera'" in refusal(load_ply, path)
+    assert "declares 2 rows of 'camera'" in refusal(load_ply, path)
 
 
 def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_file_cut_short_is_refused(text: bool, kept: float, tmp_path: Path) ->
     path = write(tmp_path / "scene.ply", table_of(scene_of()), text=text)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
-    assert "cut short" in refusal(load_ply, path)
+    assert "truncated" in refusal(load_ply, path)
 
 
 @pytest.mark.parametrize("count", [b"51", b"2000000000", b"9999999999999999999", b"9" * 5000])

@@ -141,7 +141,7 @@ def test_a_field_with_numbers_that_are_not_finite_is_not_saved(shirt: Gdf, tmp_p
 
 
 def test_a_place_that_does_not_exist_is_named(shirt: Gdf, tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match=r"does not exist; make it first"):
+    with pytest.raises(ProgdfError, match=r"does not exist; create it first"):
         save_gdf(tmp_path / "nowhere" / "a.gdf", shirt)
 
 
@@ -214,7 +214,7 @@ def test_a_folder_is_no_edit(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kept", [0.02, 0.3, 0.999])
 def test_a_file_cut_short_says_so(saved: Path, tmp_path: Path, kept: float) -> None:
     content = saved.read_bytes()
-    assert "cut short" in refusal(written(tmp_path, content[: int(kept * len(content))]))
+    assert "truncated" in refusal(written(tmp_path, content[: int(kept * len(content))]))
 
 
 def test_one_flipped_bit_of_a_number_is_noticed(saved: Path, tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def test_wrong_shapes_and_windows_are_refused_by_name() -> None:
     scene = one_gaussian()
     with pytest.raises(ValueError, match=r"crop \(0, 0, 41, 24\) is empty or leaves the image of 40x24"):
         render(scene, camera, crop=(0, 0, 41, 24))
-    with pytest.raises(ValueError, match="no rasterizer 'gpu', expected one of reference, cpu"):
+    with pytest.raises(ValueError, match="unknown rasterizer 'gpu'; use one of reference, cpu"):
         render(scene, camera, engine="gpu")
     with pytest.raises(ValueError, match=r"mask has shape \[3, 3\], expected \[24, 40\]"):
         alpha_weights(scene, camera, torch.ones(3, 3))

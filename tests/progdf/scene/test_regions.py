@@ -134,8 +134,8 @@ def refusal(spec: str, scene: Gaussians) -> str:
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("", "lacks a part"),
-        ("-all", "lacks a part"),
+        ("", "is missing a part"),
+        ("-all", "is missing a part"),
         ("all+", "no known kind"),
         ("everything", "no known kind"),
         ("cube:1,2,3", "all, labels:…, box:…, sphere:…"),
@@ -146,7 +146,7 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("sphere:99,99,99,1", "the scene reaches x"),
         ("all-all", "holds no Gaussian"),
         ("labels:nowhere.npy:1", "nowhere.npy does not exist"),
-        ("labels:nowhere.npy", "names no label"),
+        ("labels:nowhere.npy", "has no label"),
         ("labels:nowhere.npy:one", "list of integers"),
         ("labels:nowhere.npy:1,", "list of integers"),
     ],

@@ -159,12 +159,12 @@ def test_a_folder_that_is_no_whole_pipeline_is_one_line(pix2pix: str, damage: st
 
 
 def test_image_guidance_for_a_model_without_it_is_one_line(diffusers: None, tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="knows no --image-guidance; "):
+    with pytest.raises(ProgdfError, match="does not support --image-guidance; "):
         editor_of(settings_of(str(tiny_flux_kontext(tmp_path)), image_guidance=1.5))
 
 
 def test_an_empty_sentence_is_one_line() -> None:
-    with pytest.raises(ProgdfError, match="says nothing; "):
+    with pytest.raises(ProgdfError, match="needs an instruction; "):
         editor_of(EditorSettings(), 'instruct:""')
 
 

@@ -166,7 +166,7 @@ def test_a_painter_that_fails_leaves_no_note_behind(tmp_path: Path) -> None:
         KeptPictures(tmp_path).picture("v", source, {"style": 2}, fails)
     paint = Counting()
     KeptPictures(tmp_path).picture("v", source, {"style": 1}, paint)
-    assert paint.calls == 0, "what was kept before is whole"
+    assert paint.calls == 0, "what was kept before is complete"
 
 
 def test_killed_between_picture_and_note_it_is_painted_anew(

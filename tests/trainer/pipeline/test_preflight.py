@@ -25,9 +25,9 @@ FAULTS = {
     "no such editor": ({"--editor": "paint:#fff"}, "unknown editor 'paint'"),
     "no folder of edited views": ({"--editor": "folder:nowhere"}, "nowhere is not a folder"),
     "no folder of photographs": ({"--editor": "photographs:nowhere"}, "nowhere is not a folder"),
-    "no such style": ({"--editor": "style:99"}, "style:99 is no style"),
-    "an empty sentence": ({"--editor": "instruct:"}, "says nothing"),
-    "no such kind of region": ({"--region": "cube:1"}, "is of no known kind"),
+    "no such style": ({"--editor": "style:99"}, "unknown style '99'; use style:N"),
+    "an empty sentence": ({"--editor": "instruct:"}, "needs an instruction"),
+    "no such kind of region": ({"--region": "cube:1"}, "unknown region 'cube:1'"),
     "no file of labels": ({"--region": "all-labels:nowhere.npy:1"}, "nowhere.npy"),
     "labels that are none": ({"--region": "labels:labels.npy:one"}, "is not a list of integers"),
     "labels that are fractions": ({"--region": "labels:fractions.npy:1"}, "integer labels"),
@@ -37,7 +37,7 @@ FAULTS = {
     "masks without cameras": ({"--region": "masks:masks"}, "give --cameras"),
     "masks of no cameras": ({"--region": "photomasks:masks", "--cameras": "nowhere.json"}, "nowhere.json"),
     "no file of rows": ({"--region": "file:nowhere.npy"}, "nowhere.npy"),
-    "an empty prompt": ({"--region": "text:"}, "names nothing"),
+    "an empty prompt": ({"--region": "text:"}, "needs a prompt"),
     "no cameras": ({"--cameras": "nowhere.json"}, "nowhere.json"),
     "cameras that are none": ({"--cameras": "broken.json"}, "broken.json is not JSON"),
 }
@@ -125,7 +125,9 @@ def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
     options = {"--region": "text:scarf", "--detector": "detector", "--sam-model": "sam_model"}
     absent = {"no detector": {"--detector": "some/where"}, "no sam_model": {"--sam-model": "some/where"}}
     told = refused(capsys, **{**options, **absent.get(damage, {})})
-    assert ("hf download some/where" if damage in absent else "sam_model holds no whole model") in told
+    assert (
+        "hf download some/where" if damage in absent else "sam_model does not hold a complete model"
+    ) in told
 
 
 @pytest.mark.parametrize("damage", ["none", "no weights", "cut weights", "a shard missing", "a part missing"])
@@ -152,7 +154,7 @@ def test_a_pipeline_that_cannot_be_loaded_is_told_before_the_scene_is(
     else:
         shutil.rmtree(model / "vae")
     told = refused(capsys, **{"--editor": "instruct:as Batman", "--model": str(model)})
-    assert "holds no whole diffusers pipeline" in told
+    assert "does not hold a complete diffusers pipeline" in told
 
 
 def test_a_folder_that_is_taken_is_told_before_the_scene_is_loaded(

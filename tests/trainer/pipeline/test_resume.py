@@ -73,7 +73,7 @@ def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
     assert last.startswith("progdf: interrupted; ")
     assert last.endswith("give the same command with --resume to go on")
     assert saved_step() == 10
-    assert "going on at step 10 of 24" in gone_on(bear_folder, uninterrupted)
+    assert "continuing at step 10 of 24" in gone_on(bear_folder, uninterrupted)
 
 
 def test_ctrl_c_before_the_optimization_is_kept_too(
@@ -89,7 +89,7 @@ def test_ctrl_c_before_the_optimization_is_kept_too(
 @pytest.mark.usefixtures("stopped")
 def test_resuming_with_another_option_names_it_and_touches_nothing(bear_folder: Path) -> None:
     before = {path: path.read_bytes() for path in OUT.rglob("*") if path.is_file()}
-    with pytest.raises(ProgdfError, match="begun with --steps 24, not 40; "):
+    with pytest.raises(ProgdfError, match="started with --steps 24, not 40; "):
         train(replace(small_run(bear_folder, steps=40), resume=True), quiet=True)
     assert {path: path.read_bytes() for path in OUT.rglob("*") if path.is_file()} == before
 
@@ -99,7 +99,7 @@ def test_resuming_with_another_scene_under_the_same_name_is_refused(bear_folder:
     about = OUT / "state" / "run.json"
     told = json.loads(about.read_text(encoding="utf-8"))
     about.write_text(json.dumps({**told, "scene": "another"}), encoding="utf-8")
-    with pytest.raises(ProgdfError, match="the scene is no longer what run was begun with; "):
+    with pytest.raises(ProgdfError, match="the scene has changed since run was started; "):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
@@ -154,7 +154,7 @@ def test_the_region_is_not_looked_for_again(
     gone_on(bear_folder, uninterrupted)
 
 
-@pytest.mark.parametrize("broken", ["gone", "cut short"])
+@pytest.mark.parametrize("broken", ["gone", "truncated"])
 @pytest.mark.usefixtures("stopped")
 def test_an_edited_view_that_was_lost_is_edited_again(
     bear_folder: Path, uninterrupted: Path, broken: str

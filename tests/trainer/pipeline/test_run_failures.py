@@ -34,7 +34,7 @@ def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_
 
     with monkeypatch.context() as patch:
         at_step(patch, 5, lose_all)
-        with pytest.raises(ProgdfError, match=r"\.png is gone; train again, with --resume"):
+        with pytest.raises(ProgdfError, match=r"\.png is missing; train again, with --resume"):
             train(small_run(bear_folder), quiet=True)
     assert saved_step() == 24
     gone_on(bear_folder, uninterrupted)
@@ -47,7 +47,7 @@ def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
     with files_up_to(40_000):  # the pictures fit in, the optimizer's state does not
         assert main(words(bear_folder, "--resume", "--save-every=0")) == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "progdf: the disk of run is full; free some space, then go on with --resume"
+    assert last == "progdf: the disk of run is full; free some space, then continue with --resume"
     assert saved_step() == 10
     assert not list(OUT.rglob(".*"))
     gone_on(bear_folder, uninterrupted)
@@ -95,7 +95,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
     refuse_temporary_files(monkeypatch, errno.EROFS)
     with pytest.raises(ProgdfError, match=r"run.log\.txt cannot be written \(Read-only file system\); "):
         train(small_run(bear_folder), quiet=True)
-    with pytest.raises(ProgdfError, match="cannot be made"):
+    with pytest.raises(ProgdfError, match="cannot be created"):
         train(replace(small_run(bear_folder), out=Path("/proc/run")), quiet=True)
 
 

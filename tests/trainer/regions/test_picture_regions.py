@@ -128,7 +128,7 @@ def test_masks_of_photographs_are_straightened(tmp_path: Path) -> None:
 def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None:
     told, given = settings(tmp_path), settings(tmp_path, masks / "cameras.json")
     name = six_cameras()[2].name
-    assert "names no folder" in refusal("masks:", told)
+    assert "needs a folder" in refusal("masks:", told)
     assert "is not a folder" in refusal(f"masks:{tmp_path}/nowhere", given)
     (masks / f"{name}.png").rename(masks / "other.png")
     Image.new("L", (SIZE, SIZE // 2)).save(masks / f"{name}.png")
@@ -219,7 +219,7 @@ def test_given_cameras_are_thinned_out_evenly(reddish: Asked, tmp_path: Path) ->
 
 def test_what_is_found_nowhere_is_one_line(reddish: Asked, tmp_path: Path) -> None:
     assert "found in none of 6 views" in refusal('text:"a unicorn"', settings(tmp_path))
-    assert "names nothing" in refusal('text:""', settings(tmp_path))
+    assert "needs a prompt" in refusal('text:""', settings(tmp_path))
 
 
 def test_a_sentence_leaves_a_folder_that_is_no_run_alone(reddish: Asked, tmp_path: Path) -> None:
@@ -310,7 +310,7 @@ def test_missing_weights_are_one_line_that_tells_how_to_get_them(
         (tmp_path / "broken" / file.name).write_bytes(file.read_bytes())
     (tmp_path / "broken" / "model.safetensors").write_bytes(b"half")
     broken = settings(tmp_path, segmenter=replace(tiny, sam_model=str(tmp_path / "broken")))
-    assert "no whole model with safetensors weights" in refusal("text:scarf", broken)
+    assert "not hold a complete model with safetensors weights" in refusal("text:scarf", broken)
 
 
 def test_a_model_of_another_kind_is_one_line(tiny: SegmenterSettings, tmp_path: Path) -> None:

@@ -148,6 +148,6 @@ def test_views_overwrite_no_folder_of_views(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "cameras.json").write_text("[]")
-    assert "is there already" in refused(capsys, "views", scene, "--out", tmp_path)
+    assert "already exists" in refused(capsys, "views", scene, "--out", tmp_path)
     assert (tmp_path / "cameras.json").read_text() == "[]"
     assert not (tmp_path / "original").exists()

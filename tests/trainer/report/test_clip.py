@@ -114,7 +114,7 @@ def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
 ) -> None:
     with pytest.raises(ProgdfError, match="hf download nobody/no-such-clip"):
         load_clip("nobody/no-such-clip")
-    with pytest.raises(ProgdfError, match="holds no whole CLIP model"):
+    with pytest.raises(ProgdfError, match="does not hold a complete CLIP model"):
         load_clip(str(tmp_path))
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
     with pytest.raises(ProgdfError, match="bert model, no CLIP"):

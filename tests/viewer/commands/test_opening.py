@@ -212,7 +212,7 @@ def test_a_contact_sheet_never_shows_a_frame_twice(count: int) -> None:
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("--sheet", "ears"), "--sheet ears is no number of a film's pictures"),
+        (("--sheet", "ears"), "--sheet ears is not a number of pictures"),
         (("--sheet", "0"), "from 1 to 100"),
         (("--sheet", "4", "-o", "x.gif"), "x.gif holds an animation"),
         (("--sheet", "4", "--frame", "all"), "moves the camera"),

@@ -242,7 +242,7 @@ def test_a_film_as_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> N
         (("-o", "none/frames"), "does not exist"),
         (("-o", "/proc/frames"), "/proc/frames cannot be written ("),
         (("-o", "dangling"), "dangling exists and is not an empty folder"),
-        (("-o", "x.gif", "--sweep", "scarf"), "were both given"),
+        (("-o", "x.gif", "--sweep", "scarf"), "cannot be combined"),
         (("-o", "x.gif", "--orbit", "0,0", "--timeline", "moving.json"), "moving.json moves the camera"),
     ],
 )

@@ -64,7 +64,7 @@ def test_paint_survives_its_text_to_a_255th_and_full_paint_is_no_text() -> None:
 
 @pytest.mark.parametrize("text", ["no base64!", "AAAA", paint.encode(np.zeros(7, np.float32))])
 def test_damaged_or_foreign_paint_is_refused_in_one_line(text: str) -> None:
-    with pytest.raises(ProgdfError, match="paint it anew"):
+    with pytest.raises(ProgdfError, match="paint it again"):
         paint.decode(text, 5)
 
 
