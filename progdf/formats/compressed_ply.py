@@ -32,7 +32,7 @@ def is_compressed(header: PlyHeader) -> bool:
 
 
 def read_compressed_ply(path: str | os.PathLike[str], header: PlyHeader) -> Gaussians:
-    """The scene as it stands in the file; opacities of 0 and 1 give infinite logits, to be repaired.
+    """The scene as stored in the file; opacities of 0 and 1 give infinite logits, to be repaired.
 
     Raises:
         ProgdfError: a table is missing or does not fit the others.

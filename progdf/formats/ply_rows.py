@@ -38,7 +38,7 @@ def read_blocks(
     store: Store,
     threads: int = 1,
 ) -> int:
-    """Read the rows of one element and hand them to `store`, block by block, in any order.
+    """Read the rows of one element and pass them to `store`, block by block, in any order.
 
     Args:
         wanted: scalar properties that `store` needs

@@ -1,6 +1,6 @@
 """Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog.
 
-Told apart by content where it tells, else by name. Two readers are our own; .spz, .sog and .splat go through
+Recognized by content, else by name. Two readers are our own; .spz, .sog and .splat go through
 gaussforge, in a process of its own (see `gaussforge_child`), as its native code may crash on a broken file.
 """
 
@@ -41,7 +41,7 @@ FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
 
 SOG_META = "meta.json"
-"""The file that stands for an unpacked .sog: its folder's table of images."""
+"""The file that represents an unpacked .sog: its folder's table of images."""
 
 _MOST_META = 64_000_000
 _MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)

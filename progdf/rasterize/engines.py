@@ -19,7 +19,7 @@ ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.c
 
 
 class ActivatedGaussians(NamedTuple):
-    """N Gaussians in activated units; what each is, is told by `progdf.rasterize.rasterize`."""
+    """N Gaussians in activated units; what each is: see `progdf.rasterize.rasterize`."""
 
     means: Tensor
     quats: Tensor

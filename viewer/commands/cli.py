@@ -66,8 +66,8 @@ def export(argv: Sequence[str]) -> int:
         save_ply(temporary_file, edited)
         _check_reloaded(edited, load_ply(temporary_file))
         _check_by_plyfile(edited, temporary_file)
-    told = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
-    print_line(f"wrote {options.out}: {format_count(len(edited))}, {told}; read back and compared")
+    strengths = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
+    print_line(f"wrote {options.out}: {format_count(len(edited))}, {strengths}; read back and compared")
     source = found.document.path
     if source is not None and (kind := scene_format(source)) != "ply":
         print_line(f"{found.document.title} is a .{kind}, this is a plain .ply")
