@@ -32,7 +32,7 @@ from .compressed_ply import is_compressed, read_compressed_ply
 from .ksplat import read_ksplat
 from .load_report import LoadReport
 from .ply import load_ply_with_report
-from .ply_header import read_header
+from .ply_file import read_header
 from .repair import repair
 
 _log = logging.getLogger(__name__)
@@ -105,10 +105,10 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     path = scene_file(path)
     kind = scene_format(path)
     if kind == "ply" or kind is None:
-        header = read_header(path)  # which knows best what is wrong with a file that is no .ply
-        if not is_compressed(header):
+        ply = read_header(path)  # which knows best what is wrong with a file that is no .ply
+        if not is_compressed(ply):
             return load_ply_with_report(path)
-        return _repair(path, read_compressed_ply(path, header), "compressed .ply")
+        return _repair(path, read_compressed_ply(ply), "compressed .ply")
     if kind == "ksplat":
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
