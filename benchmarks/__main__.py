@@ -32,7 +32,7 @@ BENCHES: dict[str, str] = {
     "window": "benchmarks.viewer.window:tables",
 }
 
-RECORDED = "benchmarks.recorded_runs:recorded_course"
+RECORDED = "benchmarks.recorded_runs:recorded_edit"
 
 
 @dataclass(frozen=True)

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from .cpu.engine import bin_view, make_pinhole, share_tiles, to_float32
 from .cpu.jit import compilation
 from .cpu.weights import Runs, add_gradients, add_images, list_weights
 from .engines import ActivatedGaussians, Crop, RasterView
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

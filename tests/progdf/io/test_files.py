@@ -56,7 +56,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_beside_it(
 def test_a_full_disk_is_told_with_the_name_of_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     path.write_text("old")
-    told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); give a place")
+    told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); choose a place")
     with (
         told as caught,
         files_up_to(100),

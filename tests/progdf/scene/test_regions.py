@@ -136,8 +136,8 @@ def refusal(spec: str, scene: Gaussians) -> str:
     [
         ("", "is missing a part"),
         ("-all", "is missing a part"),
-        ("all+", "no known kind"),
-        ("everything", "no known kind"),
+        ("all+", "unknown region"),
+        ("everything", "unknown region"),
         ("cube:1,2,3", "all, labels:…, box:…, sphere:…"),
         ("box:1,2,3", "6 numbers"),
         ("box:1,2,3,4,5,six", "6 numbers"),

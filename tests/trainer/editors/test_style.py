@@ -198,7 +198,7 @@ def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(t
     assert (tmp_path / "step_00200" / f"{view.camera.name}.png").is_file()
     assert torch.equal(editor.edit_again(view, 1.0, None, 200), made)
     assert paint.calls == 1
-    with pytest.raises(ProgdfError, match="gone; "):
+    with pytest.raises(ProgdfError, match="missing; "):
         editor.edit_again(view, 1.0, None, 400)
 
 

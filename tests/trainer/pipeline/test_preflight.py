@@ -20,8 +20,8 @@ FAULTS = {
     "no scene": ({"scene": "nowhere.ply"}, "nowhere.ply"),
     "a color that is none": ({"--editor": "recolor:blue"}, "'blue' is not a color"),
     "a path that is none": ({"--editor": "stripes:#fff,path=green"}, "unknown color path 'green'"),
-    "an option that is none": ({"--editor": "tint:#fff,way=hue"}, "'way=hue' is no option"),
-    "no share of the light": ({"--editor": "darken:2"}, "no share of the light"),
+    "an option that is none": ({"--editor": "tint:#fff,way=hue"}, "'way=hue' is not an option"),
+    "no share of the light": ({"--editor": "darken:2"}, "is not a number between 0 and 1"),
     "no such editor": ({"--editor": "paint:#fff"}, "unknown editor 'paint'"),
     "no folder of edited views": ({"--editor": "folder:nowhere"}, "nowhere is not a folder"),
     "no folder of photographs": ({"--editor": "photographs:nowhere"}, "nowhere is not a folder"),
@@ -160,5 +160,5 @@ def test_a_pipeline_that_cannot_be_loaded_is_told_before_the_scene_is(
 def test_a_folder_that_is_taken_is_told_before_the_scene_is_loaded(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert "no run of progdf train" in refused(capsys, **{"--out": "masks"})
+    assert "neither empty nor a run of progdf train" in refused(capsys, **{"--out": "masks"})
     assert "bear.ply is a file" in refused(capsys, **{"--out": "bear.ply"})

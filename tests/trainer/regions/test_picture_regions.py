@@ -226,7 +226,7 @@ def test_a_sentence_leaves_a_folder_that_is_no_run_alone(reddish: Asked, tmp_pat
     write_bear(tmp_path)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.txt").write_text("important")
-    with pytest.raises(ProgdfError, match="no run of progdf train"):
+    with pytest.raises(ProgdfError, match="neither empty nor a run of progdf train"):
         train(replace(quick_options(tmp_path), region="text:scarf"), quiet=True)
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.txt"]
     assert reddish == []
@@ -315,7 +315,7 @@ def test_missing_weights_are_one_line_that_tells_how_to_get_them(
 
 def test_a_model_of_another_kind_is_one_line(tiny: SegmenterSettings, tmp_path: Path) -> None:
     swapped = SegmenterSettings(tiny.sam_model, tiny.detector)
-    assert "is a sam model, no grounding-dino; give --detector" in refusal(
+    assert "is a sam model, not grounding-dino; give --detector" in refusal(
         "text:scarf", settings(tmp_path, segmenter=swapped)
     )
 

@@ -113,7 +113,7 @@ def test_what_region_cannot_do_is_one_line_and_leaves_nothing(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "r.png"
-    assert "no .png or .npy" in refused(capsys, "region", scene, "all", "-o", tmp_path / "r.jpg")
+    assert "not a .png or .npy" in refused(capsys, "region", scene, "all", "-o", tmp_path / "r.jpg")
     assert "holds no Gaussian" in refused(capsys, "region", scene, "sphere:99,0,0,1", "-o", out)
     assert "--orbit" in refused(capsys, "region", scene, "all", "-o", out, "--orbit", "1,99")
     assert "--size" in refused(capsys, "region", scene, "all", "-o", out, "--size", "0x9")
