@@ -17,10 +17,10 @@ from progdf.compose.layers import Layer
 from progdf.demo_scenes import AnalyticEdit
 from progdf.field import BakedField, FieldEvaluator
 from progdf.field.evaluate import Field
-from progdf.field.ranks import decibels
 from progdf.field.rendered import Render
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
+from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights, render, set_threads
 from progdf.rasterize.cpu.parallel import threads
 from progdf.region import from_mask
@@ -111,7 +111,7 @@ def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras:
 
     def pictures(moved: Tensor) -> list[Tensor]:
         edited = scene.replace_rows(members, start + moved)
-        return [render(edited, camera) for camera in cameras]
+        return [render(edited, camera).image for camera in cameras]
 
     ends = [pictures(offsets[t]) for t in (0, len(offsets) // 2, -1)]
     counts = [((b - a).abs() + (c - a).abs()).amax(dim=2) > 2 / 255 for a, b, c in zip(*ends, strict=True)]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from progdf.field.evaluate import FieldEvaluator
 from progdf.field.separable import channel_weights, check_trajectory, moving_attributes
+from progdf.interpolation import interpolate_at
 from progdf.scene.neighbors import nearest_rows
 
 from .courses import KnownEdit
@@ -50,10 +51,7 @@ class _Predicted:
 
     def offsets(self, s: float) -> Tensor:
         """[M,C]"""
-        right = int(torch.searchsorted(self._strengths, torch.tensor(s)).clamp(1, len(self._strengths) - 1))
-        low, high = float(self._strengths[right - 1]), float(self._strengths[right])
-        share = (s - low) / (high - low)
-        return _mean_of(torch.lerp(self._offsets[right - 1], self._offsets[right], share), self._nearest)
+        return _mean_of(interpolate_at(self._strengths, self._offsets, s), self._nearest)
 
 
 def position_floor(

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics
-from progdf.rasterize import rasterize, reference, set_threads
+from progdf.rasterize import reference, render, set_threads
 from progdf.rasterize.engines import ActivatedGaussians, RasterView
 
 from .table import Table
@@ -83,7 +83,7 @@ class RasterTimes:
         return self.duels[0].ratio
 
 
-def cloud(case: RasterCase) -> tuple[list[Tensor], Camera]:
+def cloud(case: RasterCase) -> tuple[ActivatedGaussians, Camera]:
     """Activated means, quats, scales, opacities, rgb, seeded, and a camera that sees most of them.
 
     A Gaussian's standard deviation is about 1.4 pixels, axes differ by a factor of about 2: what a trained
@@ -97,37 +97,32 @@ def cloud(case: RasterCase) -> tuple[list[Tensor], Camera]:
     quats = torch.randn(case.count, 4, generator=rng)
     opacities = torch.sigmoid(1.5 * torch.randn(case.count, generator=rng))
     colors = torch.rand(case.count, 3, generator=rng)
-    return [means, quats, scales, opacities, colors], Camera(torch.eye(4), K, case.size, case.size)
+    activated = ActivatedGaussians(means, quats, scales, opacities, colors)
+    return activated, Camera(torch.eye(4), K, case.size, case.size)
 
 
 def draw(
-    inputs: list[Tensor], camera: Camera, engine: str, dtype: torch.dtype, backward: bool
+    inputs: ActivatedGaussians, camera: Camera, engine: str, dtype: torch.dtype, backward: bool
 ) -> tuple[float, Tensor, list[Tensor]]:
     """Milliseconds of one pass, the image, and the gradients that a fixed gradient of the image leads to."""
-    leaves = [tensor.clone().to(dtype).requires_grad_(backward) for tensor in inputs]
-    means, quats, scales, opacities, colors = leaves
+    leaves = inputs.each(lambda tensor: tensor.clone().to(dtype).requires_grad_(backward))
     ramp = torch.linspace(0.0, pi, camera.width, dtype=dtype).sin()
     grad_image = torch.stack([ramp[:, None] * ramp, ramp[:, None] - ramp, -ramp * ramp[:, None]], -1)
     begin = time.perf_counter()
-    image = _image(engine, (means, quats, scales, opacities, colors), camera)
+    image = _image(engine, leaves, camera)
     if backward:
         image.backward(grad_image)  # type: ignore[no-untyped-call]
     elapsed = 1e3 * (time.perf_counter() - begin)
-    return elapsed, image.detach(), [leaf.grad for leaf in leaves if leaf.grad is not None]
+    return elapsed, image.detach(), [leaf.grad for leaf in leaves.tensors if leaf.grad is not None]
 
 
-def _image(engine: str, gaussians: tuple[Tensor, ...], camera: Camera) -> Tensor:
-    means, quats, scales, opacities, colors = gaussians
-    size = (camera.width, camera.height)
+def _image(engine: str, gaussians: ActivatedGaussians, camera: Camera) -> Tensor:
+    black = gaussians.means.new_zeros(3)
     if engine != "tiled":
-        image, _, _ = rasterize(
-            means, quats, scales, opacities, colors, camera.viewmat, camera.K, *size, engine=engine
-        )
-        return image
-    window = (0, 0, *size)
-    view = RasterView(camera.viewmat, camera.K, *size, window)
-    splats, _ = reference.project(ActivatedGaussians(*gaussians), view)
-    image, _ = reference.blend(three_sigma(splats), window, means.new_zeros(3))
+        return render(gaussians, camera, black, engine=engine).image
+    view = RasterView.of(camera, gaussians)
+    splats, _ = reference.project(gaussians, view)
+    image, _ = reference.blend(three_sigma(splats), view.crop, black)
     return image
 
 

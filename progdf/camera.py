@@ -47,8 +47,9 @@ class Camera:
                 raise ValueError(f"{name} has a number that is not finite")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"the image is {self.width}x{self.height} pixels; both must be at least 1")
-        if float(self.K[0, 0]) <= 0 or float(self.K[1, 1]) <= 0:
-            raise ValueError(f"focal lengths {self.K[0, 0]:g}, {self.K[1, 1]:g} px; both must be positive")
+        fx, fy = self.K.detach().diagonal()[:2].tolist()
+        if fx <= 0 or fy <= 0:
+            raise ValueError(f"focal lengths {fx:g}, {fy:g} px; both must be positive")
 
     @property
     def c2w(self) -> Tensor:

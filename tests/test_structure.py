@@ -26,8 +26,8 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 
 # Inside a package a folder, or a file beside the folders, imports only from those before it.
 ORDER = {
-    "progdf": """gaussians lens sh terminal errors region camera color metrics demo_scenes io rasterize
-        field formats gdf scene compose cli __init__ __main__""",
+    "progdf": """gaussians lens sh terminal errors region camera interpolation color metrics demo_scenes io
+        rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options option_checks presets plan store views editors segmenters setup regions
         optimize fit report pipeline cli""",
     "viewer": "__init__ camera gl state render files pictures ui panel app commands",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from progdf.errors import ProgdfError
-from progdf.field.ranks import NO_DIFFERENCE
+from progdf.metrics.image import NO_DIFFERENCE
 from trainer.options import (
     LARGEST_SEED,
     LONGEST_NAME,

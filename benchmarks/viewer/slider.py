@@ -146,7 +146,7 @@ def rows(
     gdf = edit_for(scene, case.members, case.moves)
     case = replace(case, members=len(gdf.region))
     layers = (LayerState(0, "edit", 0.05),)
-    view = ViewState(first_camera(scene), layers, dynamic_resolution="off")
+    view = ViewState(first_camera(scene), layers, draft="off")
     events: dict[str, list[float]] = {way: [] for way in WAYS}
     parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
     with ExitStack() as held:
@@ -240,6 +240,6 @@ def _psnr(engine: ViewEngine, view: ViewState, size: tuple[int, int]) -> float:
     for strength in (0.0, 0.5, 1.0):
         slid = replace(view, layers=(LayerState(0, "edit", strength),))
         image = engine.image(slid, size)
-        target = render(engine.gaussians(slid), to_camera(slid.camera, *size))
+        target = render(engine.gaussians(slid), to_camera(slid.camera, *size)).image
         worst = min(worst, psnr(torch.from_numpy(image), target))
     return worst

@@ -7,25 +7,24 @@ Bases are kept as they are stored (int8): a new slider value reads about 84 byte
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
-from progdf.rasterize.cpu.parallel import threads
+from progdf.interpolation import find_segment
+from progdf.rasterize.cpu.parallel import run_chunks, threads
 
+from .arrays import GAINS
 from .effects import Effects, changed_edits, changed_gains, effects_of
 from .kernel import compose_rows
-from .layers import KINDS, Layer, check_numbers, check_weights
-from .plan import RowPlan, find_segment, flatten_edits, flatten_scene, plan_rows
+from .layers import KINDS, Layer, check_numbers
+from .plan import FlatWeights, RowPlan, flatten_edits, flatten_scene, plan_rows
 
 WORTH_A_THREAD = 16_384
 """Rows below which a second thread costs more than it saves."""
@@ -71,19 +70,18 @@ class Composer:
         self._edited_rows = np.unique(np.concatenate([np.zeros(0, np.int64), *self._members]))
         self._names = tuple(n for n in ATTRIBUTES if any(n in gdf.field.attributes for gdf in gdfs))
         self._moving = [frozenset(gdf.field.attributes) for gdf in gdfs]
-        self._edits = flatten_edits(scene, gdfs, self._names)
-        self._base, self._out, self._columns = flatten_scene(scene, self._names, self._edited_rows)
+        self._bases = flatten_edits(scene, gdfs, self._names)
+        self._target = flatten_scene(scene, self._names, self._edited_rows)
         tensors: dict[str, Any] = {}
-        for name, (_, _, at) in zip(self._names, self._columns[:, :3].tolist(), strict=True):
+        for name, at in zip(self._names, self._target.columns["out"].tolist(), strict=True):
             shape = getattr(scene, name).shape
-            tensors[name] = torch.from_numpy(self._out[at : at + shape.numel()]).view(shape)
+            tensors[name] = torch.from_numpy(self._target.out[at : at + shape.numel()]).view(shape)
         self.gaussians = replace(scene, **tensors)
         """The scene under the layers of the last update; its tensors are written in place by the next."""
         self._effects = Effects()
         self._plans: dict[frozenset[int], RowPlan] = {}
         self._choices: dict[tuple[int, ...], NDArray[np.int64]] = {}
-        self._pool: ThreadPoolExecutor | None = None
-        self._weights: tuple[list[Tensor], list[int], NDArray[np.float32]] = ([], [], np.zeros(0, np.float32))
+        self._weights = FlatWeights()
 
     def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
         """Make `gaussians` the scene under `layers`: what `compose_layers(scene, layers, blend)` gives.
@@ -102,7 +100,7 @@ class Composer:
         """
         check_numbers(layers, blend)
         stack = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
-        weights_at = self._weight_offsets(stack)
+        self._weights.update([layer for _, layer in stack])
         before, self._effects = self._effects, effects_of(stack, blend)
         changed = changed_edits(before, self._effects)
         if not changed:
@@ -117,7 +115,7 @@ class Composer:
             return Change(plan.rows, (), 0.0)
         concerned = [i for i, (edit, _) in enumerate(stack) if edit in plan.edits]
         moved = self._rewrite(
-            plan, [stack[i] for i in concerned], [weights_at[i] for i in concerned], chosen, blend
+            plan, [stack[i] for i in concerned], [self._weights.begins[i] for i in concerned], chosen, blend
         )
         return Change(plan.rows, tuple(self._names[i] for i in chosen), math.sqrt(moved))
 
@@ -130,34 +128,28 @@ class Composer:
         blend: str,
     ) -> float:
         """Write these attributes of the plan's rows; the largest squared step of a center."""
-        edits = self._edits
-        layers, numbers, bounds = plan.stack_edits(tuple(edit for edit, _ in stack))
+        prepared = plan.stack(tuple(edit for edit, _ in stack))
         strengths = 0.0
         for i, (edit, layer) in enumerate(stack):
-            node, on_node, share = find_segment(edits.nodes[edit], layer.strength)
-            layers[i, 3:] = weights_at[i], node, on_node
-            gains = layer.gains
-            numbers[i] = share, layer.clamped_strength, gains.geometry, gains.opacity, gains.color
+            right, share = find_segment(self._gdfs[edit].field.knots, layer.strength)
+            entry: Any = prepared.layers[i]
+            entry["weights"], entry["clamped_strength"] = weights_at[i], layer.clamped_strength
+            entry["right"], entry["at_knot"], entry["share"] = right, share == 1.0, share
+            prepared.gains[i] = [getattr(layer.gains, kind) for kind in GAINS]
             strengths += layer.clamped_strength
         # a little below 1: sums in float32 may round up to where the kernel has to look
         normalize = blend == "normalized" and strengths > 1 - 1e-6
-        blocks = plan.blocks
-        arguments = (
-            self._base, self._out, plan.rows.view(np.uint64), plan.base_index, self._columns,
-            self._index_array(chosen), layers, numbers, bounds, plan.members, plan.row_index, edits.edits,
-            edits.parts, edits.floats, edits.bytes_, edits.tables, self._weights[2], blend == "over",
-            normalize,
-        )  # fmt: skip
+        prepared = prepared._replace(weights=self._weights.flat, over=blend == "over", normalize=normalize)
+        blocks, attributes = plan.blocks, self._index_array(chosen)
+        target, lists, bases = self._target, plan.lists, self._bases
+
+        def compose(first: int, last: int) -> float:
+            return float(compose_rows(target, lists, prepared, bases, attributes, first, last))
+
         count = min(1 + len(plan.rows) // WORTH_A_THREAD, max(blocks, 1))
         count = min(count, threads()) if count > 1 else 1
-        if count == 1:
-            return float(compose_rows(*arguments, 0, blocks))
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="compose")
         cuts = [blocks * part // count for part in range(count + 1)]
-        others = [self._pool.submit(compose_rows, *arguments, *cuts[i : i + 2]) for i in range(1, count)]
-        mine = float(compose_rows(*arguments, cuts[0], cuts[1]))
-        return max([mine, *(float(other.result()) for other in others)])
+        return max(run_chunks(lambda chunk: compose(cuts[chunk], cuts[chunk + 1]), count))
 
     def _plan(self, changed: frozenset[int]) -> RowPlan:
         if changed not in self._plans:
@@ -171,22 +163,6 @@ class Composer:
         if chosen not in self._choices:
             self._choices[chosen] = np.array(chosen, np.int64)
         return self._choices[chosen]
-
-    def _weight_offsets(self, stack: Sequence[tuple[int, Layer]]) -> list[int]:
-        """Where each layer's weights begin among those of all, laid back to back; −1 for a layer without."""
-        given = [layer.weights for _, layer in stack if layer.weights is not None]
-        versions = [tensor._version for tensor in given]
-        kept, kept_versions, _ = self._weights
-        if versions != kept_versions or any(a is not b for a, b in zip(given, kept, strict=True)):
-            for _, layer in stack:
-                check_weights(layer)
-            flat = np.concatenate([np.zeros(0, np.float32), *(w.detach().float().numpy() for w in given)])
-            self._weights = (given, versions, flat)
-        begins, length = [], 0
-        for _, layer in stack:
-            begins.append(-1 if layer.weights is None else length)
-            length += 0 if layer.weights is None else len(layer.weights)
-        return begins
 
     def _edit_of(self, gdf: Gdf) -> int:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,12 +15,9 @@ from torch import Tensor
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 
+from .arrays import BLOCK, COLUMN, EDIT, GAINS, LAYER, PART, Bases, Rows, Stack, Target
 from .coverage import coverage
-from .kernel import BLOCK, COLUMN, EDIT, LAYER, NUMBER, PART
-from .layers import KINDS
-
-StackedEdits = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]
-"""[L,6] and [L,5], see `compose_kernel.LAYER` and `NUMBER`, written to at every step; bounds, [L,B+1]."""
+from .layers import KINDS, Layer, check_weights
 
 
 @dataclass(frozen=True)
@@ -30,41 +26,43 @@ class RowPlan:
 
     Args:
         rows: what is rewritten. [U]
-        base_index: where each of them is among the rows of all edits, if asked for. [U]
+        lists: the same for the kernel, with each edit's members among them; where each row is among those of
+            all edits only if it was asked for
         edits: indices of the edits that have members among them
-        begin: where each edit's list begins within `members` and `row_index`
+        begin: where each edit's list begins within `lists`
         aligned: edits whose members are the rows, one for one
-        members, row_index: members of the edits, and where in `rows` they are
         bounds: where each block of rows begins in each edit's list. [B+1]
-        prepared: see `stack_edits`, by the edits of a stack
+        prepared: see `stack`, by the edits of a stack
     """
 
     rows: NDArray[np.int64]
-    base_index: NDArray[np.uint32]
+    lists: Rows
     edits: frozenset[int]
     begin: Mapping[int, int]
     aligned: frozenset[int]
-    members: NDArray[np.uint32]
-    row_index: NDArray[np.uint32]
     bounds: Mapping[int, NDArray[np.int64]]
-    prepared: dict[tuple[int, ...], StackedEdits]
+    prepared: dict[tuple[int, ...], Stack]
 
     @property
     def blocks(self) -> int:
         """How many blocks of rows there are."""
         return -(-len(self.rows) // BLOCK)
 
-    def stack_edits(self, edits: tuple[int, ...]) -> StackedEdits:
-        """What the kernel reads of layers of these edits, lowest first; made once."""
+    def stack(self, edits: tuple[int, ...]) -> Stack:
+        """Layers of these edits, lowest first, made once; strengths, gains and weights are left to be set."""
         if edits not in self.prepared:
             if len(self.prepared) >= 32:
                 self.prepared.clear()
-            layers = np.zeros((len(edits), len(LAYER)), np.int64)
-            for i, edit in enumerate(edits):
-                layers[i, :3] = edit, self.begin[edit], edit in self.aligned
+            layers = np.zeros(len(edits), LAYER)
+            layers["edit"] = edits
+            layers["list"] = [self.begin[edit] for edit in edits]
+            layers["aligned"] = [edit in self.aligned for edit in edits]
             bounds = np.array([self.bounds[edit] for edit in edits], np.int64)
-            numbers = np.zeros((len(edits), len(NUMBER)), np.float32)
-            self.prepared[edits] = (layers, numbers, bounds.reshape(len(edits), self.blocks + 1))
+            gains = np.zeros((len(edits), len(GAINS)), np.float32)
+            none = np.zeros(0, np.float32)
+            self.prepared[edits] = Stack(
+                layers, gains, bounds.reshape(len(edits), self.blocks + 1), none, over=False, normalize=False
+            )
         return self.prepared[edits]
 
 
@@ -102,48 +100,27 @@ def plan_rows(
         found_rows.append(row_index.astype(np.uint32))
         bounds[edit] = np.searchsorted(row_index, edges).astype(np.int64)
     nothing = np.zeros(0, np.uint32)
-    return RowPlan(
-        rows=rows,
-        base_index=nothing if edited is None else np.searchsorted(edited, rows).astype(np.uint32),
-        edits=frozenset(begin),
-        begin=begin,
-        aligned=frozenset(aligned),
-        members=np.concatenate([nothing, *found_members]),
-        row_index=np.concatenate([nothing, *found_rows]),
-        bounds=bounds,
-        prepared={},
+    base_index = nothing if edited is None else np.searchsorted(edited, rows).astype(np.uint32)
+    lists = Rows(
+        rows.view(np.uint64),
+        base_index,
+        np.concatenate([nothing, *found_members]),
+        np.concatenate([nothing, *found_rows]),
     )
+    return RowPlan(rows, lists, frozenset(begin), begin, frozenset(aligned), bounds, {})
 
 
-@dataclass(frozen=True)
-class FlatEdits:
-    """All edits as the kernel reads them.
-
-    Args:
-        edits, parts: [E,4], [E,A,7], see `compose_kernel.EDIT`, `PART`
-        floats, bytes_: lines of 256 numbers of each block of members, blocks and edits back to back
-        tables: coefficients and steps of all attributes of all edits
-        nodes: of each edit
-    """
-
-    edits: NDArray[np.int64]
-    parts: NDArray[np.int64]
-    floats: NDArray[np.float32]
-    bytes_: NDArray[np.int8]
-    tables: NDArray[np.float32]
-    nodes: tuple[tuple[float, ...], ...]
-
-
-def flatten_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> FlatEdits:
+def flatten_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -> Bases:
     """Lay out the edits' bases for these attributes, and their coverage."""
-    edits = np.zeros((len(gdfs), len(EDIT)), np.int64)
-    parts = np.full((len(gdfs), len(names), len(PART)), -1, np.int64)
-    floats, bytes_ = [np.zeros(0, np.float32)], [np.zeros(0, np.int8)]
+    edits = np.zeros(len(gdfs), EDIT)
+    parts = np.zeros((len(gdfs), len(names)), PART)
+    parts["end"] = -1
+    floats, levels = [np.zeros(0, np.float32)], [np.zeros(0, np.int8)]
     tables = [np.zeros(0, np.float32)]
-    ends = [0, 0, 0]  # of the three
+    float_count = level_count = table_count = 0
     for i, gdf in enumerate(gdfs):
         float_lines: list[NDArray[np.float32]] = []
-        byte_lines: list[NDArray[np.int8]] = []
+        level_lines: list[NDArray[np.int8]] = []
         coverages: dict[str, int] = {}
         for kind, covered in coverage(scene, gdf).items():
             coverages[kind] = len(float_lines)
@@ -152,34 +129,25 @@ def flatten_edits(scene: Gaussians, gdfs: Sequence[Gdf], names: Sequence[str]) -
             bases = gdf.field.attributes.get(name)
             if bases is None:
                 continue
-            full = len(float_lines)
+            end = len(float_lines)
             float_lines += list(bases.end_offset.numpy().T)
-            rest = bases.residual_basis.permute(2, 0, 1).flatten(0, 1)  # the bases of a channel side by side
+            residual = bases.residual_basis.permute(2, 0, 1).flatten(0, 1)  # a channel's bases side by side
             is_float = bases.residual_basis.dtype != torch.int8
-            lines = len(float_lines) if is_float else len(byte_lines)
+            lines = len(float_lines) if is_float else len(level_lines)
             if is_float:
-                float_lines += list(rest.float().numpy())
+                float_lines += list(residual.float().numpy())
             else:
-                byte_lines += list(rest.numpy())
-            table, step = ends[2], ends[2] + bases.coefficients.numel()
+                level_lines += list(residual.numpy())
+            scale = table_count + bases.coefficients.numel()
             tables += [bases.coefficients.numpy().reshape(-1), bases.scale.numpy().reshape(-1)]
-            ends[2] = step + bases.scale.numel()
-            parts[i, j] = (
-                full,
-                lines,
-                is_float,
-                len(bases.residual_basis),
-                table,
-                step,
-                coverages[KINDS[name]],
-            )
-        edits[i] = ends[0], len(float_lines), ends[1], len(byte_lines)
+            rank, covers = len(bases.residual_basis), coverages[KINDS[name]]
+            parts[i, j] = (end, lines, is_float, rank, table_count, scale, covers)
+            table_count = scale + bases.scale.numel()
+        edits[i] = float_count, len(float_lines), level_count, len(level_lines)
         floats.append(split_blocks(float_lines, np.float32))
-        bytes_.append(split_blocks(byte_lines, np.int8))
-        ends[:2] = ends[0] + len(floats[-1]), ends[1] + len(bytes_[-1])
-    nodes = tuple(tuple(gdf.field.knots.tolist()) for gdf in gdfs)
-    flat = (np.concatenate(floats), np.concatenate(bytes_), np.concatenate(tables))
-    return FlatEdits(edits, parts, *flat, nodes)
+        levels.append(split_blocks(level_lines, np.int8))
+        float_count, level_count = float_count + len(floats[-1]), level_count + len(levels[-1])
+    return Bases(edits, parts, np.concatenate(floats), np.concatenate(levels), np.concatenate(tables))
 
 
 def split_blocks(lines: Sequence[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
@@ -195,53 +163,47 @@ def split_blocks(lines: Sequence[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any
     return laid.reshape(-1)
 
 
-def flatten_scene(
-    scene: Gaussians, names: Sequence[str], edited: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Attributes of the edited rows in blocks, those of all rows back to back, and where each is.
-
-    Returns:
-        What `compose_kernel.compose_rows` takes as `base`, `out` and `columns`.
-    """
+def flatten_scene(scene: Gaussians, names: Sequence[str], edited: NDArray[np.int64]) -> Target:
+    """Attributes of the edited rows in blocks, those of all rows back to back, and where each is."""
     tensors: list[Tensor] = [getattr(scene, name).detach().float() for name in names]
     tables = [tensor.numpy().reshape(len(tensor), math.prod(tensor.shape[1:])) for tensor in tensors]
     base = split_blocks([line for table in tables for line in table[edited].T], np.float32)
     out = np.concatenate([np.zeros(0, np.float32), *(table.reshape(-1) for table in tables)])
-    columns = np.zeros((len(names), len(COLUMN)), np.int64)
+    columns = np.zeros(len(names), COLUMN)
     line = at = 0
     for i, (name, table) in enumerate(zip(names, tables, strict=True)):
-        columns[i] = line, table.shape[1], at, NUMBER.index(KINDS[name]), name == "means"
+        columns[i] = line, table.shape[1], at, GAINS.index(KINDS[name]), name == "means"
         line, at = line + table.shape[1], at + table.size
-    return base, out, columns
+    return Target(base, out, columns)
 
 
-def find_segment(nodes: Sequence[float] | NDArray[np.float64], s: float) -> tuple[int, bool, float]:
-    """The node at or right of `s`, whether it is there, and else its share of the way from the left one.
+class FlatWeights:
+    """The painted weights of a stack's layers, back to back; laid out anew only where one has changed."""
 
-    As `BakedField.coefficients`, which continues the outer segments.
-    """
-    right = min(max(bisect_left(nodes, float(np.float32(s))), 1), len(nodes) - 1)
-    left_s, right_s = nodes[right - 1], nodes[right]
-    return right, s == right_s, (s - left_s) / (right_s - left_s)
+    def __init__(self) -> None:
+        self.flat: NDArray[np.float32] = np.zeros(0, np.float32)
+        self.begins: list[int] = []
+        """Where each layer's begin in `flat`; −1 for a layer without."""
+        self._given: list[tuple[Tensor, int]] = []  # and their versions: they may be written to in place
 
+    def update(self, layers: Sequence[Layer]) -> bool:
+        """Take the weights of these layers; whether `flat` is another now.
 
-def factors(
-    nodes: Sequence[float] | NDArray[np.float64],
-    table: NDArray[np.float32],
-    step: NDArray[np.float32],
-    s: float,
-) -> NDArray[np.float32]:
-    """What every basis and channel is multiplied with at `s`; as `BakedField.coefficients`. [1+R,c]
-
-    Args:
-        nodes: strengths of the table's rows. [S]
-        table: an attribute's coefficients. [S,1+R]
-        step: what one unit of bases 1..R is worth. [R,c]
-        s: strength
-    """
-    right, on_node, share = find_segment(nodes, s)
-    row = table[right]
-    if not on_node:
-        left = table[right - 1]
-        row = left + np.float32(share) * (row - left)
-    return np.concatenate([np.full((1, step.shape[1]), row[0]), row[1:, None] * step])
+        Raises:
+            ValueError: weights do not fit the members, or one is not in 0..1.
+        """
+        given = [(layer.weights, layer.weights._version) for layer in layers if layer.weights is not None]
+        kept = self._given
+        same = len(given) == len(kept) and all(
+            a[0] is b[0] and a[1] == b[1] for a, b in zip(given, kept, strict=True)
+        )
+        if not same:
+            for layer in layers:
+                check_weights(layer)
+            parts = [weights.detach().float().numpy() for weights, _ in given]
+            self.flat, self._given = np.concatenate([np.zeros(0, np.float32), *parts]), given
+        begin, self.begins = 0, []
+        for layer in layers:
+            self.begins.append(-1 if layer.weights is None else begin)
+            begin += 0 if layer.weights is None else len(layer.weights)
+        return not same

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS
+from progdf.interpolation import interpolate_at
+from progdf.metrics.image import decibels
 
 from .baked import BakedField
 from .evaluate import Field, sample_strengths
 from .neural import NeuralField
-from .ranks import decibels
 from .rendered import Render
 from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes
 
@@ -68,7 +69,7 @@ class NeuralForm:
         network: the trained network
         plan: how it is baked
         rows_sha256: of the members' raw values that the network looks at; "" where it sees places alone
-        error: what baking costs: "rms", relative, and with pictures "psnr_mean", "psnr_worst",
+        error: what baking costs: "rms", relative, and where pictures were at hand "psnr_mean", "psnr_worst",
             dB, between the network, pinned, and what was baked of it
     """
 
@@ -163,13 +164,9 @@ def bake_error(field: Field, baked: BakedField, plan: BakePlan, render: Render |
     psnrs = []
     for s in sample_strengths():
         pinned = field.offsets(s)
-        right = int(torch.searchsorted(plan.knots, torch.tensor(s)).clamp(1, len(plan.knots) - 1))
-        share = (s - float(plan.knots[right - 1])) / float(plan.knots[right] - plan.knots[right - 1])
         for name, columns in moving_attributes(end[None]).items():
             if name in plan.end_correction:
-                end_correction = torch.lerp(
-                    plan.end_correction[name][right - 1], plan.end_correction[name][right], share
-                )
+                end_correction = interpolate_at(plan.knots, plan.end_correction[name], s)
                 pinned[:, columns] += end_correction * missing[:, columns]
         found = baked.offsets(s)
         wrong += float((found - pinned).double().square().sum())

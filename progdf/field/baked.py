@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
+from progdf.interpolation import find_segment
 
 if TYPE_CHECKING:
     from .bake import NeuralForm
@@ -144,24 +145,26 @@ class BakedField:
         Outside 0..1 (overshoot) the last segment is continued: that is extrapolation, not a recorded edit.
         """
         table = self.attributes[name].coefficients
-        right = int(torch.searchsorted(self.knots, torch.tensor(s, dtype=self.knots.dtype)))
-        right = min(max(right, 1), len(self.knots) - 1)
-        left_s, right_s = float(self.knots[right - 1]), float(self.knots[right])
-        if s == right_s:
+        right, share = find_segment(self.knots, s)
+        if share == 1.0:
             return table[right]
-        share = (s - left_s) / (right_s - left_s)
         return table[right - 1] + share * (table[right] - table[right - 1])
+
+    def factors(self, name: str, s: float) -> Tensor:
+        """What each base of one attribute, as it is stored, is multiplied with at `s`. [1+R,c] float32"""
+        weights, scale = self.coefficients(name, s), self.attributes[name].scale
+        return torch.cat([weights[:1, None].expand(1, scale.shape[1]), weights[1:, None] * scale])
 
     def attribute_offsets(self, name: str, s: float) -> Tensor:
         """Raw offsets of one attribute at strength `s`; exactly 0 at 0, `end_offset` at 1. [M,c] float32"""
         bases = self.attributes[name]
-        weights = self.coefficients(name, s)
-        if not bool(weights.any()):
+        weights, factors = self.coefficients(name, s).tolist(), self.factors(name, s)
+        if not any(weights):
             return torch.zeros_like(bases.end_offset)
-        total = weights[0] * bases.end_offset
-        for k in range(bases.residual_basis.shape[0]):
-            if float(weights[1 + k]) != 0.0:
-                total = total + (weights[1 + k] * bases.scale[k]) * bases.residual_basis[k].float()
+        total = factors[0] * bases.end_offset
+        for weight, factor, basis in zip(weights[1:], factors[1:], bases.residual_basis, strict=True):
+            if weight != 0.0:
+                total = total + factor * basis.float()
         return total
 
     def offsets(self, s: float) -> Tensor:

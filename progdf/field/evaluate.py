@@ -9,15 +9,17 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from progdf.interpolation import interpolate_at
+from progdf.metrics.image import decibels
+
 from .baked import BakedField
-from .ranks import decibels
 from .rendered import Render
 
 SAMPLES = 13
 
 
 class Field(Protocol):
-    """Anything that gives the offsets of its members at any strength, baked or not."""
+    """Anything that tells the offsets of its members at any strength, baked or not."""
 
     @property
     def attributes(self) -> Collection[str]:
@@ -76,7 +78,7 @@ class FieldEvaluator:
         render: Render,
         truth: Callable[[float], Tensor] | None = None,
     ) -> None:
-        course = truth or (lambda s: _interpolate(strengths, offsets, s))
+        course = truth or (lambda s: interpolate_at(strengths, offsets, s))
         self._render = render
         self._nothing = torch.zeros_like(offsets[0])
         with torch.no_grad():
@@ -97,12 +99,3 @@ class FieldEvaluator:
     def candidate(self, field: BakedField, label: str) -> Candidate:
         """The field with its error."""
         return Candidate(field, self.curve(field), label)
-
-
-def _interpolate(strengths: Tensor, offsets: Tensor, s: float) -> Tensor:
-    """The trajectory at `s`, linear between snapshots. [M,C]"""
-    right = int(
-        torch.searchsorted(strengths, torch.tensor(s, dtype=strengths.dtype)).clamp(1, len(strengths) - 1)
-    )
-    low, high = float(strengths[right - 1]), float(strengths[right])
-    return torch.lerp(offsets[right - 1], offsets[right], (s - low) / (high - low))

@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from .rendered import Modes, RenderedTrajectories
+from progdf.metrics.image import decibels
 
-NO_DIFFERENCE = 99.0
-"""PSNR, dB, that stands for pictures which do not differ."""
+from .rendered import Modes, RenderedTrajectories
 
 
 def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
@@ -68,8 +67,3 @@ def expected_worst(seen: RenderedTrajectories, path: Sequence[Mapping[str, int]]
     """Least PSNR over the slider that each of these ranks should give at least, dB."""
     modes = seen.modes(torch.ones(seen.gram.shape[1], dtype=torch.float64))
     return [decibels(float(seen.mse(modes, ranks).max())) for ranks in path]
-
-
-def decibels(mse: float) -> float:
-    """PSNR of a mean squared error, at most `NO_DIFFERENCE`, dB."""
-    return NO_DIFFERENCE if mse <= 0 else min(NO_DIFFERENCE, -10 * math.log10(mse))

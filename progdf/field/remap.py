@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from progdf.interpolation import interpolate
+
 from .baked import BakedField
 
 _NEAR = 1 / 80
@@ -47,13 +49,6 @@ def identity_remap() -> SliderRemap:
     """The slider remap that changes nothing."""
     ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
     return SliderRemap(ends, ends)
-
-
-def interpolate(x: Tensor, nodes: Tensor, values: Tensor) -> Tensor:
-    """Piecewise linear through (nodes, values). [n], [k], [k] -> [n]"""
-    right = torch.searchsorted(nodes, x).clamp(1, len(nodes) - 1)
-    share = (x - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
-    return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
 
 
 def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.interpolation import find_segment
 from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
@@ -69,11 +70,8 @@ class Trajectory:
 
     def at(self, s: float) -> Tensor:
         """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
-        right = int(torch.searchsorted(self.s, torch.tensor(s, dtype=self.s.dtype), right=True))
-        right = min(max(right, 1), len(self) - 1)
-        low, high = float(self.s[right - 1]), float(self.s[right])
-        share = min(max((s - low) / (high - low), 0.0), 1.0)
-        return torch.lerp(self.node(right - 1), self.node(right), share)
+        right, share = find_segment(self.s, s)
+        return torch.lerp(self.node(right - 1), self.node(right), min(max(share, 0.0), 1.0))
 
     def node(self, index: int) -> Tensor:
         """Offsets of one recording. [M,C] float32"""
@@ -145,7 +143,7 @@ def recorded_field(trajectory: Trajectory) -> BakedField:
 
 
 def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors, all of them where none are named, and the file's metadata."""
+    """Tensors, all of them where none are named, and what the file tells about itself."""
     try:
         tensors, header = read_tensors(path, names)
         if header.get("format") != _FORMAT:

@@ -11,6 +11,14 @@ from torch.nn.functional import conv2d
 WINDOW, SIGMA = 11, 1.5
 """SSIM's Gaussian window in pixels (Wang et al. 2004)."""
 
+NO_DIFFERENCE = 99.0
+"""PSNR, dB, that stands for pictures which do not differ."""
+
+
+def decibels(mse: float) -> float:
+    """PSNR of a mean squared error of images of range 0..1, at most `NO_DIFFERENCE`, dB."""
+    return NO_DIFFERENCE if mse <= 0 else min(NO_DIFFERENCE, -10 * math.log10(mse))
+
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Peak signal-to-noise ratio for images of range 0..1, dB; infinite where nothing differs.

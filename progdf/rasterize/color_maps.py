@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
+
 from .cpu.engine import bin_view, make_pinhole, share_tiles, to_float32
 from .cpu.jit import compilation
 from .cpu.weights import Runs, add_gradients, add_images, list_weights
@@ -41,37 +43,25 @@ class ColorMap:
         return torch.from_numpy(colors)
 
 
-def color_map(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    crop: Crop,
-    rows: Tensor,
-    antialiased: bool = False,
-) -> ColorMap:
-    """List what some Gaussians weigh in a window of a view, as `rasterize` draws it.
+def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: Tensor) -> ColorMap:
+    """List what some Gaussians weigh in a window of a view, as `render` draws it.
 
     Args:
-        means, quats, scales, opacities, viewmat, K, width, height, near, antialiased: see `rasterize`
+        gaussians: all N that are drawn; their colors are not read
+        camera: the view
         crop: x0, y0, x1, y1 of the window
         rows: which of the N Gaussians, distinct. [M] int64
     """
-    camera = make_pinhole(RasterView(viewmat, K, width, height, crop, near, None, antialiased))
-    listed = np.full(len(means), -1, np.int32)
+    pinhole = make_pinhole(RasterView.of(camera, gaussians, crop))
+    listed = np.full(len(gaussians.means), -1, np.int32)
     listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     with compilation("weights", 4):
-        splats, lists = bin_view(ActivatedGaussians(means, quats, scales, opacities, means), camera)
+        splats, lists = bin_view(gaussians, pinhole)
         counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
-        share_tiles(list_weights, camera, splats, lists, camera, listed, False, counts, _new_runs(0, 0))
+        share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, False, counts, _new_runs(0, 0))
         runs = _new_runs(*counts.sum(axis=0).tolist())
         places = np.cumsum(counts, axis=0) - counts
-        share_tiles(list_weights, camera, splats, lists, camera, listed, True, places, runs)
+        share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, places, runs)
     x0, y0, x1, y1 = crop
     return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
 

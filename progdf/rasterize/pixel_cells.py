@@ -14,7 +14,7 @@ from .conventions import ALPHA_MIN, DILATION
 from .cpu.engine import make_pinhole
 from .cpu.jit import kernel
 from .cpu.project import Pinhole, Scene, footprint, largest_extents
-from .engines import RasterView
+from .engines import ActivatedGaussians, RasterView
 
 Array = NDArray[Any]
 
@@ -31,27 +31,21 @@ def no_cells(width: int, height: int) -> NDArray[np.bool_]:
 
 def mark_cells(
     cells: NDArray[np.bool_],
-    means: NDArray[np.float32],
-    quats: NDArray[np.float32],
-    scales: NDArray[np.float32],
-    opacities: NDArray[np.float32],
+    gaussians: ActivatedGaussians,
     rows: NDArray[np.int64],
     camera: Camera,
-    near: float = 0.01,
 ) -> None:
-    """Mark every cell with a pixel that one of `rows` can have alpha ≥ 1/255 in, as `rasterize` draws them.
+    """Mark every cell with a pixel that one of `rows` can have alpha ≥ 1/255 in, as `render` draws them.
 
     Args:
         cells: from `no_cells`; marks are added
-        means, quats, scales, opacities: activated. [N,3], [N,4], [N,3], [N]
-        rows: which Gaussians. [M]
+        gaussians: all N, float32; colors are not read
+        rows: which of them. [M]
         camera: the view; antialiasing only makes what is touched smaller
-        near: least camera z, world units
     """
-    crop = (0, 0, camera.width, camera.height)
-    pinhole = make_pinhole(RasterView(camera.viewmat, camera.K, camera.width, camera.height, crop, near))
-    no_colors = np.empty((len(means), 1, 3), np.float32)
-    _mark(cells, rows, Scene(means, quats, scales, opacities, no_colors), pinhole)
+    means, quats, scales, opacities, _ = (tensor.numpy() for tensor in gaussians.tensors)
+    scene = Scene(means, quats, scales, opacities, np.empty((len(means), 1, 3), np.float32))
+    _mark(cells, rows, scene, make_pinhole(RasterView.of(camera, gaussians)))
 
 
 @kernel()

@@ -52,11 +52,10 @@ class ReferenceSplats:
 def rasterize(
     gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
-    """See `progdf.rasterize.rasterize`; computed in the type of `means`, projection in float64."""
+    """See `progdf.rasterize.render`; computed in the type of `means`, projection in float64."""
     if grad_rows is not None:
-        gaussians = ActivatedGaussians(
-            *(tensor.detach().index_copy(0, grad_rows, tensor[grad_rows]) for tensor in gaussians)
-        )
+        rows = grad_rows
+        gaussians = gaussians.each(lambda tensor: tensor.detach().index_copy(0, rows, tensor[rows]))
     splats, info = project(gaussians, view)
     image, transmittance = blend(splats, view.crop, background)
     return image, transmittance, info
@@ -88,7 +87,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     dtype = gaussians.means.dtype
     width, height, sh_degree = view.width, view.height, view.sh_degree
     means, quats, scales, opacities, colors, viewmat, K = (
-        tensor.double() for tensor in (*gaussians, view.viewmat, view.K)
+        tensor.double() for tensor in (*gaussians.tensors, view.viewmat, view.K)
     )
     used = colors if sh_degree is None else colors[:, : (sh_degree + 1) ** 2]
     usable = means.isfinite().all(1) & scales.isfinite().all(1)
@@ -179,7 +178,7 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
     """See `progdf.rasterize.alpha_weights`."""
     means, width, height = gaussians.means, view.width, view.height
-    splats, _ = project(gaussians._replace(colors=means.new_zeros(len(means), 3)), view)
+    splats, _ = project(gaussians, view)
     # two channels, zero beyond the image's edge: the mask, and what is image at all
     inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])
     inside = torch.nn.functional.pad(inside, (0, -width % TILE, 0, -height % TILE))

@@ -103,9 +103,9 @@ def test_a_frame_in_the_order_of_the_last_one_is_found(
     save_ply(path, bear(600).gaussians)
     sort, last = engine.back_to_front, dict[int, Any]()
 
-    def stale(means: Any, camera: Camera, near: float) -> Any:
+    def stale(means: Any, camera: Camera) -> Any:
         """What was right for the engine's picture before."""
-        order = sort(means, camera, near)
+        order = sort(means, camera)
         before = last.setdefault(means.ctypes.data, order)
         last[means.ctypes.data] = order
         return before if len(before) == len(order) else order

@@ -96,7 +96,7 @@ def write_analytic_views(
         edited = truth.edit.apply(truth.scene, region.members, strength)
         for view in (*stand.train, *stand.held_out):
             with torch.no_grad():
-                image = render(edited, view.camera, stand.background)
+                image = render(edited, view.camera, stand.background).image
             write_image(where / f"{view.camera.name}.png", image)
 
 

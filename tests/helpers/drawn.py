@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.rasterize import RasterInfo, rasterize
+from progdf.rasterize import ActivatedGaussians, Crop, RasterInfo, Rendering, activate, render
 from tests.helpers.scenes import hard_cases
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
@@ -31,31 +31,15 @@ def draw(
     gaussians: Gaussians,
     camera: Camera,
     engine: str,
-    crop: tuple[int, int, int, int] | None = None,
+    crop: Crop | None = None,
 ) -> Drawn:
     dtype = torch.float64 if engine == "reference" else torch.float32
-    inputs = (
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        camera.viewmat,
-        camera.K,
-        torch.tensor([0.2, 0.4, 0.6]),
-    )
+    background = torch.tensor([0.2, 0.4, 0.6])
+    inputs = (*activate(gaussians).tensors, camera.viewmat, camera.K, background)
     leaves = {
         name: tensor.to(dtype).clone().requires_grad_() for name, tensor in zip(INPUTS, inputs, strict=True)
     }
-    image, transmittance, info = rasterize(
-        **leaves,
-        width=camera.width,
-        height=camera.height,
-        sh_degree=gaussians.sh_degree,
-        antialiased=gaussians.antialiased,
-        engine=engine,
-        crop=crop,
-    )
+    image, transmittance, info = render_leaves(leaves, camera, gaussians.antialiased, engine, crop)
     rng = torch.Generator().manual_seed(11)
     weights = torch.randn(camera.height, camera.width, 4, generator=rng).to(dtype)
     if crop is not None:
@@ -63,6 +47,15 @@ def draw(
     ((image * weights[..., :3]).sum() + (transmittance * weights[..., 3]).sum()).backward()
     gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     return Drawn(image.detach(), transmittance.detach(), info, gradients)
+
+
+def render_leaves(
+    leaves: dict[str, Tensor], camera: Camera, antialiased: bool, engine: str, crop: Crop | None = None
+) -> Rendering:
+    """Draw with each of `INPUTS` in place of the scene's and the camera's own."""
+    activated = ActivatedGaussians(*(leaves[name] for name in INPUTS[:5]), antialiased)
+    placed = replace(camera, viewmat=leaves["viewmat"], K=leaves["K"])
+    return render(activated, placed, leaves["background"], crop=crop, engine=engine)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ _CODE = """
 import torch
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
-from progdf.rasterize import alpha_weights, rasterize, render
+from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
 from progdf.rasterize.color_maps import color_map
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball, front_camera
@@ -19,17 +19,13 @@ from tests.helpers.scenes import ball, front_camera
 scene, camera = ball(50), front_camera()
 render(scene, camera)
 for antialiased in (False, True):
-    inputs = [scene.means, scene.unit_quats, scene.scales, scene.opacities, scene.sh]
-    inputs = [tensor.clone().requires_grad_() for tensor in inputs]
-    view = camera.viewmat, camera.K, camera.width, camera.height
-    image, _, _ = rasterize(*inputs, *view, sh_degree=scene.sh_degree, antialiased=antialiased)
-    image.sum().backward()
-    image, _, _ = rasterize(*inputs, *view, sh_degree=scene.sh_degree, grad_rows=torch.arange(5))
-    image.sum().backward()
+    leaves = [tensor.clone().requires_grad_() for tensor in activate(scene).tensors]
+    gaussians = ActivatedGaussians(*leaves, antialiased)
+    render(gaussians, camera).image.sum().backward()
+    render(gaussians, camera, grad_rows=torch.arange(5)).image.sum().backward()
 alpha_weights(scene, camera, torch.ones(camera.height, camera.width))
 rows = some_rows(scene, 20)
-place = scene.means, scene.unit_quats, scene.scales, scene.opacities, *view, camera.near
-weighed = color_map(*place, (0, 0, camera.width, camera.height), rows)
+weighed = color_map(activate(scene), camera, (0, 0, camera.width, camera.height), rows)
 weighed.gradient(weighed.picture(torch.ones(20, 3)))
 gdf = edit_of(scene, rows, curved_field(20))
 Composer(scene, [gdf]).update([Layer(gdf, 0.5)])

@@ -13,7 +13,7 @@ import torch
 from progdf.__main__ import main
 from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
-from progdf.formats.ply_file import read_header
+from progdf.formats.ply_header import read_header
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import alpha_weights, render
 from progdf.region import Region
@@ -115,7 +115,7 @@ def test_weights_count_what_is_drawn(stack: Stack) -> None:
     """Σ w over all Gaussians is the share of a pixel that they cover, with the filter as without."""
     scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), 40, 30)
     white = replace(scene, sh0=torch.full_like(scene.sh0, 1.7724539), shN=scene.shN[:, :0])
-    covered = render(white, camera, (0.0, 0.0, 0.0))[..., 0].sum()
+    covered = render(white, camera, (0.0, 0.0, 0.0)).image[..., 0].sum()
     for engine in ("cpu", "reference"):
         weights = alpha_weights(scene, camera, torch.ones(30, 40), engine=engine)[:, 2].sum()
         torch.testing.assert_close(weights, covered, rtol=1e-4, atol=0.0)  # sums of float32
@@ -124,7 +124,7 @@ def test_weights_count_what_is_drawn(stack: Stack) -> None:
 def test_training_views_show_what_is_drawn(stack: Stack) -> None:
     scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), *SIZE)
     region = Region("all", torch.arange(len(scene)), torch.ones(len(scene)))
-    expected = render(scene, camera, WHITE).clamp(0.0, 1.0)
+    expected = render(scene, camera, WHITE).image.clamp(0.0, 1.0)
     view = make_view(scene, region, camera, WHITE)
     torch.testing.assert_close(view.image, expected, rtol=0.0, atol=2e-6)
     for still in (False, True):
@@ -145,8 +145,8 @@ def test_the_window_draws_it_as_the_rasterizer_does(ctx: moderngl.Context, stack
     finally:
         engine.release()
     edited = compose_layers(stack.scene, [Layer(stack.gdfs[0], 0.7)])
-    expected = render(edited, to_camera(view.camera, *SIZE), view.background)
-    fat = render(replace(edited, antialiased=False), to_camera(view.camera, *SIZE), view.background)
+    expected = render(edited, to_camera(view.camera, *SIZE), view.background).image
+    fat = render(replace(edited, antialiased=False), to_camera(view.camera, *SIZE), view.background).image
     assert float((found - expected).abs().max()) < 1 / 255  # a rim at the 1/255 cut, as in test_gl_parity
     assert float((found - fat).abs().max()) > 0.1
 
@@ -163,5 +163,7 @@ def test_one_point_is_drawn_with_the_stated_share_of_its_opacity() -> None:
         shN=torch.zeros(1, 0, 3),
         antialiased=True,
     )
-    ink = [float((1 - render(replace(point, antialiased=a), camera, WHITE)).max()) for a in (True, False)]
+    ink = [
+        float((1 - render(replace(point, antialiased=a), camera, WHITE).image).max()) for a in (True, False)
+    ]
     torch.testing.assert_close(ink[0] / ink[1], 0.005**0.5, rtol=1e-3, atol=0.0)

@@ -65,7 +65,9 @@ def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
         assert max(abs(x), abs(z)) < 1.9
         assert 0.9 < y < 2.0
     camera = scene.cameras[5].resize(96, 72)
-    red, green = (render(scene.gaussians, camera, background=c) for c in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    red, green = (
+        render(scene.gaussians, camera, background=c).image for c in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    )
     # closed on all sides: next to nothing of the background is left
     assert float((red - green).abs().mean()) < 0.02
 
@@ -118,7 +120,7 @@ def test_no_gaussian_is_buried_in_another_part() -> None:
 def test_the_bear_has_no_holes_seen_from_its_cameras(bear: scenes.DemoScene) -> None:
     # what shines through from behind changes with the background, and nothing else does
     red, green = (
-        render(bear.gaussians, bear.cameras[0].resize(160, 160), background=color)
+        render(bear.gaussians, bear.cameras[0].resize(160, 160), background=color).image
         for color in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     )
     leak = (red - green).abs().amax(dim=2)
@@ -134,7 +136,7 @@ def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
     assert float(front.position[2]) > 2
     assert abs(float(front.position[0])) < 1e-4
     assert float(back.position[2]) < -2
-    image = render(bear.gaussians, front.resize(128, 128), background=bear.background)
+    image = render(bear.gaussians, front.resize(128, 128), background=bear.background).image
     assert torch.allclose(image[2, 2], torch.tensor(bear.background), atol=0.02)
     dark = (image.amax(dim=2) < 0.2).nonzero().float().mean(0)
     assert 25 < float(dark[0]) < 60  # eyes and nose: the darkest of the picture, in its upper half
@@ -198,8 +200,8 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     )
     quarter = torch.eye(4)
     quarter[:2, :2] = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
-    same = render(turned, replace(camera, viewmat=camera.viewmat @ quarter))
-    assert (same - render(plain, camera)).abs().max() < 1e-2
+    same = render(turned, replace(camera, viewmat=camera.viewmat @ quarter)).image
+    assert (same - render(plain, camera).image).abs().max() < 1e-2
 
 
 def test_recoloring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:

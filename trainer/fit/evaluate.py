@@ -6,7 +6,6 @@ that show the region or that the edit changes (docs/method.md 7).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians, pack
-from progdf.metrics.image import ssim
+from progdf.metrics.image import decibels, ssim
 from progdf.region import Region
 from trainer.optimize.losses import Perceptual
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, render_all
@@ -60,7 +59,7 @@ class Evaluator:
         for a, b, pixels in zip(found, expected, self.pixels, strict=True):
             error += float((a[pixels] - b[pixels]).double().square().sum())
             count += 3 * int(pixels.sum())
-        return 99.0 if error <= 0 else min(99.0, -10 * math.log10(error / max(count, 1)))
+        return decibels(error / max(count, 1))
 
     def ssim(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """SSIM over the pixels that count, all views together, at most 1."""

@@ -152,7 +152,7 @@ def visibility(
     total = torch.zeros(len(members))
     for view in views:
         camera, everywhere = view.camera, torch.ones_like(view.mask)
-        total += alpha_weights(scene, camera, everywhere, near=camera.near)[members, 2].float()
+        total += alpha_weights(scene, camera, everywhere)[members, 2].float()
         if looked is not None:
             looked()
     return total / total.mean().clamp_min(1e-12) + 1e-3

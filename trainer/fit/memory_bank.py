@@ -1,6 +1,6 @@
 """The memory bank of snapshots, and the field that is trained on it while the edit is optimized.
 
-ProGDF trains its field jointly with PGS: after each of its steps one of the field's, on a snapshot drawn from
+ProGDF trains its field alongside PGS: after each of its steps one of the field's, on a snapshot drawn from
 those recorded so far. The slider values are not known before the whole way is, so a snapshot goes by its
 stage's strength and its step until then; when the optimization is done, the network is finished on the
 trajectory as it was re-timed. Its end is not known either: until then a network sees positions (and its
@@ -18,6 +18,7 @@ from torch import Tensor
 from progdf.field.neural_fit import NeuralFit, rendered_importance
 from progdf.field.rendered import Render
 from progdf.field.separable import moving_attributes
+from progdf.interpolation import interpolate_at
 from trainer.store.state import Saved
 
 MOST = 64
@@ -64,7 +65,7 @@ class MemoryBank:
 
 
 class JointTraining:
-    """A network in joint training with PGS; a `state.Resumable`.
+    """A network in training beside PGS; a `state.Resumable`.
 
     Args:
         fit: the network, not yet trained
@@ -86,9 +87,7 @@ class JointTraining:
 
     def strength(self, step: int) -> float:
         """Where on the slider a step of PGS is for now: even in time within its stage."""
-        right = int(torch.searchsorted(self._after, float(step)).clamp(1, len(self._after) - 1))
-        share = (step - self._after[right - 1]) / (self._after[right] - self._after[right - 1])
-        return float(torch.lerp(self._at[right - 1], self._at[right], share))
+        return float(interpolate_at(self._after, self._at, step))
 
     def add(self, step: int, offsets: Tensor) -> None:
         """A recording of PGS. [M,C]"""

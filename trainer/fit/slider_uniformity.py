@@ -18,24 +18,24 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.remap import SliderRemap, identity_remap, interpolate, remap_slider
+from progdf.field.remap import SliderRemap, identity_remap, remap_slider
 from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.interpolation import interpolate, interpolate_at
 from trainer.editors import COSTLY_DIAL, check_editor
 from trainer.editors.base import ImageEditor
-from trainer.optimize.retime import blend_images
 from trainer.setup.training_setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
 
 STEPS = 20
-"""Equal steps that a user makes over the whole slider."""
+"""Equal steps that a hand makes over the whole slider."""
 
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
 _FINE = 2  # a step may begin at so many places per step
 _PASSES = 3
 _LOOKS = 2  # how often all places are looked at
-_JUMP = 0.7  # of the change in one step of an editor's strength: no strength between can be relied on
+_JUMP = 0.7  # of the change in one step of an editor's dial: no strength between can be relied on
 
 
 def equalized_strengths(
@@ -105,7 +105,7 @@ def _ignore_progress(done: int, word: str) -> None:
 
 
 def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> SliderRemap:
-    """The remap under which equal steps change what is seen equally, wherever they begin.
+    """The dial under which equal steps change what is seen equally, wherever they begin.
 
     Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
     robot's .93, but .68 where they begin half a step later; with them .92 and .88).
@@ -122,10 +122,10 @@ def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> 
         best, following = -1.0, places
         for _ in range(passes + 1):
             current = following
-            shown = [blend_images(pictures, looked, float(s)) for s in current]
-            uniformity, following = _spread(current, shown, _FINE)
-            if uniformity > best:
-                best, places = uniformity, current
+            shown = [interpolate_at(looked, pictures, float(s)) for s in current]
+            evenness, following = _spread(current, shown, _FINE)
+            if evenness > best:
+                best, places = evenness, current
     return SliderRemap(places[::_FINE].contiguous(), even[::_FINE].contiguous())
 
 

@@ -37,7 +37,7 @@ HURRIED_STEPS, HURRIED = 4, 60
 mottled half way (held out, s = .5: 30.1 dB; 33.3 with 60, 35.7 with 100)."""
 
 BANDS_HELD = 0.1
-"""How strongly the higher bands are held to what the change of DC predicts, beside what the views say of
+"""How strongly the higher bands are held to what the change of DC foretells, beside what the views say of
 them: views are few directions, and bands that are free fit these and shine in others."""
 
 _A = TypeVar("_A")
@@ -81,20 +81,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    weighed = color_map(
-        crop.means,
-        crop.quats,
-        crop.scales,
-        crop.opacities,
-        camera.viewmat,
-        camera.K,
-        camera.width,
-        camera.height,
-        camera.near,
-        crop.box,
-        crop.rows,
-        crop.antialiased,
-    )
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows)
     picture = crop.original()
     if crop.cached is not None:
         live, rest = crop.cached

@@ -13,8 +13,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from progdf.field.remap import interpolate
 from progdf.field.trajectory import Trajectory
+from progdf.interpolation import interpolate, interpolate_at
 from trainer.options import Slider
 
 _LEAST_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
@@ -48,7 +48,7 @@ def retime(
 
     The chord length between pictures is what counts: arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
-    stretches the slider accordingly. Chords are as long as the steps that a user makes: shorter ones count
+    stretches the slider accordingly. Chords are as long as the steps that a hand makes: shorter ones count
     jitter that no step shows (a recolored robot's 20 steps: least over largest .71 instead of .66; a bear's
     scarf .93 instead of .76, its hands .85).
 
@@ -81,16 +81,9 @@ def retime(
         for nodes, low, high in segments:
             count = max(3, round(samples * (high - low)))
             even = torch.linspace(low, high, count + 1, dtype=torch.float64)
-            progress = _cumulative(_chords([blend_images(pictures, before, float(x)) for x in even]))
+            progress = _cumulative(_chords([interpolate_at(before, pictures, float(x)) for x in even]))
             s[nodes] = _place_between(low, high, interpolate(s[nodes], even, progress))
     return replace(trajectory, s=s.float())
-
-
-def blend_images(pictures: Sequence[Tensor], places: Tensor, s: float) -> Tensor:
-    """What is seen at `s`, straight between the pictures at these ascending places. [n] float64"""
-    right = int(torch.searchsorted(places, s).clamp(1, len(places) - 1))
-    low, high = float(places[right - 1]), float(places[right])
-    return torch.lerp(pictures[right - 1], pictures[right], min(max((s - low) / (high - low), 0.0), 1.0))
 
 
 def straight_recordings(

@@ -79,9 +79,7 @@ def find_unseen_members(scene: Gaussians, members: Tensor, views: Sequence[View]
     shown = torch.zeros(len(members))
     for view in views:
         camera = view.camera
-        shown += alpha_weights(scene, camera, torch.ones_like(view.mask), near=camera.near)[
-            members, 2
-        ].float()
+        shown += alpha_weights(scene, camera, torch.ones_like(view.mask))[members, 2].float()
     return _find_sources(scene[members], shown >= least_shown(shown))
 
 

@@ -124,11 +124,11 @@ class DemoOptions:
     size: int | None = None
     """Number of Gaussians; by default 24000 for the bear, 40000 for the room."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
-    """Folder for the scene, the edits and the pictures; created if needed."""
+    """Folder for the scene, the edits and the pictures; made if need be."""
     quick: bool = False
     """A draft in a third of the time: fewer views, smaller, fewer steps."""
     seed: int = 0
-    """Random seed of the scene and of the training."""
+    """Of the scene and of the training."""
     threads: int = 0
     """CPU threads; 0 takes all cores."""
     window: bool = True
@@ -199,7 +199,7 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
         layers = [Layer(gdfs[name], strength) for name, strength in strengths.items()]
         sized = camera.resize(round(height * camera.width / camera.height), height)
         with torch.no_grad():
-            return render(compose_layers(gaussians, layers), sized, background=scene.background)
+            return render(compose_layers(gaussians, layers), sized, background=scene.background).image
 
     names = list(gdfs)
     first, second, third = names

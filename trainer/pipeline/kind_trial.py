@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from progdf.gaussians import pack
+from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import UNTOLD, ImageEditor, check_editor
 from trainer.editors.base import EditKind
@@ -242,7 +243,7 @@ def _psnr(judges: Sequence[_Small], rows: Tensor) -> float:
     for one, picture in zip(judges, render_all([one.scene for one in judges], rows), strict=True):
         error += float((picture - one.target)[one.counts].square().sum())
         count += 3 * int(one.counts.sum())
-    return 99.0 if error <= 0 else min(99.0, -10 * math.log10(error / max(count, 1)))
+    return decibels(error / max(count, 1))
 
 
 def _change(view: View, picture: Tensor) -> float:

@@ -61,7 +61,7 @@ def optimize_members(
     renewal: Renewal | None = None,
     unseen_members: UnseenMembers | None = None,
 ) -> tuple[Trajectory, Losses]:
-    """Optimize the members, from the beginning or from the saved state.
+    """Optimize the members, from the beginning or from where the saved state stands.
 
     Args:
         options: see `TrainOptions`
@@ -107,18 +107,20 @@ def optimize_members(
             solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
-    joint = begin_joint_training(make_plan(options), setup, settings.rates, stages)
+    beside = begin_joint_training(make_plan(options), setup, settings.rates, stages)
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
-    kept = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}), every_s=options.save_every)
+    kept = PeriodicSave(
+        folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every
+    )
     if kept.restore():
-        if joint is not None:
-            joint.refill([(made.step, made.offsets) for made in recordings.made])
+        if beside is not None:
+            beside.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
     with log.steps("optimize", steps) as advance, defer_signals() as stopped:
 
         def step_done(step: int, left: float) -> None:
-            if joint is not None:
-                joint.step()
+            if beside is not None:
+                beside.step()
             advance(step, f"loss to the edit {left:.4f}")
             if stopped():
                 kept.save()
@@ -135,8 +137,8 @@ def optimize_members(
         try:
             for found in way_there:
                 recordings.add(found)
-                if joint is not None:
-                    joint.add(found.step, found.offsets)
+                if beside is not None:
+                    beside.add(found.step, found.offsets)
         except FloatingPointError as error:
             kept.save()
             raise ProgdfError(
@@ -144,8 +146,8 @@ def optimize_members(
                 "with --resume, or try --kind style in another folder"
             ) from error
     kept.save()
-    if joint is not None:
-        save_network(joint, folder)
+    if beside is not None:
+        save_network(beside, folder)
     losses = loss_table([(made.step, made.means) for made in recordings.made])
     left = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")

@@ -68,7 +68,7 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     bare = (scene.opacities - ALPHA_MIN) / (scene.opacities / ALPHA_MIN).clamp_min(1.001).log()
     bare = bare.clamp_min(1e-6)
     for camera, mask in zip(cameras, masks, strict=True):
-        found = alpha_weights(scene, camera, mask, near=camera.near)
+        found = alpha_weights(scene, camera, mask)
         sums += found
         mean = (found[:, 2] / found[:, 3].clamp_min(1.0)).float()
         mean_weight = torch.maximum(mean_weight, mean)

@@ -12,7 +12,6 @@ Where parts move, colors cannot follow, and nothing is measured.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +19,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from progdf.rasterize import rasterize
+from progdf.metrics.image import NO_DIFFERENCE, decibels
+from progdf.rasterize import render
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
@@ -82,24 +82,11 @@ class ViewChange:
 
     def render(self, colors: Tensor) -> Tensor:
         """The picture that changes of the members' colors make, where it counts. [M,3] -> [h,w,3]"""
-        scene, camera = self.scene, self.scene.camera
-        image: Tensor = rasterize(
-            scene.means,
-            scene.quats,
-            scene.scales,
-            scene.opacities,
-            torch.zeros_like(scene.colors).index_copy(0, scene.rows, colors),
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            background=torch.zeros(3),
-            near=camera.near,
-            antialiased=scene.antialiased,
-            crop=scene.box,
-            grad_rows=scene.rows,
-        )[0]
-        return image * self.counts
+        scene = self.scene
+        changes = torch.zeros_like(scene.gaussians.colors).index_copy(0, scene.rows, colors)
+        shown = scene.gaussians._replace(colors=changes)
+        drawn = render(shown, scene.camera, (0.0, 0.0, 0.0), crop=scene.box, grad_rows=scene.rows)
+        return drawn.image * self.counts
 
     def gather(self, picture: Tensor, members: int) -> Tensor:
         """The transpose of `render`: what each member gets of a picture. [h,w,3] -> [M,3]"""
@@ -126,8 +113,8 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
             change += float(one.change.square().sum())
             count += 3 * float(one.counts.sum())
     if lost <= 0 or count == 0:
-        return Agreement(99.0, 0.0)
-    return Agreement(min(99.0, -10 * math.log10(lost / count)), lost / max(change, 1e-12))
+        return Agreement(NO_DIFFERENCE, 0.0)
+    return Agreement(decibels(lost / count), lost / max(change, 1e-12))
 
 
 def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:

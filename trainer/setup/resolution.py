@@ -39,7 +39,7 @@ def unresolved_share(
     for camera in looks:
         small = fit_size(camera, _LOOK)
         area = (image_size / max(small.width, small.height)) ** 2
-        weights = alpha_weights(scene, small, torch.ones(small.height, small.width), near=small.near)
+        weights = alpha_weights(scene, small, torch.ones(small.height, small.width))
         shown += area * weights[region.members, 2]
     shown *= views / max(1, len(looks))
     visible = shown > 0

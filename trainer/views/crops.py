@@ -7,7 +7,7 @@ the box.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
-from progdf.rasterize import Crop, rasterize
+from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
 from progdf.rasterize.color_maps import ColorMap, color_map
 from progdf.rasterize.cpu.parallel import threads
 from progdf.sh import C0, basis
@@ -34,12 +34,11 @@ class CropScene:
     Args:
         camera: the whole view
         box: the pixels that are rendered
-        means, quats, scales, opacities, colors: activated values of the n Gaussians of the box, colors
-            as seen from this camera; members hold the original's values. [n,3], [n,4], [n,3], [n], [n,3]
+        gaussians: the n Gaussians of the box with their colors as seen from this camera; members hold the
+            original's values
         rows: where the members are among them, in the region's order. [M] int64
         member_shN: higher SH bands of the members in the original. [M,K,3]
         background: what shows through. [3]
-        antialiased: see `Gaussians`
         cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
             None where all are drawn
         still: nothing but the members' colors ever differs
@@ -47,15 +46,10 @@ class CropScene:
 
     camera: Camera
     box: Crop
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
+    gaussians: ActivatedGaussians
     rows: Tensor
     member_shN: Tensor
     background: Tensor
-    antialiased: bool = False
     cached: tuple[Tensor, Tensor] | None = None
     still: bool = False
 
@@ -66,8 +60,7 @@ class CropScene:
 
     def original(self) -> Tensor:
         """The box of the unedited view, not clamped. [h,w,3]"""
-        image, _ = self._draw(self.means, self.quats, self.scales, self.opacities, self.colors)
-        return image
+        return self._draw(self.gaussians).image
 
     def render(self, packed: Tensor, moving: Collection[str] = ATTRIBUTES) -> tuple[Tensor, Tensor]:
         """The box with these raw values in the region's rows, differentiable in them.
@@ -81,21 +74,20 @@ class CropScene:
         """
         members = unpack(packed, self.member_shN)
         colors = member_colors(members, self.camera.position)
-
-        def put(values: Tensor, into: Tensor) -> Tensor:
-            return into.index_copy(0, self.rows, values)
-
         if self.still and not colors.requires_grad:
             weighed, others, transmittance = self._linear
             image = others + weighed.picture(colors)
         else:
-            image, transmittance = self._draw(
-                put(members.means, self.means) if "means" in moving else self.means,
-                put(members.quats, self.quats) if "quats" in moving else self.quats,
-                put(members.scales, self.scales) if "log_scales" in moving else self.scales,
-                put(members.opacities, self.opacities) if "logit_opacities" in moving else self.opacities,
-                put(colors, self.colors),
-            )
+            new = {"colors": colors}
+            if "means" in moving:
+                new["means"] = members.means
+            if "quats" in moving:
+                new["quats"] = members.quats
+            if "log_scales" in moving:
+                new["scales"] = members.scales
+            if "logit_opacities" in moving:
+                new["opacities"] = members.opacities
+            image, transmittance, _ = self._draw(self.with_members(new))
         if self.cached is not None:
             live, original = self.cached
             image = torch.where(live, image, original)
@@ -104,45 +96,19 @@ class CropScene:
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
         """While nothing moves: what each member weighs in each pixel, what all others show, transmittance."""
-        camera = self.camera
-        weighed = color_map(
-            self.means,
-            self.quats,
-            self.scales,
-            self.opacities,
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            camera.near,
-            self.box,
-            self.rows,
-            self.antialiased,
-        )
-        image, transmittance = self._draw(self.means, self.quats, self.scales, self.opacities, self.colors)
-        return weighed, image - weighed.picture(self.colors[self.rows]), transmittance
+        weighed = color_map(self.gaussians, self.camera, self.box, self.rows)
+        image, transmittance, _ = self._draw(self.gaussians)
+        return weighed, image - weighed.picture(self.gaussians.colors[self.rows]), transmittance
 
-    def _draw(
-        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        camera = self.camera
-        image, transmittance, _ = rasterize(
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            background=self.background,
-            near=camera.near,
-            antialiased=self.antialiased,
-            crop=self.box,
-            grad_rows=self.rows,
+    def with_members(self, new: Mapping[str, Tensor]) -> ActivatedGaussians:
+        """The box's Gaussians with other activated values of the members, by name. [M,...] each"""
+        old = self.gaussians._asdict()
+        return self.gaussians._replace(
+            **{name: old[name].index_copy(0, self.rows, values) for name, values in new.items()}
         )
-        return image, transmittance
+
+    def _draw(self, gaussians: ActivatedGaussians) -> Rendering:
+        return render(gaussians, self.camera, self.background, crop=self.box, grad_rows=self.rows)
 
 
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
@@ -185,61 +151,37 @@ def crop_scene(
         still: nothing but colors will move, so only the tiles that show a member are drawn, see `tiles`, and
             without gradients a linear map of the members' colors; transmittance is right in these only
     """
-    colors = seen_colors(scene, camera)
-    _, _, seen = rasterize(
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        colors,
-        camera.viewmat,
-        camera.K,
-        camera.width,
-        camera.height,
-        background=background,
-        near=camera.near,
-        antialiased=scene.antialiased,
-        crop=box,
-    )
-    kept = seen.visible.clone()
+    activated = activate(scene, seen_colors(scene, camera))
+    kept = render(activated, camera, background, crop=box).info.visible.clone()
     kept[members] = True  # a member that is out of sight now may come into it
     index = kept.nonzero()[:, 0]
     whole = CropScene(
         camera,
         box,
-        scene.means[index],
-        scene.quats[index],
-        scene.scales[index],
-        scene.opacities[index],
-        colors[index],
+        activated.select(index),
         torch.searchsorted(index, members),
         scene.shN[members],
         background,
-        scene.antialiased,
     )
     return _keep_live_tiles(replace(whole, still=True)) if still else whole
 
 
 def _keep_live_tiles(view: CropScene) -> CropScene:
     """The view with all that no member contributes to taken from the original picture."""
-    member = torch.zeros_like(view.opacities)
+    whole = view.gaussians
+    member = torch.zeros_like(whole.opacities)
     member[view.rows] = 1.0
-    share, _ = replace(view, background=torch.zeros(3))._draw(
-        view.means, view.quats, view.scales, view.opacities, member[:, None].expand(-1, 3).contiguous()
-    )
+    white = whole._replace(colors=member[:, None].expand(-1, 3).contiguous())
+    share = replace(view, background=torch.zeros(3))._draw(white).image
     live = live_tiles((share > 0).any(dim=2), view.box)
     if bool(live_pixels(live, view.box).all()):
         return view
-    kept = may_reach(view.means, view.scales, view.camera, live)
+    kept = may_reach(whole.means, whole.scales, view.camera, live)
     kept[view.rows] = True
     index = kept.nonzero()[:, 0]
     return replace(
         view,
-        means=view.means[index],
-        quats=view.quats[index],
-        scales=view.scales[index],
-        opacities=view.opacities[index],
-        colors=view.colors[index],
+        gaussians=whole.select(index),
         rows=torch.searchsorted(index, view.rows),
         cached=(live_pixels(live, view.box)[..., None], view.original()),
     )

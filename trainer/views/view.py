@@ -11,7 +11,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
-from progdf.rasterize import Crop, rasterize
+from progdf.rasterize import Crop, render
 from progdf.region import Region
 from progdf.scene.bounds import near_plane, scene_sphere
 from progdf.scene.orbit_rig import orbit_rig
@@ -102,21 +102,7 @@ def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
 def render_colors(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
     """The scene in these colors instead of its own, without gradients. [N,3] -> [H,W,3]"""
     with torch.no_grad():
-        image: Tensor = rasterize(
-            scene.means,
-            scene.quats,
-            scene.scales,
-            scene.opacities,
-            colors,
-            camera.viewmat,
-            camera.K,
-            camera.width,
-            camera.height,
-            background=background,
-            near=camera.near,
-            antialiased=scene.antialiased,
-        )[0]
-    return image
+        return render(scene, camera, background, colors=colors).image
 
 
 def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:

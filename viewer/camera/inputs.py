@@ -1,4 +1,4 @@
-"""User input in the words of `controls`: which actions keys ask for, which drag has begun."""
+"""What the hand does, in the words of `controls`: which actions keys ask for, which drag has begun."""
 
 from __future__ import annotations
 

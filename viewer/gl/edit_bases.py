@@ -26,15 +26,6 @@ Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Mover:
-    """One attribute that an edit moves: what its factors are made from (see `compose_plan.factors`)."""
-
-    attribute: str
-    table: Floats
-    step: Floats
-
-
-@dataclass(frozen=True)
 class TargetBases:
     """What an edit does to one of `TARGETS`: where its bases begin, and what they move.
 
@@ -42,13 +33,13 @@ class TargetBases:
         full: texel of the full offsets in `floats`
         rest: texel of bases 1 to `rank` in `levels`; −1: they follow each full offset in `floats`
         rank: largest R of its attributes
-        movers: one attribute or, in `mean_logit`, up to two
+        attributes: one or, in `mean_logit`, up to two
     """
 
     full: int
     rest: int
     rank: int
-    movers: tuple[Mover, ...]
+    attributes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,6 @@ class PackedEdits:
         edits: by target, what each edit does to it
         covers: where each edit's texels of geometry, opacity and color begin in `floats`, see
             `progdf.compose.coverage`; one a member
-        nodes: strengths of each edit's coefficients. [S] each
         sh_coefficients: K of shN that are shown
     """
 
@@ -75,7 +65,6 @@ class PackedEdits:
     places: NDArray[np.int32]
     edits: tuple[Mapping[int, TargetBases], ...]
     covers: tuple[int, ...]
-    nodes: tuple[NDArray[np.float64], ...]
     sh_coefficients: int
 
     def width(self, target: int) -> int:
@@ -127,7 +116,6 @@ def pack_edits(scene: Gaussians, gdfs: Sequence[Gdf]) -> PackedEdits:
         places.reshape(-1),
         tuple(edits),
         tuple(covers),
-        tuple(gdf.field.knots.double().numpy() for gdf in gdfs),
         shown,
     )
 
@@ -158,7 +146,6 @@ def _target(
     rank = max(bases.residual_basis.shape[0] for bases in attributes.values())
     as_floats = any(bases.residual_basis.dtype != torch.int8 for bases in attributes.values())
     full = rest = np.zeros(0)
-    movers = []
     for name, bases in attributes.items():
         place = PLACES[name]
         own = _texels(bases.end_offset.numpy(), place, shown)
@@ -170,13 +157,10 @@ def _target(
         full[:, columns] = own
         for k in range(len(own_rest)):
             rest[:, k, columns] = _texels(own_rest[k].numpy(), place, shown)
-        width = shown if name == "shN" else 1
-        step = bases.scale[:, : width * place.components].numpy()
-        movers.append(Mover(name, bases.coefficients.numpy(), step))
     if as_floats:
         together = np.concatenate([full[:, None], rest], axis=1).reshape(-1, 4)
-        return TargetBases(floats.append(together), -1, rank, tuple(movers))
-    return TargetBases(floats.append(full), levels.append(rest.reshape(-1, 4)), rank, tuple(movers))
+        return TargetBases(floats.append(together), -1, rank, tuple(attributes))
+    return TargetBases(floats.append(full), levels.append(rest.reshape(-1, 4)), rank, tuple(attributes))
 
 
 def _originals(scene: Gaussians, texture: str, slots: NDArray[np.int64], shown: int) -> Floats:

@@ -12,17 +12,16 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from progdf.compose.layers import BLENDS, Layer
-from progdf.compose.plan import plan_rows
+from progdf.compose.plan import FlatWeights, plan_rows
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 
 from .edit_bases import pack_edits
 from .edit_spans import spans_of
-from .edit_stack import joined_weights, pack_stack
+from .edit_stack import pack_stack
 from .layout import PLACES, SPLAT_TEXTURES, SPLATS_PER_ROW, TARGETS
 from .programs import load_program
 from .scene_textures import SplatTextures
@@ -93,7 +92,7 @@ class EditPass:
         self._base = load_program(ctx, "edit.vert", "edit.frag")
         self._sh = load_program(ctx, "edit.vert", "edit_sh.frag")
         self._plans: dict[frozenset[int], _EditPlan] = {}
-        self._weights: list[tuple[Tensor, int]] = []  # those in `edit_weights`, and their versions
+        self._weights = FlatWeights()  # those in `edit_weights`
 
     def run(
         self, stack: Sequence[tuple[int, Layer]], blend: str, changed: frozenset[int]
@@ -168,15 +167,9 @@ class EditPass:
 
     def _send(self, stack: Sequence[tuple[int, Layer]]) -> None:
         """The stack's strengths, and its painted weights where they are others than those of before."""
-        weights, begins = joined_weights(stack)
-        given = [(l.weights, l.weights._version) for _, l in stack if l.weights is not None]
-        kept = self._weights
-        if len(given) != len(kept) or any(
-            a[0] is not b[0] or a[1] != b[1] for a, b in zip(given, kept, strict=True)
-        ):
-            self._lists["edit_weights"].write(weights)
-            self._weights = given
-        layers, numbers = pack_stack(self._packed, stack, begins)
+        if self._weights.update([layer for _, layer in stack]):
+            self._lists["edit_weights"].write(self._weights.flat)
+        layers, numbers = pack_stack(self._packed, stack, self._weights.begins)
         self._lists["edit_layers"].write(layers.view("<i4"))
         self._lists["edit_numbers"].write(numbers)
 

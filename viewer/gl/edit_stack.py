@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.compose.layers import Layer
-from progdf.compose.plan import factors
 
 from .edit_bases import Floats, PackedEdits, TargetBases
 from .layout import EDIT_LAYER, PLACES
@@ -45,31 +44,21 @@ def pack_stack(
         entry["numbers"] = put(np.array([[layer.clamped_strength, 0.0, 0.0, 0.0]], np.float32))
         entry["targets"]["numbers"] = -1
         for target, bases in packed.edits[edit].items():
-            if not any(layer.gain(mover.attribute) for mover in bases.movers):
+            if not any(layer.gain(name) for name in bases.attributes):
                 continue
-            numbers = put(_numbers(packed.nodes[edit], bases, packed.width(target), layer))
+            numbers = put(_numbers(bases, packed.width(target), layer))
             entry["targets"][target] = (bases.full, bases.rest, bases.rank, numbers)
     return layers, np.concatenate([np.zeros((0, 4), np.float32), *lines])
 
 
-def joined_weights(stack: Sequence[tuple[int, Layer]]) -> tuple[Floats, list[int]]:
-    """The painted weights of all layers in turn, and where each layer's begin; −1 for one without."""
-    parts, begins, length = [np.zeros(0, np.float32)], [], 0
-    for _, layer in stack:
-        begins.append(-1 if layer.weights is None else length)
-        if layer.weights is not None:
-            parts.append(layer.weights.detach().float().numpy())
-            length += len(layer.weights)
-    return np.concatenate(parts), begins
-
-
-def _numbers(nodes: NDArray[np.float64], bases: TargetBases, width: int, layer: Layer) -> Floats:
+def _numbers(bases: TargetBases, width: int, layer: Layer) -> Floats:
     """The gain, then the factors of every basis, `width` texels each. [1+(1+R)·width,4]"""
     lines = np.zeros((1 + (1 + bases.rank) * width, 4), np.float32)
-    for mover in bases.movers:
-        place = PLACES[mover.attribute]
+    for name in bases.attributes:
+        place = PLACES[name]
         columns = slice(place.component, place.component + place.components)
-        own = factors(nodes, mover.table, mover.step, layer.strength).reshape(-1, place.components)
-        lines[0, columns] = layer.gain(mover.attribute)
+        own = layer.gdf.field.factors(name, layer.strength)[:, : width * place.components].numpy()
+        own = own.reshape(-1, place.components)
+        lines[0, columns] = layer.gain(name)
         lines[1 : 1 + len(own), columns] = own
     return lines

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from progdf.camera import NEAR, Camera
+from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.rasterize import Crop, rasterize
+from progdf.rasterize import ActivatedGaussians, Crop, render
 from progdf.rasterize.pixel_cells import mark_cells, no_cells
 from progdf.sh import C0
 from viewer.camera.up_axis import Vec3
@@ -63,13 +63,12 @@ class CpuRenderer:
 
     Args:
         ctx: where pictures are shown; None where they are only read
-        near: depth at and below which nothing is drawn, world units
     """
 
     wants_order = False
 
-    def __init__(self, ctx: moderngl.Context | None = None, near: float = NEAR) -> None:
-        self._ctx, self._near = ctx, near
+    def __init__(self, ctx: moderngl.Context | None = None) -> None:
+        self._ctx = ctx
         self._presenter = None if ctx is None else Presenter(ctx)
         self._texture: moderngl.Texture | None = None
         self._stale: list[Crop] | None = None  # where the texture is behind the picture; None is everywhere
@@ -81,15 +80,19 @@ class CpuRenderer:
 
     def upload(self, scene: Gaussians) -> None:
         """Take a whole scene. The renderer's copies are what was drawn, when `scene` is written in place."""
-        self._means, self._quats = _copy(scene.means), _copy(scene.quats)
-        self._scales, self._opacities = _exp(scene.log_scales), _sigmoid(scene.logit_opacities)
+        self._drawn = ActivatedGaussians(
+            means=torch.from_numpy(_copy(scene.means)),
+            quats=torch.from_numpy(_copy(scene.quats)),
+            scales=torch.from_numpy(_exp(scene.log_scales)),
+            opacities=torch.from_numpy(_sigmoid(scene.logit_opacities)),
+            colors=scene.sh,
+            antialiased=scene.antialiased,
+        )
         self._scene, self._highlights = scene, None
-        self._sh = scene.sh
-        self._degree = min(scene.sh_degree, 3)
         self._kept = self._cells = self._last = None
         nobody = np.zeros(0, np.int64)  # compiled now, and not under the first touch of a slider
         camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
-        mark_cells(no_cells(1, 1), *self._shapes(), nobody, camera, self._near)
+        mark_cells(no_cells(1, 1), self._drawn, nobody, camera)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         self._scene, names = scene, tuple(attributes)
@@ -114,7 +117,7 @@ class CpuRenderer:
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `Renderer.highlight`."""
         if self._highlights is None:
-            self._highlights = np.zeros((len(self._means), 4), np.float32)
+            self._highlights = np.zeros((len(self._drawn.means), 4), np.float32)
         self._highlights[rows] = highlights.astype(np.float32) / 255.0
         self.update(self._scene, SH, rows)
         if not self._highlights[:, 3].any():
@@ -126,7 +129,7 @@ class CpuRenderer:
         crops = [(0, 0, camera.width, camera.height)]
         kept = self._kept if self._kept is not None and self._kept.shows(camera, background) else None
         if kept is not None and self._cells is not None:
-            worth = CALL_PIXELS + int(GAUSSIAN_PIXELS * len(self._means))
+            worth = CALL_PIXELS + int(GAUSSIAN_PIXELS * len(self._drawn.means))
             crops = dirty_rectangles(self._cells, (camera.width, camera.height), worth)
         share = area(crops) / whole
         if kept is None or share > WORTH_DRAWING_APART:
@@ -182,27 +185,9 @@ class CpuRenderer:
 
     def _draw(self, camera: Camera, background: Vec3, crop: Crop | None) -> Image:
         with torch.no_grad():
-            image, _, _ = rasterize(
-                torch.from_numpy(self._means),
-                torch.from_numpy(self._quats),
-                torch.from_numpy(self._scales),
-                torch.from_numpy(self._opacities),
-                self._sh,
-                camera.viewmat,
-                camera.K,
-                camera.width,
-                camera.height,
-                background,
-                self._near,
-                sh_degree=self._degree,
-                antialiased=self._scene.antialiased,
-                crop=crop,
-            )
+            image = render(self._drawn, camera, background, crop=crop).image
         pixels: Image = image.numpy()
         return pixels
-
-    def _shapes(self) -> tuple[Image, Image, Image, Image]:
-        return self._means, self._quats, self._scales, self._opacities
 
     def _where(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """The cells of the kept picture that `rows` touch as they are. While one slider is dragged, where
@@ -210,29 +195,30 @@ class CpuRenderer:
         camera = self._picture().camera
         if self._last is None or self._last[0] is not rows:
             cells = no_cells(camera.width, camera.height)
-            mark_cells(cells, *self._shapes(), rows, camera, self._near)
+            mark_cells(cells, self._drawn, rows, camera)
             self._last = rows, cells
         return self._last[1]
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
+        means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self._drawn.tensors)
         match name:
             case "means":
-                self._means[part] = scene.means[part].numpy()
+                means[part] = scene.means[part].numpy()
             case "quats":
-                self._quats[part] = scene.quats[part].numpy()
+                quats[part] = scene.quats[part].numpy()
             case "log_scales":
-                self._scales[part] = _exp(scene.log_scales[part])
+                scales[part] = _exp(scene.log_scales[part])
             case "logit_opacities":
-                self._opacities[part] = _sigmoid(scene.logit_opacities[part])
+                opacities[part] = _sigmoid(scene.logit_opacities[part])
             case "sh0":
-                self._sh.numpy()[part, 0] = scene.sh0[part].numpy()
+                sh[part, 0] = scene.sh0[part].numpy()
             case "shN":
-                self._sh.numpy()[part, 1:] = scene.shN[part].numpy()
+                sh[part, 1:] = scene.shN[part].numpy()
 
     def _apply_highlight(self, part: slice) -> None:
         """Mix the highlights into colors that were just written: all bands, as color is linear in them."""
         assert self._highlights is not None, "nothing to highlight with"
-        sh, share = self._sh.numpy()[part], self._highlights[part, 3:]
+        sh, share = self._drawn.colors.numpy()[part], self._highlights[part, 3:]
         sh *= 1.0 - share[:, :, None]
         sh[:, 0] += share * (self._highlights[part, :3] - 0.5) / C0
 

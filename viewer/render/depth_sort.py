@@ -9,16 +9,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.camera import NEAR, Camera
+from progdf.camera import Camera
 
 
-def back_to_front(means: NDArray[np.float32], camera: Camera, near: float = NEAR) -> NDArray[np.uint32]:
+def back_to_front(means: NDArray[np.float32], camera: Camera) -> NDArray[np.uint32]:
     """Rows in front of the near plane, farthest first; the exact reverse of (float32 depth, index) ascending.
 
     Args:
         means: centers, world units; a row that is not finite is left out. [N,3]
-        camera: only its `viewmat` counts
-        near: least depth, world units
+        camera: only its `viewmat` and `near` count
 
     Returns:
         [V] uint32, V ≤ N
@@ -27,7 +26,7 @@ def back_to_front(means: NDArray[np.float32], camera: Camera, near: float = NEAR
     # float64 as the CPU engine does: another rounding would swap neighbors
     with np.errstate(invalid="ignore", over="ignore"):
         depths = means.astype(np.float64) @ row[:3] + row[3]
-        seen = np.flatnonzero((depths > near) & (depths < np.inf))
+        seen = np.flatnonzero((depths > camera.near) & (depths < np.inf))
     # positive floats sort like their bits; below them the index makes every key unique
     bits = depths[seen].astype(np.float32).view(np.uint32)
     keys = bits.astype(np.uint64) << np.uint64(32) | seen.astype(np.uint64)

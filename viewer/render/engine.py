@@ -194,7 +194,7 @@ class ViewEngine:
     def _create(self, wants_pass: bool) -> tuple[Renderer, Editing]:
         """The renderer with the scene in it, and what edits it there."""
         if self.draws_with == "cpu" or self.ctx is None:
-            renderer: Renderer = CpuRenderer(self.ctx, self.near)
+            renderer: Renderer = CpuRenderer(self.ctx)
             return renderer, CpuEditing(renderer, self.scene, self.gdfs)
         if wants_pass:
             by_gl = GlRenderer(self.ctx, editable=True)
@@ -225,8 +225,9 @@ class ViewEngine:
         compose_ms, upload_ms, changed = self._compose(wanted.edits)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
+        camera = replace(camera, near=self.near)
         if self.renderer.wants_order and self._ordered_for != wanted.viewmat:
-            self.order = back_to_front(self.editing.means, camera, self.near)
+            self.order = back_to_front(self.editing.means, camera)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
         share = self.renderer.draw(camera, view.background, self.order)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import reference
 from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN
-from progdf.rasterize.engines import ActivatedGaussians, RasterView
+from progdf.rasterize.engines import RasterView, activate
 from viewer.camera.up_axis import Vec3
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import ViewState
@@ -130,13 +130,8 @@ def _alphas(
     """Which of some Gaussians the rasterizer draws at a position, nearest first, and their alphas there."""
     some = scene[torch.from_numpy(rows)]
     pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
-    activated = ActivatedGaussians(
-        some.means.double(), some.quats, some.scales, some.opacities, torch.zeros(len(rows), 3)
-    )
-    view = RasterView(
-        camera.viewmat, camera.K, camera.width, camera.height, pixel, near, None, scene.antialiased
-    )
-    splats, _ = reference.project(activated, view)
+    activated = activate(replace(some, means=some.means.double()), torch.zeros(len(rows), 3))
+    splats, _ = reference.project(activated, RasterView.of(replace(camera, near=near), activated, pixel))
     l11, l21, l22 = splats.whitening.unbind(1)
     dx, dy = (torch.tensor([x, y], dtype=torch.float64) - splats.means2d).unbind(1)
     alphas = splats.opacities * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))

@@ -75,7 +75,7 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
             moved[name] = old + gdf.field.attribute_offsets(name, strength)[::every].reshape(old.shape)
         edited = replace(region, **moved)
         with torch.no_grad():
-            return [render(edited, camera, (0.5, 0.5, 0.5)) for camera in cameras]
+            return [render(edited, camera, (0.5, 0.5, 0.5)).image for camera in cameras]
 
     original = pictures(0.0)
     changes = [visible_change(original, pictures(i / STEPS)) for i in range(count)]

@@ -22,7 +22,7 @@ from progdf.compose.layers import Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.rasterize import rasterize
+from progdf.rasterize import render
 
 from .view_state import Brush
 
@@ -206,19 +206,8 @@ def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -
     width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
     small = camera.resize(width, height)
     with torch.no_grad():
-        image, clear, _ = rasterize(
-            scene.means,
-            scene.quats,
-            scene.scales,
-            scene.opacities,
-            torch.from_numpy(depths).float()[:, None].expand(-1, 3).contiguous().nan_to_num(),
-            small.viewmat,
-            small.K,
-            width,
-            height,
-            (0.0, 0.0, 0.0),
-            antialiased=scene.antialiased,
-        )
+        as_colors = torch.from_numpy(depths).float()[:, None].expand(-1, 3).contiguous().nan_to_num()
+        image, clear, _ = render(scene, small, (0.0, 0.0, 0.0), colors=as_colors)
     covered = 1.0 - clear.reshape(height, width).numpy()
     depth = np.where(covered > 0.05, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
     column = np.clip(places[:, 0] / camera.width * width, 0, width - 1).astype(int)

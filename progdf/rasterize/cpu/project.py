@@ -58,7 +58,7 @@ class Pinhole(NamedTuple):
         window: x0, y0, x1, y1 of what is drawn, pixels
         grid: first tile column and row of the window, and how many there are
         degree: of spherical harmonics, -1 for rgb
-        antialiased: see `progdf.rasterize.rasterize`
+        antialiased: see `progdf.rasterize.render`
     """
 
     rows: tuple[Vec, Vec, Vec]

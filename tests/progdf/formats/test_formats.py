@@ -102,7 +102,7 @@ def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> N
     scene = scene_of(degree)
     found = load_scene(writer(tmp_path / file, scene))
     camera = orbit_camera(60, 40)
-    error = (render(found, camera) - render(scene, camera)).square().mean()
+    error = (render(found, camera).image - render(scene, camera).image).square().mean()
     assert -10 * float(error.log10()) > 32.0
 
 

@@ -37,7 +37,7 @@ def shuffled(scene: Gaussians, seed: int = 3) -> tuple[Gaussians, torch.Tensor]:
 
 def psnr(a: Gaussians, b: Gaussians, stack: Stack) -> float:
     camera = to_camera(first_camera(stack.scene, stack.demo.cameras), 96, 72)
-    return -10 * float((render(a, camera) - render(b, camera)).square().mean().log10())
+    return -10 * float((render(a, camera).image - render(b, camera).image).square().mean().log10())
 
 
 def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.rasterize import ENGINES, rasterize
-from tests.helpers.drawn import CASES, INPUTS, draw, drawn_case, relative_errors
+from progdf.rasterize import ENGINES, ActivatedGaussians, activate, render
+from tests.helpers.drawn import CASES, INPUTS, draw, drawn_case, relative_errors, render_leaves
 from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -81,8 +81,8 @@ def test_the_reference_has_the_gradients_of_finite_differences() -> None:
     weights = torch.randn(5, 7, 4, generator=rng).double()
 
     def loss(changed: dict[str, Tensor]) -> Tensor:
-        for_one = rasterize(**changed, width=7, height=5, sh_degree=1, antialiased=True, engine="reference")
-        return (torch.cat([for_one[0], for_one[1][..., None]], dim=-1) * weights).sum()
+        drawn = render_leaves(changed, front_camera(7, 5), antialiased=True, engine="reference")
+        return (torch.cat([drawn.image, drawn.transmittance[..., None]], dim=-1) * weights).sum()
 
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
     loss(leaves).backward()
@@ -111,13 +111,10 @@ def test_gradients_of_a_crop_match_the_references() -> None:
 def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine: str) -> None:
     scene, camera = random_gaussians(200, seed=12, sh_degree=1), orbit_camera(90, 61)
     rows = torch.arange(3, 200, 7)
-    inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
     found = []
     for wanted in (None, rows):
-        leaves = [tensor.double().requires_grad_() for tensor in inputs]
-        image, _, _ = rasterize(
-            *leaves, camera.viewmat, camera.K, 90, 61, sh_degree=1, engine=engine, grad_rows=wanted
-        )
+        leaves = [tensor.double().requires_grad_() for tensor in activate(scene).tensors]
+        image = render(ActivatedGaussians(*leaves), camera, grad_rows=wanted, engine=engine).image
         (image[20:] ** 2).sum().backward()
         found.append([leaf.grad for leaf in leaves])
     others = torch.ones(200, dtype=torch.bool).index_fill(0, rows, False)
@@ -130,10 +127,7 @@ def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine:
 def test_double_precision_inputs_get_double_precision_gradients() -> None:
     scene, camera = one_gaussian().to(dtype=torch.float64), front_camera()
     means = scene.means.requires_grad_()
-    image, _, _ = rasterize(
-        means, scene.quats, scene.scales, scene.opacities, torch.ones(1, 3).double(),
-        camera.viewmat, camera.K, 40, 24,
-    )  # fmt: skip
+    image = render(scene, camera, (0.0, 0.0, 0.0)).image
     (image[:, :15] ** 2).sum().backward()
     assert image.dtype == torch.float32
     assert means.grad is not None

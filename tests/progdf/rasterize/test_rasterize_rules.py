@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from progdf.rasterize import ENGINES, alpha_weights, rasterize, render
+from progdf.rasterize import ENGINES, ActivatedGaussians, activate, alpha_weights, render
 from tests.helpers.drawn import CASES, draw, drawn_case
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 
@@ -32,13 +32,9 @@ def test_a_crop_is_the_slice_of_the_whole_picture_bit_for_bit(
 
 def test_the_order_of_the_list_does_not_matter_where_depths_differ() -> None:
     scene, camera = random_gaussians(300, seed=8), orbit_camera(50, 40)
-    activated = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh0.sigmoid())
+    activated = activate(scene, scene.sh0.sigmoid())
     shuffle = torch.randperm(300, generator=torch.Generator().manual_seed(1))
-    pictures = [
-        rasterize(*tensors, camera.viewmat, camera.K, 50, 40)[0]
-        for tensors in (activated, [tensor[shuffle] for tensor in activated])
-    ]
-    assert torch.equal(*pictures)
+    assert torch.equal(render(activated, camera).image, render(activated.select(shuffle), camera).image)
 
 
 def test_equal_depths_are_drawn_in_the_order_of_the_list() -> None:
@@ -48,17 +44,18 @@ def test_equal_depths_are_drawn_in_the_order_of_the_list() -> None:
     )
     camera = front_camera()
     center = (camera.height // 2, camera.width // 2)
-    assert float(render(concatenate(red, green), camera)[center][0]) > 0.9
-    assert float(render(concatenate(green, red), camera)[center][1]) > 0.9
+    assert float(render(concatenate(red, green), camera).image[center][0]) > 0.9
+    assert float(render(concatenate(green, red), camera).image[center][1]) > 0.9
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> None:
     camera = front_camera(60, 40)
-    image, transmittance, _ = rasterize(
+    one = ActivatedGaussians(
         torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.3),
-        torch.tensor([0.7]), torch.ones(1, 3), camera.viewmat, camera.K, 60, 40, engine=engine,
+        torch.tensor([0.7]), torch.ones(1, 3),
     )  # fmt: skip
+    image, transmittance, _ = render(one, camera, (0.0, 0.0, 0.0), engine=engine)
     x, y = torch.meshgrid(torch.arange(60) + 0.5 - 30, torch.arange(40) + 0.5 - 20, indexing="xy")
     variance = (0.3 * 30.0 / 2.0) ** 2 + 0.3
     alpha = 0.7 * torch.exp(-0.5 * (x.double() ** 2 + y.double() ** 2) / variance)
@@ -75,10 +72,8 @@ def test_no_pixel_falls_below_the_least_transmittance(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_no_gaussians_leave_the_background(engine: str) -> None:
-    image, transmittance, _ = rasterize(
-        *(torch.zeros(shape) for shape in ((0, 3), (0, 4), (0, 3), (0,), (0, 3))),
-        torch.eye(4), front_camera().K, 40, 24, background=(0.25, 0.5, 0.75), engine=engine,
-    )  # fmt: skip
+    nothing = random_gaussians(5)[:0]
+    image, transmittance, _ = render(nothing, front_camera(), (0.25, 0.5, 0.75), engine=engine)
     assert torch.equal(image, torch.tensor([0.25, 0.5, 0.75]).expand(24, 40, 3))
     assert bool((transmittance == 1.0).all())
 
@@ -89,10 +84,7 @@ def test_mask_weights_match_the_reference_and_the_picture() -> None:
     found = alpha_weights(scene, camera, mask)
     expected = alpha_weights(scene.to(dtype=torch.float64), camera, mask, engine="reference")
     torch.testing.assert_close(found.double(), expected, rtol=2e-5, atol=2e-5)
-    _, transmittance, _ = rasterize(
-        scene.means, scene.quats, scene.scales, scene.opacities, torch.zeros(200, 3),
-        camera.viewmat, camera.K, 90, 61,
-    )  # fmt: skip
+    transmittance = render(scene, camera).transmittance
     assert float(found[:, 2].sum()) == pytest.approx(float((1 - transmittance).sum()), rel=1e-5)
     inside = float(((1 - transmittance) * mask).sum())
     assert float(found[:, 0].sum()) == pytest.approx(inside, rel=1e-5)

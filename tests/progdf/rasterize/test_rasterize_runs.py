@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 from progdf.errors import ProgdfError
-from progdf.rasterize import alpha_weights, rasterize, render, set_threads
+from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render, set_threads
 from tests.helpers.drawn import INPUTS, Drawn, draw
 from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
@@ -58,11 +59,9 @@ def test_two_python_threads_may_draw_at_once() -> None:
 
 def test_camera_gradients_of_some_rows_only_are_refused() -> None:
     scene, camera = one_gaussian(), front_camera()
+    free = replace(camera, viewmat=camera.viewmat.clone().requires_grad_())
     with pytest.raises(ValueError, match="viewmat or K wants gradients, which need all rows"):
-        rasterize(
-            scene.means, scene.quats, scene.scales, scene.opacities, torch.ones(1, 3),
-            camera.viewmat.clone().requires_grad_(), camera.K, 40, 24, grad_rows=torch.tensor([0]),
-        )  # fmt: skip
+        render(scene, free, grad_rows=torch.tensor([0]))
 
 
 def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,10 +83,7 @@ def test_wrong_shapes_and_windows_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"mask has shape \[3, 3\], expected \[24, 40\]"):
         alpha_weights(scene, camera, torch.ones(3, 3))
     with pytest.raises(ValueError, match=r"quats has shape \[1, 3\], expected \[1, 4\]"):
-        rasterize(
-            scene.means, scene.quats[:, :3], scene.scales, scene.opacities, torch.ones(1, 3),
-            camera.viewmat, camera.K, 40, 24,
-        )  # fmt: skip
+        render(activate(scene)._replace(quats=scene.quats[:, :3]), camera)
 
 
 @pytest.mark.parametrize("shown", [0, 5, 400])
@@ -98,12 +94,11 @@ def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
     scene.means[:, 2] -= 50.0
     rows = torch.randperm(900, generator=torch.Generator().manual_seed(1))[:shown]
     scene.means[rows, 2] += 54.0
-    inputs = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    leaves = [tensor.clone().requires_grad_() for tensor in activate(scene).tensors]
     camera = front_camera()
     draw(scene, camera, "cpu")  # so that the kernels are compiled
     monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, 77, dtype))
-    image, _, info = rasterize(*leaves, camera.viewmat, camera.K, 40, 24, sh_degree=1)
+    image, _, info = render(ActivatedGaussians(*leaves), camera)
     image.square().sum().backward()  # type: ignore[no-untyped-call]
     assert int(info.visible.sum()) <= shown
     for leaf in leaves:
@@ -115,9 +110,7 @@ def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
 def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
     one, camera = one_gaussian(), front_camera()
     means = one.means.clone().requires_grad_()
-    image, _, _ = rasterize(
-        means, one.quats, one.scales, one.opacities, one.sh, camera.viewmat, camera.K, 40, 24, sh_degree=0
-    )
+    image = render(replace(one, means=means), camera).image
     with torch.no_grad():
         means += 1.0
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):

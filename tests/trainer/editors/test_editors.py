@@ -75,7 +75,7 @@ def test_mask_and_inside_rebuild_the_view_with_the_region_taken_out() -> None:
     hidden = replace(case.scene, sh0=case.scene.sh0.clone(), shN=case.scene.shN.clone())
     hidden.sh0[case.region.members] = -0.5 / 0.28209479177387814  # the region in black
     hidden.shN[case.region.members] = 0.0
-    assert torch.allclose(rest, render(hidden, view.camera).clamp(0, 1), atol=2e-3)
+    assert torch.allclose(rest, render(hidden, view.camera).image.clamp(0, 1), atol=2e-3)
 
 
 def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> None:
@@ -88,7 +88,7 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     painted = editor.paint(sh0_to_rgb(matt.sh0[rows]).clamp_min(0), 1.0)
     scene = replace(matt, sh0=matt.sh0.index_copy(0, rows, rgb_to_sh0(painted)))
     for view in views:
-        expected = render(scene, view.camera).clamp(0, 1)
+        expected = render(scene, view.camera).image.clamp(0, 1)
         difference = (editor.edit(view, 1.0) - expected).abs().amax(dim=2)
         # a pixel's colors are cut at 1 before they are edited, the members' are not
         assert float(difference.max()) < 0.05

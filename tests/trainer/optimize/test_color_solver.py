@@ -10,7 +10,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, pack
-from progdf.rasterize import rasterize
+from progdf.rasterize import activate, render
 from progdf.rasterize.color_maps import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
@@ -81,16 +81,14 @@ def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
     scene = random_gaussians(400, seed=2)
     scene = replace(scene, means=0.4 * scene.means / scene.means.norm(dim=1).max())
     camera, window = orbit(3, 80)[1], (7, 3, 77, 61)
-    shape = (scene.means, scene.quats, scene.scales, scene.opacities)
     rows = torch.arange(0, 400, 3)
     colors = torch.zeros(400, 3)
     colors[rows] = torch.rand(len(rows), 3, generator=torch.Generator().manual_seed(5))
     colors.requires_grad_()
-    view = (camera.viewmat, camera.K, camera.width, camera.height)
-    image, _, _ = rasterize(*shape, colors, *view, near=camera.near, crop=window)
+    image = render(scene, camera, (0.0, 0.0, 0.0), colors=colors, crop=window).image
     pull = torch.randn(image.shape, generator=torch.Generator().manual_seed(6))
     (image * pull).sum().backward()  # type: ignore[no-untyped-call]
-    weighed = color_map(*shape, *view, camera.near, window, rows)
+    weighed = color_map(activate(scene), camera, window, rows)
     assert float(image.detach().amax()) > 0.1
     # float32 sums in another order
     torch.testing.assert_close(weighed.picture(colors.detach()[rows]), image.detach(), atol=2e-5, rtol=0)

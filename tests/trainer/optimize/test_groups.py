@@ -121,9 +121,9 @@ def test_a_moved_part_looks_as_it_did_from_a_camera_that_moved_along() -> None:
         center + motion.shift[0]
     )
     with torch.no_grad():
-        before = render(part, camera)
-        assert float((render(after, replace(camera, viewmat=along)) - before).abs().max()) < 0.02
-        assert float((render(after, camera) - before).abs().max()) > 0.2
+        before = render(part, camera).image
+        assert float((render(after, replace(camera, viewmat=along)).image - before).abs().max()) < 0.02
+        assert float((render(after, camera).image - before).abs().max()) > 0.2
 
 
 def test_half_way_a_part_has_half_the_shift_half_the_turn_and_half_the_growth_in_logs() -> None:
@@ -145,7 +145,7 @@ def pictured(case: Small, edit: AnalyticEdit) -> tuple[Tensor, list[CropScene], 
     """Members' rows, the views with boxes that hold the edit, and the edited boxes."""
     edited = edit.apply(case.scene, case.region.members, 1.0)
     with torch.no_grad():
-        whole = [render(edited, view.camera, WHITE).clamp(0, 1) for view in case.views]
+        whole = [render(edited, view.camera, WHITE).image.clamp(0, 1) for view in case.views]
     views = [view.widen([picture]) for view, picture in zip(case.views, whole, strict=True)]
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in views]
     rows = pack(case.scene[case.region.members], with_shN=case.scene.sh_degree > 0)

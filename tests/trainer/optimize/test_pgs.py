@@ -31,7 +31,7 @@ def test_the_members_arrive_at_the_edited_views() -> None:
     for view in case.views:
         target, inside = editor.edit(view, 1.0), view.mask > 0.5
         before = masked_psnr(view.image, target, inside)
-        after = masked_psnr(render(edited, view.camera).clamp(0, 1), target, inside)
+        after = masked_psnr(render(edited, view.camera).image.clamp(0, 1), target, inside)
         assert after > 28.0
         assert after > before + 12.0
 
@@ -89,7 +89,7 @@ def test_a_crop_equals_the_composed_scene_rendered_whole() -> None:
     rows = rows + 0.05 * torch.randn(rows.shape, generator=random)
     prepared = crop_scene(case.scene, case.region.members, view.camera, view.box, WHITE)
     image, _ = prepared.render(rows)
-    whole = render(case.scene.replace_rows(case.region.members, rows), view.camera).clamp(0, 1)
+    whole = render(case.scene.replace_rows(case.region.members, rows), view.camera).image.clamp(0, 1)
     assert torch.allclose(image, crop(whole, view.box), atol=1e-5)
     assert torch.allclose(prepared.original().clamp(0, 1), crop(view.image, view.box), atol=1e-6)
 

@@ -35,7 +35,7 @@ def setup(case: Small) -> TrainingSetup:
 def pictured(case: Small, edit: AnalyticEdit) -> list[Tensor]:
     edited = edit.apply(case.scene, case.region.members, 1.0)
     with torch.no_grad():
-        return [render(edited, view.camera, WHITE).clamp(0, 1) for view in case.views]
+        return [render(edited, view.camera, WHITE).image.clamp(0, 1) for view in case.views]
 
 
 def waves(part: Gaussians, strength: float) -> Gaussians:

@@ -95,7 +95,7 @@ def test_colors_that_the_members_can_have_are_found() -> None:
     changed = case.scene.sh0.clone()
     changed[case.region.members] += 0.3 * torch.randn(len(case.region.members), 3, generator=rng)
     scene = case.scene.__class__(**{**case.scene.__dict__, "sh0": changed})
-    pictures = [render(scene, view.camera, WHITE).clamp(0, 1) for view in case.views]
+    pictures = [render(scene, view.camera, WHITE).image.clamp(0, 1) for view in case.views]
     found = judged(pictures)
     assert found.unexplained < 0.35, "noise in every Gaussian is the hardest that one scene can show"
     assert found.agree

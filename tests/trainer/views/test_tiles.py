@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians, pack
-from progdf.rasterize import rasterize
+from progdf.rasterize import ActivatedGaussians, render
 from progdf.rasterize.cpu.bin import TILE_H, TILE_W
 from tests.helpers.scenes import front_camera, hard_cases, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, small
@@ -50,7 +50,7 @@ def test_picture_and_gradients_are_the_bits_of_the_whole_box(part: str) -> None:
         assert torch.equal(image, expected)
         assert torch.equal(gradient, expected_gradient)
         assert float(expected_gradient[:, 11:].abs().max()) > 0
-        saved += len(whole.means) - len(tiles.means)
+        saved += len(whole.gaussians.means) - len(tiles.gaussians.means)
     assert saved > 0, "nothing was left out"
 
 
@@ -101,9 +101,8 @@ def test_needles_beyond_the_edge_of_an_off_center_picture_are_not_left_out() -> 
     half = torch.nn.functional.normalize(axis + torch.tensor([1.0, 0.0, 0.0]), dim=1)
     quats = torch.cat([torch.zeros(400, 1), half], dim=1)  # a half turn that takes x to the axis
     scales = torch.tensor([[1.0, 1e-3, 1e-3]]) * (0.05 + torch.rand(400, 1, generator=rng))
-    _, _, found = rasterize(
-        means, quats, scales, torch.full((400,), 0.99), torch.zeros(400, 3), camera.viewmat, K, 160, 80,
-    )  # fmt: skip
+    needles = ActivatedGaussians(means, quats, scales, torch.full((400,), 0.99), torch.zeros(400, 3))
+    found = render(needles, camera).info
     every = torch.ones(80 // TILE_H, 160 // TILE_W, dtype=torch.bool)
     assert 20 < int(found.visible.sum()) < 380
     assert not bool((found.visible & ~may_reach(means, scales, camera, every)).any())
@@ -125,11 +124,7 @@ def test_no_gaussian_that_reaches_a_tile_is_left_out(name: str) -> None:
                 min(camera.width, (column + 1) * TILE_W),
                 min(camera.height, (row + 1) * TILE_H),
             )
-            _, _, found = rasterize(
-                scene.means, scene.quats, scene.scales, scene.opacities, torch.zeros(len(scene), 3),
-                camera.viewmat, camera.K, camera.width, camera.height,
-                antialiased=scene.antialiased, crop=window,
-            )  # fmt: skip
+            found = render(scene, camera, colors=torch.zeros(len(scene), 3), crop=window).info
             live = torch.zeros(-(-camera.height // TILE_H), -(-camera.width // TILE_W), dtype=torch.bool)
             live[row, column] = True
             assert not bool((found.visible & ~may_reach(scene.means, scene.scales, camera, live)).any())

@@ -162,7 +162,7 @@ def test_a_view_shows_the_scene_and_of_the_region_its_own_color() -> None:
     region = from_mask("front", torch.tensor([False, True]))
     camera, background = front_camera(96, 80, focal=90.0), torch.tensor([0.2, 0.9, 0.4])
     view = make_view(scene, region, camera, background)
-    torch.testing.assert_close(view.image, render(scene, camera, background).clamp(0, 1))
+    torch.testing.assert_close(view.image, render(scene, camera, background).image.clamp(0, 1))
     alone = view.mask > 0.05
     assert int(alone.sum()) > 100
     own = seen_colors(scene, camera)[1].clamp(0, 1)

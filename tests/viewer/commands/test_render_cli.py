@@ -55,7 +55,7 @@ def pixels(path: Path | str) -> np.ndarray:
 
 def edited_by(stack: Stack, camera: Camera, scarf: float, ears: float) -> np.ndarray:
     layers = [Layer(stack.gdfs[0], scarf), Layer(stack.gdfs[1], ears)]
-    return film.to_pixels(render(compose_layers(stack.scene, layers), camera).numpy())
+    return film.to_pixels(render(compose_layers(stack.scene, layers), camera).image.numpy())
 
 
 def test_a_camera_file_and_strengths_give_the_composed_picture(run: Run, stack: Stack) -> None:

@@ -17,7 +17,7 @@ from progdf.camera import Camera
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.rasterize import render
+from progdf.rasterize import activate, render
 from progdf.rasterize.pixel_cells import CELL, mark_cells, no_cells
 from progdf.region import Region
 from tests.helpers.stacks import Stack, bear_stack
@@ -175,13 +175,13 @@ def test_marked_cells_hold_every_pixel_that_a_gaussian_changes(stack: Stack) -> 
         logit_opacities=torch.empty(count).uniform_(-6.0, 6.0, generator=rng),
         sh0=torch.full((count, 3), -1.0),
     )
-    arrays = [t.numpy() for t in (scene.means, scene.quats, scene.scales, scene.opacities)]
+    activated = activate(scene)
     seen = 0
     for i in range(count):
         cells = no_cells(*SIZE)
-        mark_cells(cells, *arrays, np.array([i]), camera)
+        mark_cells(cells, activated, np.array([i]), camera)
         pixels = np.kron(cells, np.ones((CELL, CELL), bool))[: SIZE[1], : SIZE[0]]
-        changed = (render(scene[i : i + 1], camera).numpy() != 1.0).any(axis=2)
+        changed = (render(scene[i : i + 1], camera).image.numpy() != 1.0).any(axis=2)
         assert not (changed & ~pixels).any(), i
         seen += bool(changed.any())
     assert seen > count // 3

@@ -68,7 +68,7 @@ def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stac
 def test_the_picture_is_the_composed_scene_drawn(engine: ViewEngine, stack: Stack) -> None:
     view = view_of(stack, 0.7, 0.4)
     layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
-    expected = render(compose_layers(stack.scene, layers), to_camera(view.camera, *SIZE)).numpy()
+    expected = render(compose_layers(stack.scene, layers), to_camera(view.camera, *SIZE)).image.numpy()
     image = engine.image(view, SIZE)
     assert image.shape == (72, 96, 3)
     assert image.dtype == np.float32

@@ -79,7 +79,7 @@ def psnr(image: Image, target: Image) -> float:
 def test_hard_cases_look_the_same(draw: Draw, name: str) -> None:
     case = CASES[name]
     image = draw(case.gaussians, case.camera)
-    expected = render(case.gaussians, case.camera, WHITE, engine="reference").numpy()
+    expected = render(case.gaussians, case.camera, WHITE, engine="reference").image.numpy()
     # float32 against float64: 120 dB and more is usual, 0.5/255 of one pixel where a rim is at stake
     assert psnr(image, expected) >= 100.0
     assert float(np.abs(image - expected).max(initial=0.0)) <= 1.0 / 255.0
@@ -102,7 +102,7 @@ def test_opengl_draws_the_depth_of_hard_cases_like_the_reference(renderer: Splat
 def test_a_dense_scene_agrees_to_120_db_but_for_the_early_stop(draw: Draw) -> None:
     scene = bear(6000).gaussians
     camera = orbit_rig(scene, 1, 200, 150)[0]
-    assert psnr(draw(scene, camera), render(scene, camera, WHITE, engine="reference").numpy()) >= 115.0
+    assert psnr(draw(scene, camera), render(scene, camera, WHITE, engine="reference").image.numpy()) >= 115.0
 
 
 def test_the_bear_looks_the_same_as_on_the_cpu(draw: Draw) -> None:
@@ -110,13 +110,13 @@ def test_the_bear_looks_the_same_as_on_the_cpu(draw: Draw) -> None:
     for camera in demo.cameras[::16]:
         small = camera.resize(320, 320)
         # the early stop at 1e-4 leaves at most 0.01 of a color in a pixel: 76 dB and more
-        assert psnr(draw(demo.gaussians, small), render(demo.gaussians, small, WHITE).numpy()) >= 70.0
+        assert psnr(draw(demo.gaussians, small), render(demo.gaussians, small, WHITE).image.numpy()) >= 70.0
 
 
 def test_a_real_scene_looks_the_same_as_on_the_cpu(draw: Draw, shared_data: Path) -> None:
     scene = load_ply(shared_data / "playbot_31k.ply")
     for camera in orbit_rig(scene, 2, 400, 300):
-        image, expected = draw(scene, camera), render(scene, camera, WHITE).numpy()
+        image, expected = draw(scene, camera), render(scene, camera, WHITE).image.numpy()
         assert psnr(image, expected) >= 70.0
         assert float(np.abs(image - expected).max()) <= 0.0101, "more than the early stop explains"
 
@@ -126,9 +126,9 @@ def test_what_the_early_stop_leaves_out_is_all_that_differs(
 ) -> None:
     case = CASES["400 opaque ones stacked"]
     image = draw(case.gaussians, case.camera)
-    stopped = render(case.gaussians, case.camera, WHITE, engine="reference").numpy()
+    stopped = render(case.gaussians, case.camera, WHITE, engine="reference").image.numpy()
     monkeypatch.setattr(importlib.import_module("progdf.rasterize.reference"), "TRANSMITTANCE_MIN", 0.0)
-    through = render(case.gaussians, case.camera, WHITE, engine="reference").numpy()
+    through = render(case.gaussians, case.camera, WHITE, engine="reference").image.numpy()
     assert psnr(image, through) > psnr(image, stopped) + 20.0
 
 
@@ -139,7 +139,7 @@ def test_a_needle_of_thousands_of_pixels_keeps_its_width(draw: Draw, length: flo
     camera = front_camera(120, 90, focal=2000.0)
     quat = (0.9238795, 0.1, 0.05, 0.3826834)
     scene = one_gaussian(scales=(length, width, width), quat=quat, mean=(0.005, 0.002, 2.0))
-    expected = render(scene, camera, WHITE, engine="reference").numpy()
+    expected = render(scene, camera, WHITE, engine="reference").image.numpy()
     assert (expected < 0.9).any(), "in the picture"
     assert psnr(draw(scene, camera), expected) >= 120.0
 
@@ -149,7 +149,7 @@ def test_a_needle_of_thousands_of_pixels_keeps_its_width(draw: Draw, length: flo
 def test_every_band_of_spherical_harmonics_is_shown(draw: Draw, degree: int) -> None:
     scene, camera = random_gaussians(300, seed=degree, sh_degree=degree), orbit_camera(80, 60)
     scene = replace(scene, shN=3.0 * scene.shN)
-    expected = render(scene, camera, WHITE, engine="reference").numpy()
+    expected = render(scene, camera, WHITE, engine="reference").image.numpy()
     assert psnr(draw(scene, camera), expected) >= 110.0
 
 

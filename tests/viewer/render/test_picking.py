@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from progdf.gaussians import Gaussians
-from progdf.rasterize import rasterize
+from progdf.rasterize import render
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
 from tests.helpers.ui_rig import bear
 from viewer.camera.view_camera import first_camera, to_camera
@@ -86,18 +86,7 @@ def test_something_is_picked_exactly_where_the_rasterizer_draws_something(
     camera, scene = orbit_camera(), random_gaussians(60, seed)
     x, y = int(x) + 0.5, int(y) + 0.5
     picked = surface_point(scene, camera, x, y)
-    _, transmittance, _ = rasterize(
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        torch.zeros(60, 3),
-        camera.viewmat,
-        camera.K,
-        41,
-        25,
-        engine="reference",
-    )
+    transmittance = render(scene, camera, engine="reference").transmittance
     covered = 1.0 - float(transmittance[int(y), int(x)])
     if abs(covered - 0.05) > 0.01:
         assert (picked is not None) == (covered > 0.05)

@@ -1,0 +1,47 @@
+"""Piecewise linear interpolation between knots: the one place that finds a segment and where in it one is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Segment(NamedTuple):
+    """A place between two knots.
+
+    Args:
+        right: index of the right one, 1..S−1; the left one is that before it
+        share: of the way from the left one, 1 exactly at the right one; beyond 0..1 outside all knots
+    """
+
+    right: int
+    share: float
+
+
+def find_segment(knots: Tensor, x: float) -> Segment:
+    """The segment that holds `x`, at a knot the one left of it; the outer ones go on for ever.
+
+    Args:
+        knots: ascending, at least 2. [S]
+        x: in their unit; which segment it is is told in their precision
+    """
+    right = int(torch.searchsorted(knots, torch.tensor(x, dtype=knots.dtype)))
+    right = min(max(right, 1), len(knots) - 1)
+    low, high = knots[right - 1 : right + 1].tolist()
+    return Segment(right, (x - low) / (high - low))
+
+
+def interpolate_at(knots: Tensor, values: Sequence[Tensor] | Tensor, x: float) -> Tensor:
+    """Linear between the values at knots [S], the outermost ones beyond them. S × [...] -> [...]"""
+    right, share = find_segment(knots, x)
+    return torch.lerp(values[right - 1], values[right], min(max(share, 0.0), 1.0))
+
+
+def interpolate(x: Tensor, knots: Tensor, values: Tensor) -> Tensor:
+    """`interpolate_at` for many places and one number a knot. [n], [S], [S] -> [n]"""
+    right = torch.searchsorted(knots, x).clamp(1, len(knots) - 1)
+    share = (x - knots[right - 1]) / (knots[right] - knots[right - 1])
+    return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
