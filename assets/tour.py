@@ -135,7 +135,7 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
 def first_state(gdfs: tuple[Gdf, ...], strengths: tuple[float, ...] = (0.8, 0.6, 0.5, 0.4)) -> ViewState:
     """Every edit part of the way; never coarse."""
     stack = tuple(LayerState(i, gdf.name, strengths[i % 4]) for i, gdf in enumerate(gdfs))
-    return ViewState(layers=stack, background=(0.75, 0.82, 0.88), draft="off")
+    return ViewState(layers=stack, background=(0.75, 0.82, 0.88), dynamic_resolution="off")
 
 
 def main() -> None:

@@ -39,7 +39,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 def _usage() -> str:
-    lines = ["usage: progdf COMMAND …   (progdf COMMAND --help tells its options)", ""]
+    lines = ["usage: progdf COMMAND …   (progdf COMMAND --help lists its options)", ""]
     lines += [f"  {name:<8}{what}" for name, (_, what) in COMMANDS.items()]
     return "\n".join(lines)
 
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> int:
-    """Run a command line with what goes wrong told in one line.
+    """Run a command line; report an error in one line.
 
     Returns:
         0 done; 2 the user can mend it; 70 it is a mistake of ours, kept in a file; 130 interrupted.
@@ -62,7 +62,7 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
         with _raise_on_signals(list(arguments[:1]) != ["view"]):
             status = run(arguments)
             if sys.stdout is not None:
-                sys.stdout.flush()  # here, where a full disk or a closed pipe can still be told
+                sys.stdout.flush()  # here, where a full disk or a closed pipe can still be reported
             return status
     except ProgdfError as error:
         return _report_failure(str(error))
@@ -78,8 +78,8 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
     except Exception as error:
         if _is_out_of_memory(error):
             return _report_failure("out of memory; close other programs or use a smaller scene")
-        told = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        return _report_failure(f"internal error in progdf ({told[:200]}); {_save_traceback()}", 70)
+        message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        return _report_failure(f"internal error in progdf ({message[:200]}); {_save_traceback()}", 70)
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -104,8 +104,8 @@ def _report_failure(line: str, status: int = 2) -> int:
 
 def _is_out_of_memory(error: Exception) -> bool:
     """torch raises a RuntimeError of its allocator's."""
-    told = str(error) if isinstance(error, RuntimeError) else ""
-    return isinstance(error, MemoryError) or "allocate memory" in told or "not enough memory" in told
+    message = str(error) if isinstance(error, RuntimeError) else ""
+    return isinstance(error, MemoryError) or "allocate memory" in message or "not enough memory" in message
 
 
 def _save_traceback() -> str:
@@ -125,7 +125,7 @@ def _save_traceback() -> str:
 
 @contextmanager
 def _raise_on_signals(wanted: bool) -> Iterator[None]:
-    """SIGTERM and a closed terminal end a command as Ctrl-C does: temporary files go, a run tells the way on.
+    """SIGTERM and a closed terminal end a command as Ctrl-C does, with its files removed and a hint.
 
     Args:
         wanted: false for the window, whose loop has its own way

@@ -2,7 +2,7 @@
 
 Everything drawn here is drawn through a pinhole, so a distorted camera's *view* is exact without its lens. A
 photograph taken through the lens is not: it shows each ray at another pixel. The lens is therefore kept
-beside the camera, and a photograph is straightened before it is compared with a render.
+beside the camera, and a photograph is undistorted before it is compared with a render.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ NETWORK_OPTIONS: Mapping[str, Any] = {
 """Options of a neural field, and what they are where nothing is said."""
 
 MOST_STAGES = 8
-"""Strengths that an editor with a dial is asked for if nobody says how many, at most."""
+"""Strengths that an editor with a strength control is asked for if nobody says how many, at most."""
 
 MOST_THREADS = 1024
 """More than any machine has: what --threads says at most."""
@@ -67,7 +67,7 @@ class TrainOptions:
     scene: tyro.conf.Positional[Path]
     """The scene: a .ply (also compressed), .spz, .splat, .ksplat or .sog."""
     out: Path
-    """Folder of the run; made if need be."""
+    """Folder of the run; created if needed."""
     region: str
     """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r, masks:DIR (one a
     camera), photomasks:DIR (of photographs), text:"the man's shirt"; join by + -."""
@@ -79,37 +79,37 @@ class TrainOptions:
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
     lift_threshold: float | None = None
-    """masks, text: least score of a member; by default .7 for share, .8 for count and paper."""
+    """masks, text: minimum score of a member; by default .7 for share, .8 for count and paper."""
     detector: str = DETECTOR
-    """text: id or folder of the GroundingDINO that finds things, downloaded before."""
+    """text: id or folder of the GroundingDINO that finds objects; download it first."""
     sam_model: str = SAM_MODEL
-    """text: id or folder of the SAM that outlines them, downloaded before."""
+    """text: id or folder of the SAM that outlines them; download it first."""
     box_threshold: float = 0.3
-    """text: confidence that a find needs, 0 to 1; lower finds more, also what is not meant."""
+    """text: minimum detection confidence, 0 to 1; a lower one finds more, including false matches."""
     model: str = ""
     """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
     guidance: float | None = None
-    """instruct: how closely the sentence is followed; by default as the model was made for (paper: 7.5)."""
+    """instruct: how closely the instruction is followed; by default the model's own value (paper: 7.5)."""
     image_guidance: float | None = None
-    """instruct: how closely the picture is followed, where the model knows it (paper: 1.5)."""
+    """instruct: how closely the picture is followed, where the model supports it (paper: 1.5)."""
     edit_steps: int | None = None
-    """instruct: denoising steps per picture; by default as the model was made for (paper: 20)."""
+    """instruct: denoising steps per picture; by default the model's own number (paper: 20)."""
     edit_size: int | None = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
     confine: Literal["auto", "yes", "no"] = "auto"
     """Put back what the editor changed outside the region; auto: unless --kind is geometry."""
     reedit_every: int = 0
-    """style, instruct: every so many steps, edit the current renders again and go on towards those."""
+    """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
     preset: Preset = "default"
     """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
-    printed. In Python: trainer.presets.under_preset."""
+    printed. In Python: trainer.presets.apply_preset."""
     name: str = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     cameras: Path | None = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at
     the region."""
     up: UpChoice = "auto"
-    """The axis of the scene that is up. auto: as the cameras are held, or as a ground lies, or −y."""
+    """The axis of the scene that is up. auto: from the cameras, else from the ground, else −y."""
     views: int = 0
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with. 0: 30,
     or 40 for an edit of colors whose members are dense."""
@@ -122,13 +122,14 @@ class TrainOptions:
     """What the edit moves; sets learning rates and loss weights. auto: as the editor knows; for folder:,
     photographs: and instruct: all are tried on a few small views, and the log says which was best."""
     group_steps: int | None = None
-    """geometry: first the connected parts of the region are moved as wholes, in so many steps per strength
-    or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves far. By
-    default 120 or 0, whichever a short trial finds better."""
+    """geometry: first the connected parts of the region are moved as rigid wholes, in this many steps per
+    strength or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves
+    far. By default 120 or 0, whichever a short trial finds better."""
     stages: int = 0
-    """Strengths that an editor with a dial is asked for; 0: 8, or 4 for fewer than 320 steps, but 1 for a
-    style, which is the paper's way, towards the end alone. instruct is asked for strengths, by rising
-    guidance, only if more than 1 are asked for here: each is another pass over the views."""
+    """Number of strengths that an editor with a strength control is asked for; 0: 8, or 4 for fewer than 320
+    steps, but 1 for a style, which is the paper's way, towards the end alone. instruct is asked for
+    strengths, by rising guidance, only if more than 1 are asked for here: each is another pass over the
+    views."""
     sh: Literal["auto", "on", "off"] = "auto"
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
@@ -143,9 +144,9 @@ class TrainOptions:
     """Sharpness of the renders: not less than the target's (hinge), or the printed term, which pulls at no
     pixel but the rim's (paper). auto: hinge for style, off for color and geometry."""
     slider: Slider = "auto"
-    """Slider values. even: equal steps look equally large, and an editor with a dial is asked for pictures
-    that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto: even, but
-    stages where folder: has pictures of several strengths."""
+    """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
+    pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
+    even, but stages where folder: has pictures of several strengths."""
     field: FieldKind = "auto"
     """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
     keeps every recording."""
@@ -155,7 +156,7 @@ class TrainOptions:
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     code: int = NETWORK_OPTIONS["code"]
-    """neural: a byte each for so many learned numbers per Gaussian, which tell what its place does not."""
+    """neural: bytes of learned code per Gaussian, for what its position cannot predict."""
     picture_loss: float = NETWORK_OPTIONS["picture_loss"]
     """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
@@ -168,16 +169,16 @@ class TrainOptions:
     seed: int = 0
     """Order of the views; the same seed gives the same files."""
     threads: int = 0
-    """CPU threads; 0 takes all cores. More than there are idle cores is slower."""
+    """CPU threads; 0 takes all cores. More threads than idle cores are slower."""
     text_before: str = ""
-    """What the views show before the edit, as "a bear"; with --text-after, CLIP directional similarity is
-    measured (ViT-L/14; pip install progdf-studio[clip])."""
+    """What the views show before the edit, such as "a bear"; with --text-after, CLIP directional similarity
+    is measured (ViT-L/14; pip install progdf-studio[clip])."""
     text_after: str = ""
-    """What they show after it, as "a golden bear"; instruct: its sentence, if nothing is given."""
+    """What they show after it, such as "a golden bear"; instruct: its sentence, if nothing is given."""
     clip_model: str = CLIP_MODEL
-    """Id or folder of the CLIP model, downloaded before."""
+    """Id or folder of the CLIP model; download it first."""
     resume: bool = False
-    """Go on with a run that was stopped in this folder; its result is that of a run that was not."""
+    """Continue a run that was stopped in this folder; the result is the same as without the stop."""
     save_every: float = 10.0
     """Seconds between saves of the run's state, more where saving takes long; 0: after every step."""
 
@@ -194,7 +195,7 @@ class FitOptions:
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     code: int = NETWORK_OPTIONS["code"]
-    """neural: a byte each for so many learned numbers per Gaussian, which tell what its place does not."""
+    """neural: bytes of learned code per Gaussian, for what its position cannot predict."""
     picture_loss: float = NETWORK_OPTIONS["picture_loss"]
     """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0

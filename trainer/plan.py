@@ -15,7 +15,7 @@ class NetworkPlan:
     """The network of a neural field.
 
     Args:
-        joint: trained beside the optimization, not on the finished recording
+        joint: trained jointly with the optimization, not on the finished recording
         size, code: see `TrainOptions`
         inputs, bins: see `Constants`; a jointly trained one sees positions alone, as the end is not known yet
         picture_loss: weight of L1 + LPIPS between pictures of field and recording, ≥ 0
@@ -51,7 +51,7 @@ class FieldPlan:
 
     @property
     def joint(self) -> bool:
-        """Whether a network is trained beside the optimization."""
+        """Whether a network is trained jointly with the optimization."""
         return self.kind == "neural" and self.network.joint
 
 

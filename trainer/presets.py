@@ -42,8 +42,8 @@ PRESETS: Mapping[Preset, Mapping[str, Any]] = {
     "default": {},
     # the trainer of ProGDF (AAAI 2025) as it is printed. PGS: λ = 1, 5, 1, one target, the rates of 3DGS, all
     # attributes free, raw iterates along the optimizer's time; `--progressive growth` is its other schedule.
-    # GDF: 6 million parameters that see positions alone, hard bins, trained beside PGS on L1 + LPIPS, which
-    # takes a quarter of an hour; `--field auto` leaves it out. Not the paper's: the gradients through clamped
+    # GDF: 6 million parameters that see positions alone, hard bins, trained jointly with PGS on L1 + LPIPS;
+    # it takes a quarter of an hour, so `--field auto` omits it. Not the paper's: gradients through clamped
     # colors, and the bake.
     "paper": {
         "steps": 1500,

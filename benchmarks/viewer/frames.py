@@ -26,7 +26,7 @@ from progdf.metrics.image import psnr
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
-from viewer.render import dynamic_resolution as draft
+from viewer.render.dynamic_resolution import COARSE, REST_S
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
@@ -133,7 +133,9 @@ def measure_turning(
         opened_s: dict[str, float] = {}
         for way in WAYS:
             empty = ViewEngine(ctx, nothing, (), way)
-            mice[way] = held.enter_context(Mouse(ctx, empty, nothing, (), ViewState(draft="off"), size))
+            mice[way] = held.enter_context(
+                Mouse(ctx, empty, nothing, (), ViewState(dynamic_resolution="off"), size)
+            )
             _open(mice[way], path, way)
             empty.release()
             first = mice[way].engine
@@ -142,7 +144,7 @@ def measure_turning(
             held.callback(mice[way].engine.release)
         full = _turn(mice, steps)
         for mouse in mice.values():
-            mouse.main_view.change(replace(mouse.main_view.work.view, draft="on"))
+            mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
         coarse = _turn(mice, steps)
         for way, mouse in mice.items():
             wrong = sum(not np.array_equal(image, _draw_anew(mouse, view)) for view, image in full[way].kept)
@@ -250,7 +252,7 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
         ),
         tuple(rows),
         f"OpenGL by {renderer}. Medians of whole frames while orbiting; one pixel drawn fills "
-        f"{draft.COARSE}×{draft.COARSE} of the window. The error is the worst of {KEPT} frames.",
+        f"{COARSE}×{COARSE} of the window. The error is the worst of {KEPT} frames.",
     )
 
 
@@ -307,7 +309,7 @@ def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
     main_view, engine = mouse.main_view, mouse.engine
     new = ViewEngine(main_view.context, engine.scene, (), engine.draws_with)
     main_view.set_engine(new, main_view.facts)
-    main_view.change(replace(view, draft="off"))
+    main_view.change(replace(view, dynamic_resolution="off"))
     mouse.frame()
     picture = mouse.picture()
     main_view.set_engine(engine, main_view.facts)
@@ -317,12 +319,12 @@ def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
 
 def _at_rest(mouse: Mouse) -> int:
     """Largest difference from the full picture once the hand, still holding it, has come to rest."""
-    mouse.main_view.change(replace(mouse.main_view.work.view, draft="on"))
+    mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
     mouse.grip_picture()
     mouse.turn(TURN_PX)
     if mouse.main_view.canvas.pixels == 1:
         raise AssertionError("the picture in motion was not coarse")
-    mouse.frame(seconds=2 * draft.REST_S)
+    mouse.frame(seconds=2 * REST_S)
     rested, view = mouse.picture(), mouse.main_view.work.view
     mouse.release()
     mouse.settle()

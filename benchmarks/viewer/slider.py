@@ -146,7 +146,7 @@ def rows(
     gdf = edit_for(scene, case.members, case.moves)
     case = replace(case, members=len(gdf.region))
     layers = (LayerState(0, "edit", 0.05),)
-    view = ViewState(first_camera(scene), layers, draft="off")
+    view = ViewState(first_camera(scene), layers, dynamic_resolution="off")
     events: dict[str, list[float]] = {way: [] for way in WAYS}
     parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
     with ExitStack() as held:

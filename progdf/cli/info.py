@@ -1,4 +1,4 @@
-"""`progdf info FILE`: what a scene, an edit or a camera file holds, told by its content."""
+"""`progdf info FILE`: what a scene, an edit or a camera file holds, recognized by its content."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from progdf.terminal import print_line
 from .options import parse_options
 
 TIMELINE_MARK = "progdf_timeline"
-"""The first key of every timeline file of the window, by which its kind is told."""
+"""The first key of every timeline file of the window, which identifies its kind."""
 
 
 @dataclass(frozen=True)

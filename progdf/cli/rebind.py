@@ -155,13 +155,13 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
         channels=BASE_CHANNELS + (3 * b.shN.shape[1] if "shN" in attributes else 0),
         recorded=gdf.field.recorded,
     )
-    told = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
+    figures = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
     return replace(
         gdf,
         region=Region(gdf.region.name, rows, gdf.region.score[of_a]),
         field=field,
         scene=fingerprint(b),
-        report={**gdf.report, "rebound": told},
+        report={**gdf.report, "rebound": figures},
     )
 
 

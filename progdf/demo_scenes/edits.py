@@ -168,7 +168,7 @@ def _nearest(means: Tensor, pivots: Tensor) -> Tensor:
 
 
 def _with_color(part: Gaussians, rgb: Tensor, share: float | Tensor) -> Gaussians:
-    """Set the color, and let view-dependent light take its hue: the sheen of gold is golden."""
+    """Set the color, and let view-dependent light take its hue: the highlight on gold is golden."""
     hue = rgb.clamp_min(0) / rgb.clamp_min(0).mean(dim=1, keepdim=True).clamp_min(1e-3)
-    sheen = part.shN.mean(dim=2, keepdim=True) * (0.35 + 0.65 * hue)[:, None, :]
-    return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (sheen - part.shN))
+    highlight = part.shN.mean(dim=2, keepdim=True) * (0.35 + 0.65 * hue)[:, None, :]
+    return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (highlight - part.shN))

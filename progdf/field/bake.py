@@ -69,7 +69,7 @@ class NeuralForm:
         network: the trained network
         plan: how it is baked
         rows_sha256: of the members' raw values that the network looks at; "" where it sees places alone
-        error: what baking costs: "rms", relative, and where pictures were at hand "psnr_mean", "psnr_worst",
+        error: what baking costs: "rms", relative, and with pictures "psnr_mean", "psnr_worst",
             dB, between the network, pinned, and what was baked of it
     """
 

@@ -84,7 +84,7 @@ def choose_field(
         kind: "auto" tries separable and keyframe fields; "lossless" is every snapshot, whatever it takes
         target: least PSNR over the slider, dB; infinite asks for the best in the budget
         budget: most bytes a member; None is as many as it takes
-        judge: has the last word, best on views that `render` does not show; None judges on `render`
+        evaluator: decides in the end, best on views that `render` does not show; None decides by `render`
         recorded: strengths for the slider's ticks; `strengths` when None
 
     Returns:

@@ -19,7 +19,7 @@ SAMPLES = 13
 
 
 class Field(Protocol):
-    """Anything that tells the offsets of its members at any strength, baked or not."""
+    """Anything that gives the offsets of its members at any strength, baked or not."""
 
     @property
     def attributes(self) -> Collection[str]:

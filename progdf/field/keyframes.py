@@ -27,7 +27,7 @@ def fit_keyframes(
     kept: Tensor | None = None,
     between: Between = "linear",
 ) -> BakedField:
-    """Keep `count` snapshots, at even strengths (even visible change in a re-timed trajectory) if not told.
+    """Keep `count` snapshots, at even strengths (even visible change in a re-timed trajectory) if None.
 
     Args:
         strengths: of the snapshots, ascending from 0 to 1. [T]

@@ -4,7 +4,7 @@ The paper's network sees a position, encoded, and the control signal H(s), and i
 Gaussians at one place can then not move differently, and 6 M numbers are spent on what its place does not
 tell. Our own form keeps the recorded end, which s = 1 needs to be exact anyway, and lets the network say
 only how the way bends beside it; what a Gaussian looks like and where it ends are inputs that the scene
-and the file hold already, so they cost no byte. A short learned code per Gaussian tells the rest.
+and the file hold already, so they cost no byte. A short learned code per Gaussian carries the rest.
 
     paper:  Δ_i(s) = g(s) · spread · f(γ(x_i), H(s))                             g(0) = 0
     ours:   Δ_i(s) = s · end_i + 4 s (1 − s) · spread · f(γ(x_i), look_i, end_i, code_i, H(s))
@@ -205,10 +205,10 @@ class BoundField:
         self.attributes = field.shape.attributes
         self._weights = weights
         with torch.no_grad():
-            told = torch.cat([encode(self.shape, weights, rows, self.end), codes], dim=1)
+            inputs = torch.cat([encode(self.shape, weights, rows, self.end), codes], dim=1)
             # all of the first layer that does not depend on s
             first = weights["layers.0.weight"]
-            self._first = linear(told, first[:, : told.shape[1]], weights["layers.0.bias"])
+            self._first = linear(inputs, first[:, : inputs.shape[1]], weights["layers.0.bias"])
 
     def offsets(self, s: float) -> Tensor:
         """Packed offsets at strength `s`; exactly 0 at 0. [M,C] float32"""

@@ -143,7 +143,7 @@ def recorded_field(trajectory: Trajectory) -> BakedField:
 
 
 def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors, all of them where none are named, and what the file tells about itself."""
+    """Tensors, all of them where none are named, and the file's metadata."""
     try:
         tensors, header = read_tensors(path, names)
         if header.get("format") != _FORMAT:

@@ -6,7 +6,7 @@ smaller components of a quaternion; opacities are bytes; f_rest bytes cover −4
 
 from __future__ import annotations
 
-import os
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 
-from .ply_header import Element, PlyHeader
+from .ply_file import PlyFile
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -26,44 +26,42 @@ _SH_REST = (0, 9, 24, 45)
 Floats = npt.NDArray[np.float32]
 
 
-def is_compressed(header: PlyHeader) -> bool:
+def is_compressed(ply: PlyFile) -> bool:
     """Whether a .ply keeps its Gaussians packed."""
-    return any(e.name == "vertex" and "packed_position" in e.names for e in header.elements)
+    return "packed_position" in ply.columns("vertex")
 
 
-def read_compressed_ply(path: str | os.PathLike[str], header: PlyHeader) -> Gaussians:
-    """The scene as it stands in the file; opacities of 0 and 1 give infinite logits, to be repaired.
+def read_compressed_ply(ply: PlyFile) -> Gaussians:
+    """The scene as stored in the file; opacities of 0 and 1 give infinite logits, to be repaired.
 
     Raises:
         ProgdfError: a table is missing or does not fit the others.
     """
-    name = os.fspath(path)
-    tables = {element.name: element for element in header.elements}
-    vertex, chunk, sh = tables["vertex"], tables.get("chunk"), tables.get("sh")
-    if header.format == "ascii" or any(element.has_lists for element in header.elements):
+    name, count, counts = ply.path, ply.counts["vertex"], ply.counts
+    if ply.layout.text:
         raise ProgdfError(f"{name} is a compressed .ply of an unknown kind; export it as a plain 3DGS .ply")
-    if not vertex.count:
+    if not count:
         raise ProgdfError(f"{name} holds 0 Gaussians; a scene needs at least one: export it again")
-    if chunk is None or chunk.count != -(-vertex.count // _CHUNK):
+    if counts.get("chunk") != -(-count // _CHUNK):
         raise ProgdfError(f"{name} is a compressed .ply without its chunks; export it again")
-    if sh is not None and (sh.count != vertex.count or len(sh.properties) not in _SH_REST):
+    vertex, chunk, sh = (ply.columns(element) for element in ("vertex", "chunk", "sh"))
+    if "sh" in counts and (counts["sh"] != count or len(sh) not in _SH_REST):
         raise ProgdfError(f"{name} has an element 'sh' that does not fit its Gaussians; export it again")
-    ranged = [_XYZ, _SCALES, *([_RGB] if "min_r" in chunk.names else [])]
+    ranged = [_XYZ, _SCALES, *([_RGB] if "min_r" in chunk else [])]
     wanted = [f"{edge}_{name}" for names in ranged for name in names for edge in ("min", "max")]
-    words = {column.name for column in vertex.properties if column.type == "u4"}
-    missing = [n for n in wanted if n not in chunk.names] + [n for n in _PACKED if n not in words]
+    missing = [n for n in wanted if n not in chunk] + [n for n in _PACKED if vertex.get(n) != "u4"]
     if missing:
         raise ProgdfError(f"{name} is a compressed .ply without {missing[0]}; export it again")
-    at = np.arange(vertex.count) // _CHUNK
-    ranges, packed = _rows(name, header, chunk), _rows(name, header, vertex)
+    (ranges, packed, *bands), _ = ply.rows("chunk", "vertex", *(["sh"] if sh else []))
+    at = np.arange(count) // _CHUNK
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
     rgba = _unorm(color, (24, 16, 8, 0), (8, 8, 8, 8))
-    rgb = rgba[:, :3] if "min_r" not in chunk.names else _dequantize(ranges, at, rgba, _RGB)
+    rgb = rgba[:, :3] if "min_r" not in chunk else _dequantize(ranges, at, rgba, _RGB)
     with np.errstate(divide="ignore"):  # 0 and 1 are infinite
         logits = -np.log(1.0 / rgba[:, 3].astype(np.float64) - 1.0)
-    higher = np.zeros((vertex.count, 0, 3), np.float32)
-    if sh is not None and sh.properties:
-        higher = _higher_bands(name, _rows(name, header, sh), len(sh.properties))
+    higher = np.zeros((count, 0, 3), np.float32)
+    if bands:
+        higher = _higher_bands(name, bands[0], len(sh))
     found = {
         "means": _dequantize(ranges, at, _unorm(position, (21, 11, 0), (11, 10, 11)), _XYZ),
         "quats": _quats(rotation),
@@ -73,19 +71,7 @@ def read_compressed_ply(path: str | os.PathLike[str], header: PlyHeader) -> Gaus
         "shN": higher,
     }
     tensors = {key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in found.items()}
-    return Gaussians(**tensors, antialiased=header.antialiased)
-
-
-def _rows(name: str, header: PlyHeader, element: Element) -> npt.NDArray[np.void]:
-    """A table of the file; its size was checked when the header was read."""
-    start = header.length
-    for before in header.elements[: header.elements.index(element)]:
-        start += before.count * before.least_row_bytes
-    kind = np.dtype([(column.name, header.byte_order + column.type) for column in element.properties])
-    rows = np.fromfile(name, kind, element.count, offset=start)
-    if len(rows) < element.count:
-        raise ProgdfError(f"{name} ends within element '{element.name}'; it is truncated: copy it again")
-    return rows
+    return Gaussians(**tensors, antialiased=ply.antialiased)
 
 
 def _unorm(words: npt.NDArray[np.uint32], shifts: tuple[int, ...], bits: tuple[int, ...]) -> Floats:
@@ -118,12 +104,12 @@ def _quats(packed: npt.NDArray[np.uint32]) -> Floats:
     return quats
 
 
-def _higher_bands(name: str, rows: npt.NDArray[np.void], count: int) -> Floats:
+def _higher_bands(name: Path, rows: npt.NDArray[np.void], count: int) -> Floats:
     """f_rest_0 …, channel-major, as bytes of −4 to 4. -> [N,K,3]"""
     names = [f"f_rest_{i}" for i in range(count)]
     absent = next((column for column in names if column not in (rows.dtype.names or ())), None)
     if absent:
-        raise ProgdfError(f"{name} is a compressed .ply without {absent}; export it again")
+        raise ProgdfError(f"{name} is a compressed .ply that lacks {absent}; export it again")
     values = np.stack([rows[column] for column in names], axis=1).astype(np.float32)
     share = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256.0))
     return ((share - 0.5) * 8.0).reshape(len(rows), 3, -1).transpose(0, 2, 1).astype(np.float32)

@@ -53,6 +53,6 @@ def main(kind: str, source: str, target: str, memory: int, output: int, seconds:
 if __name__ == "__main__":
     try:
         main(sys.argv[1], sys.argv[2], sys.argv[3], *map(int, sys.argv[4:7]))
-    except Exception as error:  # whatever it is, the caller tells it
+    except Exception as error:  # reported by the caller
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(3)

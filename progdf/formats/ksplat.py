@@ -54,7 +54,7 @@ def is_ksplat(start: bytes) -> bool:
 
 
 def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
-    """The scene as it stands in the file, and its compression level 0..2.
+    """The scene as stored in the file, and its compression level 0..2.
 
     Raises:
         ProgdfError: it is no .ksplat, or truncated or damaged.
@@ -159,7 +159,7 @@ def _rows(
 
 
 def _centers(path: str | os.PathLike[str], content: bytes, section: _Section) -> Floats:
-    """The center of each row's bucket: full buckets first, then those whose sizes stand in the file. [N,3]"""
+    """The center of each row's bucket: full buckets first, then those whose sizes are in the file. [N,3]"""
     sizes = np.frombuffer(content, "<u4", section.partial_buckets, section.sizes_at).astype(np.int64)
     full = section.full_buckets * section.bucket_size
     ends = np.concatenate([[full], full + np.cumsum(sizes)])

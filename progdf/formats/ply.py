@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,14 +16,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from plyfile import PlyData, PlyElement
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.io.atomic import atomic_write, open_error
+from progdf.io.atomic import atomic_write
 
 from .load_report import LoadReport
-from .ply_header import ANTIALIASED_COMMENT, Element, PlyHeader, read_header
-from .ply_rows import BLOCK_ROWS, read_blocks
+from .ply_file import ANTIALIASED_COMMENT, PlyFile, read_header
 from .repair import repair
 
 Floats = npt.NDArray[np.float32]
@@ -40,8 +39,9 @@ GEOMETRY = {
 }
 """The columns of each attribute that every 3DGS .ply has."""
 _NORMALS = ("nx", "ny", "nz")
-_SH_REST = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
-_MOST_THREADS = 4
+_BLOCK_ROWS = 4096
+"""1 MB of SH3 rows: taken apart while they are in the second-level cache."""
+_SH_REST = (0, 9, 24, 45, 72)
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -60,29 +60,22 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
     """As `load_ply`, with the report of what the file held and what was repaired."""
-    header = read_header(path)
-    name = os.fspath(path)
-    vertex = _vertex(name, header)
-    rest = _check_properties(name, header, vertex)
-    columns = dict(GEOMETRY)
-    columns["shN"] = tuple(f"f_rest_{i}" for i in range(rest))
-    used = tuple(column for names in columns.values() for column in names)
-    attributes = {key: np.empty((vertex.count, len(names)), np.float32) for key, names in columns.items()}
-    store = _store_into(attributes, columns)
-    try:
-        trailing = read_blocks(path, header, vertex, used, store, _threads(vertex.count))
-    except OSError as error:
-        raise open_error(path, error) from None
-    scene, counts = repair(replace(_gaussians(attributes), antialiased=header.antialiased))
+    ply = read_header(path)
+    rest = _check_properties(ply)
+    columns = {**GEOMETRY, "shN": tuple(f"f_rest_{i}" for i in range(rest))}
+    (rows,), trailing = ply.rows("vertex")
+    scene, counts = repair(replace(_gaussians(rows, columns), antialiased=ply.antialiased))
+    used = {column for names in columns.values() for column in names}
+    order = {"<": " little-endian", ">": " big-endian"}[ply.layout.byte_order] if not ply.layout.text else ""
     return scene, LoadReport(
         file=Path(path).name,
-        file_bytes=header.file_size,
-        format=header.format.replace("_", " ").replace(" endian", "-endian"),
-        count=vertex.count,
-        sh_degree=_SH_REST[rest],
-        antialiased=header.antialiased,
-        ignored_properties=tuple(p for p in vertex.names if p not in used and p not in _NORMALS),
-        ignored_elements=tuple((e.name, e.count) for e in header.elements if e is not vertex),
+        file_bytes=ply.size,
+        format=f"binary{order}" if order else "ascii",
+        count=len(scene),
+        sh_degree=scene.sh_degree,
+        antialiased=ply.antialiased,
+        ignored_properties=tuple(p for p in ply.columns("vertex") if p not in used and p not in _NORMALS),
+        ignored_elements=tuple((name, count) for name, count in ply.counts.items() if name != "vertex"),
         trailing_bytes=trailing,
         **counts,
     )
@@ -102,70 +95,51 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     for key in ATTRIBUTES:
         if not bool(getattr(scene, key).isfinite().all()):
             raise ProgdfError(f"{path} was not written: {key} holds NaN or infinity; repair the scene first")
-    arrays = {key: _numpy(scene, key) for key in ATTRIBUTES}
-    higher = arrays["shN"].shape[1]
-    names = (
-        "x",
-        "y",
-        "z",
-        *_NORMALS,
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        *(f"f_rest_{i}" for i in range(3 * higher)),
-    )
-    names += ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-    head = ["ply", "format binary_little_endian 1.0"]
-    head += [f"comment {ANTIALIASED_COMMENT}"] if scene.antialiased else []
-    head += [f"element vertex {len(scene)}"]
-    head += [f"property float {name}" for name in names]
-    with atomic_write(path) as temporary_file, temporary_file.open("wb") as file:
-        file.write(("\n".join([*head, "end_header"]) + "\n").encode("ascii"))
-        for start in range(0, len(scene), BLOCK_ROWS):
-            part = {key: array[start : start + BLOCK_ROWS] for key, array in arrays.items()}
-            rows = len(part["means"])
-            block = np.concatenate(
-                [
-                    part["means"],
-                    np.zeros((rows, 3), np.float32),
-                    part["sh0"],
-                    part["shN"].transpose(0, 2, 1).reshape(rows, -1),
-                    part["logit_opacities"][:, None],
-                    part["log_scales"],
-                    part["quats"],
-                ],
-                axis=1,
-            )
-            file.write(block.astype("<f4", copy=False).tobytes())
+    columns = {
+        "means": scene.means,
+        "normals": torch.zeros(len(scene), 3),
+        "sh0": scene.sh0,
+        "shN": scene.shN.transpose(1, 2).flatten(1),
+        "logit_opacities": scene.logit_opacities[:, None],
+        "log_scales": scene.log_scales,
+        "quats": scene.quats,
+    }
+    table = torch.cat([tensor.detach().cpu().to(torch.float32) for tensor in columns.values()], dim=1).numpy()
+    names = {
+        **GEOMETRY,
+        "normals": _NORMALS,
+        "shN": tuple(f"f_rest_{i}" for i in range(columns["shN"].shape[1])),
+    }
+    rows = table.view([(name, "=f4") for key in columns for name in names[key]])[:, 0]
+    vertex = PlyElement.describe(rows, "vertex")
+    comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
+    with atomic_write(path) as temporary_file:
+        PlyData([vertex], byte_order="<", comments=comments).write(str(temporary_file))
 
 
-def _vertex(name: str, header: PlyHeader) -> Element:
-    vertex = next((element for element in header.elements if element.name == "vertex"), None)
-    if vertex is None:
-        packed = any(element.name == "chunk" for element in header.elements)
-        raise ProgdfError(f"{name} has no element 'vertex'" + ("" if packed else "; it is not a 3DGS .ply"))
-    return vertex
-
-
-def _check_properties(name: str, header: PlyHeader, vertex: Element) -> int:
+def _check_properties(ply: PlyFile) -> int:
     """The number of f_rest properties, once every property that 3DGS needs is known to be there."""
-    present = {column.name for column in vertex.properties if not column.count_type}
+    if "vertex" not in ply.counts:
+        known = "" if "chunk" in ply.counts else "; it is not a 3DGS .ply"
+        raise ProgdfError(f"{ply.path} has no element 'vertex'{known}")
+    present = ply.columns("vertex")
     missing = [column for names in GEOMETRY.values() for column in names if column not in present]
     if missing:
-        raise ProgdfError(f"{name} {_describe(header, present, missing)}")
+        raise ProgdfError(f"{ply.path} {_describe(ply, missing)}")
     rest = sum(column.startswith("f_rest_") for column in present)
     absent = next((f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in present), None)
     if rest not in _SH_REST or absent:
         raise ProgdfError(
-            f"{name} has {rest} f_rest properties{f' without {absent}' if absent else ''}; "
+            f"{ply.path} has {rest} f_rest properties{f' without {absent}' if absent else ''}; "
             f"expected 0, 9, 24, 45 or 72: export it again"
         )
-    if not vertex.count:
-        raise ProgdfError(f"{name} holds 0 Gaussians; a scene needs at least one: export it again")
+    if not ply.counts["vertex"]:
+        raise ProgdfError(f"{ply.path} holds 0 Gaussians; a scene needs at least one: export it again")
     return rest
 
 
-def _describe(header: PlyHeader, present: set[str], missing: list[str]) -> str:
+def _describe(ply: PlyFile, missing: list[str]) -> str:
+    present = set(ply.columns("vertex"))
     if "packed_position" in present:
         return "is a compressed .ply; open it with load_scene"
     if missing == ["scale_2"]:
@@ -173,42 +147,42 @@ def _describe(header: PlyHeader, present: set[str], missing: list[str]) -> str:
     listed = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
     if {"f_dc_0", "opacity", "scale_0", "rot_0"} & present:
         return f"lacks {listed}, which a 3DGS .ply has; export it again"
-    kind = "a mesh" if any(element.name == "face" for element in header.elements) else "a point cloud"
+    kind = "a mesh" if "face" in ply.counts else "a point cloud"
     return f"is {kind}, not a Gaussian scene: it lacks {listed}; train one with 3DGS and give its .ply"
 
 
-def _store_into(
-    attributes: dict[str, Floats], columns: dict[str, tuple[str, ...]]
-) -> Callable[[int, Floats, dict[str, int]], None]:
-    """The function that takes a block of rows apart: (first row, block [B,P], column of each property)."""
-
-    def store(first: int, block: Floats, where: dict[str, int]) -> None:
-        for key, names in columns.items():
-            if not names:
-                continue
-            target = attributes[key][first : first + len(block)]
-            index = [where[name] for name in names]
-            run = index == list(range(index[0], index[0] + len(index)))
-            source = block[:, index[0] : index[0] + len(index)] if run else block[:, index]
+def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) -> Gaussians:
+    """The rows taken apart, in blocks that stay in the cache; those of a plain file are a matrix."""
+    rows, names = np.asarray(rows), rows.dtype.names or ()
+    plain = all(rows.dtype[name] == np.dtype("<f4") for name in names)
+    if not plain:
+        names = tuple(name for part in columns.values() for name in part)
+    index = {key: _run([names.index(name) for name in part]) for key, part in columns.items()}
+    arrays: dict[str, npt.NDArray[Any]] = {
+        key: np.empty((len(rows), len(part)), np.float32) for key, part in columns.items()
+    }
+    bands = len(columns["shN"]) // 3
+    arrays["shN"] = arrays["shN"].reshape(len(rows), bands, 3)
+    for first in range(0, len(rows), _BLOCK_ROWS):
+        block = rows[first : first + _BLOCK_ROWS]
+        if plain:
+            table: Floats = block.view("<f4").reshape(len(block), -1)
+        else:
+            with np.errstate(
+                over="ignore", invalid="ignore"
+            ):  # what is beyond float32 becomes ±inf: repaired
+                table = np.stack([block[name].astype(np.float32) for name in names], axis=1)
+        for key, array in arrays.items():
+            found: npt.NDArray[Any] = table[:, index[key]]
             if key == "shN":  # channel-major in the file, rgb innermost here
-                source = source.reshape(len(block), 3, -1).transpose(0, 2, 1)
-                target = target.reshape(source.shape)
-            np.copyto(target, source)
-
-    return store
-
-
-def _gaussians(attributes: dict[str, Floats]) -> Gaussians:
-    tensors: dict[str, Any] = {key: torch.from_numpy(array) for key, array in attributes.items()}
+                found = found.reshape(len(block), 3, bands).transpose(0, 2, 1)
+            array[first : first + _BLOCK_ROWS] = found
+    tensors: dict[str, Any] = {key: torch.from_numpy(array) for key, array in arrays.items()}
     tensors["logit_opacities"] = tensors["logit_opacities"][:, 0]
-    count, rest = tensors["shN"].shape
-    tensors["shN"] = tensors["shN"].reshape(count, rest // 3, 3)
     return Gaussians(**tensors)
 
 
-def _numpy(scene: Gaussians, key: str) -> Floats:
-    return np.asarray(getattr(scene, key).detach().cpu().to(torch.float32).numpy())
-
-
-def _threads(count: int) -> int:
-    return 1 if count < 4 * BLOCK_ROWS else min(_MOST_THREADS, os.cpu_count() or 1)
+def _run(index: list[int]) -> slice | list[int]:
+    """Neighbouring columns as a slice, which numpy does not copy."""
+    run = slice(index[0], index[-1] + 1) if index else slice(0)
+    return run if index == list(range(run.start or 0, run.stop)) else index

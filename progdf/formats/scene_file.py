@@ -1,6 +1,6 @@
 """Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog.
 
-Told apart by content where it tells, else by name. Two readers are our own; .spz, .sog and .splat go through
+Recognized by content, else by name. Two readers are our own; .spz, .sog and .splat go through
 gaussforge, in a process of its own (see `gaussforge_child`), as its native code may crash on a broken file.
 """
 
@@ -32,7 +32,7 @@ from .compressed_ply import is_compressed, read_compressed_ply
 from .ksplat import read_ksplat
 from .load_report import LoadReport
 from .ply import load_ply_with_report
-from .ply_header import read_header
+from .ply_file import read_header
 from .repair import repair
 
 _log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
 
 SOG_META = "meta.json"
-"""The file that stands for an unpacked .sog: its folder's table of images."""
+"""The file that represents an unpacked .sog: its folder's table of images."""
 
 _MOST_META = 64_000_000
 _MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
@@ -105,10 +105,10 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     path = scene_file(path)
     kind = scene_format(path)
     if kind == "ply" or kind is None:
-        header = read_header(path)  # which knows best what is wrong with a file that is no .ply
-        if not is_compressed(header):
+        ply = read_header(path)  # which knows best what is wrong with a file that is no .ply
+        if not is_compressed(ply):
             return load_ply_with_report(path)
-        return _repair(path, read_compressed_ply(path, header), "compressed .ply")
+        return _repair(path, read_compressed_ply(ply), "compressed .ply")
     if kind == "ksplat":
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")

@@ -104,7 +104,7 @@ class GdfHead:
 
     Args:
         path, size: the file, and its bytes
-        text: the JSON header as it stands in the file
+        text: the JSON header as stored in the file
         sha256: of the whole: header and tensors
         tensors: shape and type of each, as safetensors calls it
         name, region, instruction: the layer's, the region's, and what was asked for
@@ -248,7 +248,7 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
 
 
 def _check(header: _Header, tensors: Mapping[str, tuple[tuple[int, ...], _Type]]) -> None:
-    """Whether the header fits the table of tensors, as far as the file is told by them."""
+    """Whether the header fits the table of tensors, as far as they determine the file."""
     if not 0 <= header.scene.count <= MOST_GAUSSIANS:
         raise ValueError(f"a scene of {header.scene.count} Gaussians")
     sides = {"nodes": 1}

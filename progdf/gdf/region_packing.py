@@ -69,7 +69,7 @@ def _pack_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
 
 
 def _unpack_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: int | None) -> Tensor:
-    """Sorted, unique and within the scene, or a ValueError; as many as expected, told before they are made,
+    """Sorted, unique and within the scene, or a ValueError; as many as expected, checked beforehand,
     as eight bytes of a run can name millions. [M] int64"""
     if f"{key}.bits" in tensors:
         bits = tensors[f"{key}.bits"]

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written beside their place, renamed when they are complete."""
+"""Files that are whole or absent: written to a temporary file, renamed when they are complete."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _A_DAY = 86400.0
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file beside `path`, renamed to it when the block ends well and removed when it does not.
 
-        with atomic_write("scene.ply") as beside:
-            beside.write_bytes(…)
+        with atomic_write("scene.ply") as temporary:
+            temporary.write_bytes(…)
 
     A link stays and the file it leads to is replaced. A pipe or a device gets the bytes when all are there.
     What processes that were killed have left in the folder goes too.

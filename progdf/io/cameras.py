@@ -1,4 +1,4 @@
-"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, told apart by content; and
+"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, recognized by content; and
 folders: a COLMAP sparse model, or a folder with one of these files in it.
 """
 

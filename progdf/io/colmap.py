@@ -78,16 +78,16 @@ def load_model(model: Path) -> list[Camera]:
             f"{model} is a COLMAP model, which needs pycolmap; pip install 'progdf-studio[colmap]'"
         )
     suffix = _suffix(model)
-    with tempfile.TemporaryDirectory() as beside:
+    with tempfile.TemporaryDirectory() as folder:
         try:
             for name in (*_NEEDED, *_OPTIONAL):
                 source = model / f"{name}{suffix}"
                 if name in _NEEDED or source.is_file():
-                    shutil.copyfile(source, Path(beside, source.name))
+                    shutil.copyfile(source, Path(folder, source.name))
         except OSError as error:
             raise open_error(error.filename or model, error) from None
-        Path(beside, f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
-        images = _images(Path(beside))
+        Path(folder, f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        images = _images(Path(folder))
     if images is None:
         raise ProgdfError(
             f"{model} is a broken COLMAP model; export cameras{suffix} and images{suffix} again"

@@ -47,6 +47,6 @@ def main(folder: str, memory: int, seconds: int) -> None:
 if __name__ == "__main__":
     try:
         main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
-    except Exception as error:  # whatever it is, the caller tells it
+    except Exception as error:  # reported by the caller
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(3)

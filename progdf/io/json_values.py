@@ -1,4 +1,4 @@
-"""JSON from files, checked: what is wrong is told with its place, its name and what it is.
+"""JSON from files, checked: an error is reported with its place, its name and what it is.
 
 `where` is how a message begins: "camera 3 of cameras.json".
 """

@@ -34,7 +34,7 @@ from .json_values import convert_json, decode_json
 
 VERSION = 1
 MARK = "progdf_session"
-"""The first key of every session file, by which its kind is told."""
+"""The first key of every session file, which identifies its kind."""
 SUFFIX = ".session.json"
 _LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a few megabytes
 

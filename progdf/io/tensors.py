@@ -2,7 +2,7 @@
 
 The safetensors library writes the metadata in an order that differs from run to run, so the same training
 would give a file with another hash each time. Reading is left to the library, which knows nothing of damaged
-numbers: a checksum of everything may stand among the metadata.
+numbers: a checksum of everything may be in the metadata.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def paint_depth(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 
 def depth_of(image: Tensor) -> Depth:
-    """What a picture of a scene painted by `paint_depth` tells. [H,W,≥2]"""
+    """What a picture of a scene painted by `paint_depth` shows. [H,W,≥2]"""
     weighted, alpha = image[..., 0], image[..., 1]
     shown = alpha > 0
     return Depth(torch.where(shown, weighted / torch.where(shown, alpha, 1.0), 0.0), alpha)

@@ -39,10 +39,10 @@ from progdf.region import (
 )
 
 Kind = Callable[[str, Gaussians], Region]
-"""Makes a region from what stands behind `KIND:`."""
+"""Makes a region from the text after `KIND:`."""
 
 Check = Callable[[str], object]
-"""Raises ProgdfError where what stands behind `KIND:` cannot be, whatever the scene."""
+"""Raises ProgdfError where the text after `KIND:` cannot be, whatever the scene."""
 
 _NOTHING: Mapping[str, Kind] = {}
 _UNCHECKED: Mapping[str, Check] = {}

@@ -23,6 +23,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
+from tests.helpers.blank_plots import blank_plots
 from tests.helpers.trained import quick_options, write_bear
 from trainer.option_checks import resolve_options
 from trainer.options import TrainOptions
@@ -39,7 +40,8 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
     made = tmp_path_factory.mktemp("bear")
     write_bear(made)
     options = resolve_options(quick_options(made, steps=100, views=4, image_size=48))
-    train(options, quiet=True)
+    with blank_plots():
+        train(options, quiet=True)
     return options
 
 

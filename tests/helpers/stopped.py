@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from tests.helpers.blank_plots import blank_plots
 from tests.helpers.trained import quick_options
 from trainer.options import TrainOptions
 from trainer.pipeline.run import train
@@ -92,5 +93,6 @@ def killed_again_and_again(options: TrainOptions, moments: Sequence[float]) -> l
 
 if __name__ == "__main__":
     run = small_run(Path(sys.argv[1]), **json.loads(sys.argv[2]))
-    ends = killed_again_and_again(run, [float(moment) for moment in sys.argv[3].split(",") if moment])
+    with blank_plots():
+        ends = killed_again_and_again(run, [float(at) for at in sys.argv[3].split(",") if at])
     sys.exit(ends[-1])

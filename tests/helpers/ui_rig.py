@@ -34,7 +34,7 @@ def first_view(stack: Stack, *strengths: float) -> ViewState:
     """The bear from the front, its edits at these strengths; never coarse, however slow the machine is."""
     layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
     camera = first_camera(stack.scene, stack.demo.cameras)
-    return ViewState(camera=camera, layers=layers, background=stack.demo.background, draft="off")
+    return ViewState(camera=camera, layers=layers, background=stack.demo.background, dynamic_resolution="off")
 
 
 class Rig:

@@ -29,7 +29,7 @@ EDITORS: dict[str, Factory] = {
     "style": style,
     "instruct": instruct,
 }
-"""Kind of editor → its factory, given what stands behind the colon, the scene, the region, the views
+"""Kind of editor → its factory, given the text after the colon, the scene, the region, the views
 and the settings of learned editors."""
 
 VIEW_BY_VIEW = ("folder", "photographs", "style", "instruct")
@@ -66,7 +66,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "photographs": photograph_folders,
     "style": check_style,
 }
-"""Kind of editor → what tells, by itself, whether what stands behind the colon can be."""
+"""Kind of editor → the check of the text after the colon, by itself."""
 
 
 def check_editor(spec: str) -> tuple[str, str]:
@@ -93,7 +93,7 @@ def make_editor(
     views: Sequence[View],
     settings: EditorSettings | None = None,
 ) -> ImageEditor:
-    """The editor that `spec` names, for one region and its views; ProgdfError tells what is wrong with it."""
+    """The editor that `spec` names, for one region and its views; ProgdfError says what is wrong with it."""
     kind, what = check_editor(spec)
     return EDITORS[kind](what, scene, region, views, settings or EditorSettings())
 

@@ -28,7 +28,7 @@ class EditorSettings:
         steps: denoising steps
         seed: of the noise, the same in every view
         size: longer side in pixels at which pictures are painted
-        dial: picture strengths by rising guidance, not the finished edit alone
+        graded: edit at several strengths by rising guidance, not the finished edit alone
         confine: see `Confine`
         kept: folder in which painted pictures are kept; None keeps nothing
     """
@@ -39,7 +39,7 @@ class EditorSettings:
     steps: int | None = None
     seed: int = 0
     size: int | None = None
-    dial: bool = False
+    graded: bool = False
     confine: Confine = "auto"
     kept: Path | None = None
 
@@ -47,7 +47,7 @@ class EditorSettings:
 class ImageEditor(Protocol):
     """Edits pictures of one region.
 
-    An editor with a dial of its own pictures any strength, one that only knows the finished edit only 1.
+    An editor with a strength control edits at any strength, one that only knows the finished edit only at 1.
     """
 
     @property

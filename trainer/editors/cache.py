@@ -2,7 +2,7 @@
 
 RUN/views/painted/VIEW.png              what a learned editor made of the whole view
 RUN/views/painted/VIEW.json             from what: the view's picture, the editor, all its options
-RUN/views/painted/0.25/VIEW.png         at another strength, where the editor has a dial
+RUN/views/painted/0.25/VIEW.png         at another strength, where the editor has several
 RUN/views/painted/step_00200/VIEW.png   of the render at a training step (--reedit-every)
 
 A picture is taken again while its note fits. So one that was touched up by hand stays as it is.

@@ -61,7 +61,7 @@ class InstructEditor:
         guidance: of the finished edit
         recipe: what a picture depends on besides guidance
         kept: where pictures are kept
-        stages: (1,), or empty with a dial
+        stages: (1,), or empty where graded
     """
 
     paint: Callable[[Tensor, float], Tensor]
@@ -113,13 +113,13 @@ def instruct(
         "size": asked.size,
         "seed": asked.seed,
     }
-    dial = settings.dial and asked.guidance > 1.0
+    graded = settings.graded and asked.guidance > 1.0
     return InstructEditor(
         lambda picture, guidance: _run_pipeline(pipeline(), asked, picture, guidance),
         asked.guidance,
         recipe,
         KeptPictures(settings.kept),
-        stages=() if dial else (1.0,),
+        stages=() if graded else (1.0,),
     )
 
 

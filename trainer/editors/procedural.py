@@ -1,4 +1,4 @@
-"""Editors made of a color function: exact, the same in every view, and with a dial of their own.
+"""Editors made of a color function: exact, the same in every view, at any strength.
 
 They edit the region's own color, unmixed from what shares a pixel with it, and mix it back (see
 `View.blend`): soft edges keep the right share of either side.

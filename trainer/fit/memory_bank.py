@@ -1,6 +1,6 @@
 """The memory bank of snapshots, and the field that is trained on it while the edit is optimized.
 
-ProGDF trains its field alongside PGS: after each of its steps one of the field's, on a snapshot drawn from
+ProGDF trains its field jointly with PGS: after each of its steps one of the field's, on a snapshot drawn from
 those recorded so far. The slider values are not known before the whole way is, so a snapshot goes by its
 stage's strength and its step until then; when the optimization is done, the network is finished on the
 trajectory as it was re-timed. Its end is not known either: until then a network sees positions (and its
@@ -65,7 +65,7 @@ class MemoryBank:
 
 
 class JointTraining:
-    """A network in training beside PGS; a `state.Resumable`.
+    """A network in joint training with PGS; a `state.Resumable`.
 
     Args:
         fit: the network, not yet trained

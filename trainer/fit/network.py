@@ -71,7 +71,7 @@ def network_settings(plan: NetworkPlan) -> NeuralSettings:
 def begin_joint_training(
     plan: Plan, setup: TrainingSetup, rates: Tensor, stages: Sequence[TargetStage]
 ) -> JointTraining | None:
-    """The network that is trained beside PGS, where the plan has one.
+    """The network that is trained jointly with PGS, where the plan has one.
 
     Args:
         plan: see `Plan`

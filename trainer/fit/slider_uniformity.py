@@ -29,13 +29,13 @@ from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
 
 STEPS = 20
-"""Equal steps that a hand makes over the whole slider."""
+"""Equal steps that a user makes over the whole slider."""
 
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
 _FINE = 2  # a step may begin at so many places per step
 _PASSES = 3
 _LOOKS = 2  # how often all places are looked at
-_JUMP = 0.7  # of the change in one step of an editor's dial: no strength between can be relied on
+_JUMP = 0.7  # of the change in one step of an editor's strength: no strength between can be relied on
 
 
 def equalized_strengths(
@@ -105,7 +105,7 @@ def _ignore_progress(done: int, word: str) -> None:
 
 
 def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> SliderRemap:
-    """The dial under which equal steps change what is seen equally, wherever they begin.
+    """The remap under which equal steps change what is seen equally, wherever they begin.
 
     Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
     robot's .93, but .68 where they begin half a step later; with them .92 and .88).
@@ -123,9 +123,9 @@ def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> 
         for _ in range(passes + 1):
             current = following
             shown = [interpolate_at(looked, pictures, float(s)) for s in current]
-            evenness, following = _spread(current, shown, _FINE)
-            if evenness > best:
-                best, places = evenness, current
+            uniformity, following = _spread(current, shown, _FINE)
+            if uniformity > best:
+                best, places = uniformity, current
     return SliderRemap(places[::_FINE].contiguous(), even[::_FINE].contiguous())
 
 

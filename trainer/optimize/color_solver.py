@@ -37,7 +37,7 @@ HURRIED_STEPS, HURRIED = 4, 60
 mottled half way (held out, s = .5: 30.1 dB; 33.3 with 60, 35.7 with 100)."""
 
 BANDS_HELD = 0.1
-"""How strongly the higher bands are held to what the change of DC foretells, beside what the views say of
+"""How strongly the higher bands are held to what the change of DC predicts, beside what the views say of
 them: views are few directions, and bands that are free fit these and shine in others."""
 
 _A = TypeVar("_A")

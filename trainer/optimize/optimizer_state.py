@@ -1,4 +1,4 @@
-"""Where the optimization stands between two steps: the members' offsets, Adam's memory, what was measured.
+"""The state of the optimization between two steps: the members' offsets, Adam's memory, what was measured.
 
 Everything that decides the steps to come is here, and nothing that can be computed again from the run's
 inputs. So a run that is stopped between two steps goes on from `PgsState.capture_state` to the same bits.

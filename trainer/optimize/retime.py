@@ -48,7 +48,7 @@ def retime(
 
     The chord length between pictures is what counts: arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
-    stretches the slider accordingly. Chords are as long as the steps that a hand makes: shorter ones count
+    stretches the slider accordingly. Chords are as long as the steps that a user makes: shorter ones count
     jitter that no step shows (a recolored robot's 20 steps: least over largest .71 instead of .66; a bear's
     scarf .93 instead of .76, its hands .85).
 

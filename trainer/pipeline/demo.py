@@ -124,11 +124,11 @@ class DemoOptions:
     size: int | None = None
     """Number of Gaussians; by default 24000 for the bear, 40000 for the room."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
-    """Folder for the scene, the edits and the pictures; made if need be."""
+    """Folder for the scene, the edits and the pictures; created if needed."""
     quick: bool = False
     """A draft in a third of the time: fewer views, smaller, fewer steps."""
     seed: int = 0
-    """Of the scene and of the training."""
+    """Random seed of the scene and of the training."""
     threads: int = 0
     """CPU threads; 0 takes all cores."""
     window: bool = True

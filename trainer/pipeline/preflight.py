@@ -22,7 +22,7 @@ def check_command(options: TrainOptions, edit: Mapping[str, str]) -> None:
     A run that goes on needs no longer what it began with: its region and its edited views are kept.
 
     Args:
-        options: settled
+        options: resolved
         edit: see `check_folder`
 
     Raises:

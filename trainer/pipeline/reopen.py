@@ -35,7 +35,7 @@ class FinishedRun:
         scene: the original
         region: what was edited
         trajectory: what was recorded
-        about: what the trajectory's file tells of the run: options, losses, …
+        about: what the trajectory's file says of the run: options, losses, …
     """
 
     folder: RunFolder

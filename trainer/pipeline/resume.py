@@ -59,7 +59,7 @@ def decide_resume(
 
     Args:
         folder: opened and locked
-        options: settled
+        options: resolved
         edit: see `open_run_folder`
         region: what may change
         threads: that the options ask for

@@ -61,7 +61,7 @@ def optimize_members(
     renewal: Renewal | None = None,
     unseen_members: UnseenMembers | None = None,
 ) -> tuple[Trajectory, Losses]:
-    """Optimize the members, from the beginning or from where the saved state stands.
+    """Optimize the members, from the beginning or from the saved state.
 
     Args:
         options: see `TrainOptions`
@@ -107,20 +107,18 @@ def optimize_members(
             solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
-    beside = begin_joint_training(make_plan(options), setup, settings.rates, stages)
+    joint = begin_joint_training(make_plan(options), setup, settings.rates, stages)
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
-    kept = PeriodicSave(
-        folder, PART, parts | ({"field": beside} if beside else {}), every_s=options.save_every
-    )
+    kept = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}), every_s=options.save_every)
     if kept.restore():
-        if beside is not None:
-            beside.refill([(made.step, made.offsets) for made in recordings.made])
+        if joint is not None:
+            joint.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
     with log.steps("optimize", steps) as advance, defer_signals() as stopped:
 
         def step_done(step: int, left: float) -> None:
-            if beside is not None:
-                beside.step()
+            if joint is not None:
+                joint.step()
             advance(step, f"loss to the edit {left:.4f}")
             if stopped():
                 kept.save()
@@ -137,8 +135,8 @@ def optimize_members(
         try:
             for found in way_there:
                 recordings.add(found)
-                if beside is not None:
-                    beside.add(found.step, found.offsets)
+                if joint is not None:
+                    joint.add(found.step, found.offsets)
         except FloatingPointError as error:
             kept.save()
             raise ProgdfError(
@@ -146,8 +144,8 @@ def optimize_members(
                 "with --resume, or try --kind style in another folder"
             ) from error
     kept.save()
-    if beside is not None:
-        save_network(beside, folder)
+    if joint is not None:
+        save_network(joint, folder)
     losses = loss_table([(made.step, made.means) for made in recordings.made])
     left = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")

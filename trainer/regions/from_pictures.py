@@ -81,7 +81,7 @@ def region_settings(
     """What the options of a run say; pictures that are segmented are kept in its folder.
 
     Args:
-        options: settled
+        options: resolved
         edit: see `open_run_folder`
         quiet, say: see `RegionSettings`
     """
@@ -191,7 +191,7 @@ def _lift(
     name: str,
     settings: RegionSettings,
 ) -> Region:
-    """The region that the masks tell of; a view without a mask tells nothing."""
+    """The region that the masks select; a view without a mask adds nothing."""
     given = [
         (fit_size(c, LIFTED_AT), mask) for c, mask in zip(cameras, masks, strict=True) if mask is not None
     ]

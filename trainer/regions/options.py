@@ -23,7 +23,7 @@ class RegionOptions:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """picture.png, in which the region is tinted and the rest is pale; or members.npy, its rows (int64)."""
     cameras: Path | None = None
-    """masks: their cameras, where DIR holds none; text: views to look for it in."""
+    """masks: their cameras, where DIR holds none; text: views in which to look for it."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="FILE[:INDEX]")] = None
     """Look through a camera of this file, the first where no INDEX is given."""
     orbit: Annotated[str | None, tyro.conf.arg(metavar="AZ,EL[,DISTANCE]")] = None
@@ -56,7 +56,7 @@ class ViewsOptions:
     region: str | None = None
     """The rig looks at this region instead of the whole scene."""
     views: int = 12
-    """How many views, at most; of more cameras the ones that differ most."""
+    """How many views, at most; of more cameras, those that differ most."""
     image_size: int = 768
     """Longer side of the views in pixels."""
     up: UpChoice = "auto"

@@ -56,7 +56,7 @@ class Measured:
     Args:
         fitted: the field and its baselines, on the trajectory's slider
         shown: the field as it is shipped, on a slider of its own
-        dial: from the trajectory's slider to that
+        remap: from the trajectory's slider to that
         asked: slider value of what the editor was asked for, and the strength that it was asked at
         slider: how the slider feels
         at_recordings: worst PSNR of the field at the recordings themselves, dB
@@ -94,7 +94,7 @@ def measure(
         trajectory: what was recorded
         fitted: the field and its baselines
         shown: the field as it is shipped
-        dial: from the trajectory's slider to the shipped field's
+        remap: from the trajectory's slider to the shipped field's
         perceptual: LPIPS, or its stand-in
         clip: measured already, or the reason why not
     """

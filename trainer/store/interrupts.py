@@ -27,7 +27,7 @@ def interrupt_on_signals() -> Iterator[None]:
 
 @contextmanager
 def defer_signals() -> Iterator[Callable[[], bool]]:
-    """Hold Ctrl-C, SIGTERM and SIGHUP back; the yielded function tells whether one came.
+    """Hold Ctrl-C, SIGTERM and SIGHUP back; the yielded function says whether one came.
 
     Ask it where the state is whole, save, and raise KeyboardInterrupt. A second signal does not wait, and
     neither does one that nobody asked about.
@@ -50,7 +50,7 @@ def defer_signals() -> Iterator[Callable[[], bool]]:
 def _handle_signals(
     signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
 ) -> Iterator[None]:
-    """Python lets only the main thread handle signals; elsewhere whoever owns that thread does."""
+    """Python lets only the main thread handle signals; elsewhere the owner of that thread does."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

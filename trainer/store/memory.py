@@ -26,7 +26,7 @@ class PeakMemory:
             self.by_stage[stage] = max(peak, self.by_stage.get(stage, 0))
 
     def peak(self) -> int | None:
-        """Of the process and of earlier sessions of the same run; None where it cannot be told."""
+        """Of the process and of earlier sessions of the same run; None where it is unknown."""
         return max(round(_peak_mb()), self._earlier) or None
 
     def restore(self, by_stage: Mapping[str, int], peak: int | None) -> None:
@@ -37,7 +37,7 @@ class PeakMemory:
 
 
 def _peak_mb() -> float:
-    """Peak since the process began; 0 where it cannot be told.
+    """Peak since the process began; 0 where it is unknown.
 
     On Linux not `getrusage`, whose figure begins with what the parent held when it started this process.
     """

@@ -1,4 +1,4 @@
-"""How a run tells what it does: a bar with loss and time left on a terminal, plain lines elsewhere."""
+"""How a run reports its progress: a bar with loss and time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class RunLog:
 
     def close(self) -> None:
         """End the file."""
-        with suppress(OSError):  # a full disk, which whoever could not write to it has told already
+        with suppress(OSError):  # a full disk, which has been reported already
             self._file.close()
 
     def _total(self) -> float:

@@ -140,7 +140,7 @@ def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
 
 
 def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
-    """A new log.txt; its first line tells that the folder is a run, and of which edit."""
+    """A new log.txt; its first line says that the folder is a run, and of which edit."""
     with atomic_write(folder.log) as temporary_file:
         line = f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n"
         temporary_file.write_text(line, encoding="utf-8")

@@ -49,7 +49,7 @@ class Saved:
 class Resumable(Protocol):
     """Something that trains for many steps and can be stopped between any two.
 
-    The members' optimization is one (`descent.PgsState`). Whatever trains beside it, such as a field fitted
+    The members' optimization is one (`PgsState`). Whatever trains with it, such as a field fitted
     jointly, implements these two and is given to `PeriodicSave` under a name of its own: all members of
     one `PeriodicSave` go into one file, so that they are always of the same step. What they hold must decide
     every later bit: parameters, Adam moments and the step count, and the state of every random generator,
@@ -81,7 +81,7 @@ class StateFolder:
         return self.path / "run.json"
 
     def identity(self) -> dict[str, Any] | None:
-        """What `begin` was told; None where no run was stopped."""
+        """What `begin` was given; None where no run was stopped."""
         try:
             return convert_json(decode_json(self._run.read_bytes()), dict[str, Any])
         except (FileNotFoundError, NotADirectoryError):

@@ -3,7 +3,7 @@
 A scene comes with hundreds of cameras, in the order in which someone walked; 96 is the most that ProGDF
 (AAAI 2025) edits. The first 96 would show one side. So a camera is worth what it shows of the region that no
 camera taken before shows from near the same direction: every part of the region is seen, and from all around,
-whatever the list's order. The same measure tells which views stand for the others, to be held out.
+whatever the list's order. The same measure decides which views represent the others, to be held out.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .view import View, fit_size, make_view
 from .visible_area import visible_area
 
 _SAMPLES = 256
-"""Members that stand for the region when views are compared."""
+"""Members that represent the region when views are compared."""
 
 _LOOK = 96
 """Longer side in pixels at which cameras are compared."""
@@ -175,7 +175,7 @@ def _reach(count: int) -> float:
 
 
 def sample_members(scene: Gaussians, region: Region) -> Tensor:
-    """Rows that stand for the region, evenly by the area they can cover. -> [S] int64"""
+    """Rows that represent the region, evenly by the area they can cover. -> [S] int64"""
     total = visible_area(scene[region.members]).cumsum(dim=0)
     ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
     picked = torch.searchsorted(total, ticks).clamp_max(len(total) - 1)

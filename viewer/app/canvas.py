@@ -1,4 +1,4 @@
-"""The picture in the window: drawn when it is another than the last one, coarsely while a hand moves it."""
+"""The picture in the window: drawn when it is another than the last one, coarsely while it moves."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Canvas:
         Args:
             focus: the layer whose painted weights are shown while the brush is out, or None
             overlap: the layer of which is shown what it shares with the others, or None
-            held: a hand is on something, so that more will follow
+            held: the mouse holds something, so that more will follow
             now: seconds on the main view's clock
 
         Raises:
@@ -66,7 +66,7 @@ class Canvas:
         aim, edits = (view.camera, size), (view.layers, view.blend, view.background)
         turned, slid = aim != self._last[0], edits != self._last[1]
         self._last = aim, edits
-        mode = "off" if view.compare.mode == "difference" else view.draft
+        mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         self._resolution = dynamic_resolution.before_draw(self._resolution, mode, held, turned, slid, now)
         self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap)
         new = self.comparer.needs_draw(view, size, self.pixels)

@@ -46,7 +46,7 @@ def draw(view: ViewState, said: Labels, area: Area, held: bool, ui: UiContext) -
 
     Args:
         said: the words
-        held: the divider is in the hand, or under it
+        held: the mouse holds the divider, or is over it
     """
     if view.compare.mode == "difference":
         overlay.banner(said.line, area, ui)

@@ -69,7 +69,7 @@ def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiC
     Args:
         recent: files opened before, the last one first
         pressed: chords that went down in this frame
-        area: the picture; the question stands in its upper part
+        area: the picture; the question is in its upper part
     """
     if not imgui.is_popup_open(_POPUP):
         imgui.open_popup(_POPUP)

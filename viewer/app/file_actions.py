@@ -176,18 +176,18 @@ class FileActions:
         self._app.show(opened.document)
         main_view = self._app.main_view
         main_view.restart(opened.view, opened.snapshots)
-        beside = autosaves.session_of(path)
-        if beside is None:
+        saved = autosaves.session_of(path)
+        if saved is None:
             self.path = path
             self.offer_autosave()
             return
         main_view.work = replace(main_view.work, saved=None)
         discarded = autosaves.is_discarded(path)
         # what was never saved, or was discarded, never takes the place of a session unasked
-        self.path = beside if beside.is_file() and not discarded else None
+        self.path = saved if saved.is_file() and not discarded else None
         if not discarded:
             self.session_autosave.continue_from(path)
-            main_view.show_message(f"Restored the unsaved work of {beside.name}")
+            main_view.show_message(f"Restored the unsaved work of {saved.name}")
 
     def offer_autosave(self) -> None:
         """Ask what becomes of work that was left unsaved the last time, of the latest first."""

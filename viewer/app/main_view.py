@@ -225,20 +225,20 @@ class MainView:
         self.work = perform(self.work, action, self.facts, area.width / area.height)
 
     def _pointer(self) -> PointerContext:
-        """What lies under the hand."""
+        """What lies under the mouse."""
         return PointerContext(self.engine, self.facts, self._shown_view(), self._area(), self.ui, self._clock)
 
     def _shown_view(self) -> ViewState:
         return workspace.original(self.work.view) if inputs.holds_original(self._keys) else self.work.view
 
     def _is_held(self) -> bool:
-        """Whether a hand is on something that moves the picture, or a film plays."""
+        """Whether the user holds something that moves the picture, or a film plays."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
         return inputs.is_flying(self._keys) or inputs.is_repeating(self._keys) or self.work.player.playing
 
     def _draw_overlays(self) -> None:
-        """What stands over the picture; where some of it goes away, another frame follows."""
+        """What is drawn over the picture; where some of it goes away, another frame follows."""
         pointer, before = self._pointer(), self.work
         pressed = [press.chord for press in self._keys.pressed]
         self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)

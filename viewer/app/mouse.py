@@ -42,7 +42,7 @@ class MouseTool:
 
 @dataclass(frozen=True)
 class PointerContext:
-    """What lies under the hand in one frame.
+    """What lies under the mouse in one frame.
 
     Args:
         engine: draws the picture
@@ -160,7 +160,7 @@ def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[M
 
 
 def _has_traveled(ui: UiContext) -> bool:
-    """Whether the left button moved between its press and its release, by more than a hand trembles."""
+    """Whether the left button moved between its press and its release, by more than a tremor."""
     way = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
     return bool(way.x or way.y)
 

@@ -1,4 +1,4 @@
-"""What the hand does to the camera, as pure functions, and the table of bindings, as data.
+"""What the mouse and the keys do to the camera, as pure functions, and the table of bindings, as data.
 
 Pixels are window coordinates at 1× (the caller divides by the UI scale), angles degrees, lengths world units.
 No function ever returns a camera that is not finite: a move that would leave the numbers is not made.
@@ -20,14 +20,14 @@ CLOSEST, WIDEST = 1e-4, 1e4  # of the scene's radius: how near to and far from t
 
 
 def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
-    """Turn around the pivot so that the scene follows the hand; stops at the poles."""
+    """Turn around the pivot so that the scene follows the mouse; stops at the poles."""
     elevation = max(-90.0, min(90.0, camera.elevation + DEGREES_PER_PIXEL * dy))
     azimuth = _wrap_degrees(camera.azimuth - DEGREES_PER_PIXEL * dx)
     return _keep_finite(replace(camera, azimuth=azimuth, elevation=elevation), camera)
 
 
 def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
-    """Turn the head where the eye stands (fly mode): right looks right, down looks down."""
+    """Turn the view with the eye fixed (fly mode): right looks right, down looks down."""
     turned = orbit(camera, dx, dy)
     position = eye(camera)
     return _keep_finite(
@@ -235,7 +235,7 @@ KEYS = (
     KeyBinding("Ctrl+Shift+S", "save_as", "save the session as"),
     KeyBinding("Ctrl+O", "open", "open a session, scene or edit"),
     KeyBinding("F10", "overlay", "show timings"),
-    KeyBinding("Shift+F10", "draft", "dynamic resolution: auto, on, off"),
+    KeyBinding("Shift+F10", "dynamic_resolution", "dynamic resolution: auto, on, off"),
     KeyBinding("F11", "full_screen", "full screen"),
     KeyBinding("F12", "panel", "show or hide the panel"),
     KeyBinding("Ctrl+Q", "quit", "quit"),

@@ -1,4 +1,4 @@
-"""What the hand does, in the words of `controls`: which actions keys ask for, which drag has begun."""
+"""User input in the words of `controls`: which actions keys ask for, which drag has begun."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class StackOptions:
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
     """Strength of an edit, 0 to 1; repeat it for several edits. Without any, `render` and `export` show every
-    edit at 1 and `view` opens at 0; beside a session it takes the place of the session's."""
+    edit at 1 and `view` opens at 0; with a session it replaces the session's."""
     gain: Gains = ()
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
     solo: Solo = ()
@@ -38,9 +38,9 @@ class StackOptions:
     paint: Paint = ()
     """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: bool = False
-    """Let strengths go on to 1.2; beyond 1 an edit is extrapolated."""
+    """Overshoot to 1.2: extrapolates past the trained range."""
     blend: Blend | None = None
-    """How edits that share Gaussians go together; normalized, or as the session has it, if not given."""
+    """How edits that share Gaussians add up; by default the session's rule, else normalized."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,13 +48,13 @@ class PictureOptions(StackOptions):
     """The stack as a picture shows it."""
 
     up: UpChoice = "auto"
-    """The axis of the scene that is up; auto: as the edits were trained, or as a ground lies, or −y."""
+    """The axis of the scene that is up; auto: as the edits were trained, else from the ground, else −y."""
     background: str = "white"
     """#rrggbb, white or black."""
     engine: Annotated[Literal["auto", "gl", "cpu"], tyro.conf.arg(aliases=["--draw"])] = "auto"
     """What draws: OpenGL or the CPU rasterizer; auto takes OpenGL where a graphics card does the work."""
     edit_pass: Literal["auto", "gpu", "cpu"] = "auto"
-    """What works out the attributes of a new strength; auto takes the GPU where a graphics card draws."""
+    """What computes the attributes of a new strength; auto takes the GPU where a graphics card draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ class RenderOptions(PictureOptions):
     difference: Annotated[str | None, tyro.conf.arg(metavar="[AMPLIFY]")] = None
     """What differs from the original, amplified (4), with the PSNR."""
     against: Literal["original", "recorded"] | None = None
-    """What --split and --difference set the picture against: the original, or what training recorded."""
+    """What --split and --difference compare with: the original, or what training recorded."""
     timeline: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
     """A film of the keys in this file (Ctrl+K in the window), or in the session: .gif, .mp4, or a folder for
     .png frames; with --sheet N a contact sheet of N of them."""

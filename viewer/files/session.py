@@ -127,7 +127,7 @@ def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapsh
         _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)
         _check_known("view.compare.mode", view.compare.mode, MODES)
         _check_known("view.compare.against", view.compare.against, AGAINST)
-        _check_known("view.draft", view.draft, RESOLUTION_MODES)
+        _check_known("view.dynamic_resolution", view.dynamic_resolution, RESOLUTION_MODES)
         _check_known("view.brush.mode", view.brush.mode, paint.MODES)
         _check("view.brush.radius", [view.brush.radius], paint.SMALLEST_PX, paint.LARGEST_PX)
         _check("view.brush.softness", [view.brush.softness], 0.0, 1.0)

@@ -36,7 +36,7 @@ class DynamicResolution:
 
 
 def before_draw(
-    draft: DynamicResolution, mode: str, held: bool, turned: bool, slid: bool, now: float
+    known: DynamicResolution, mode: str, held: bool, turned: bool, slid: bool, now: float
 ) -> DynamicResolution:
     """Before a picture is drawn: how it shall be drawn.
 
@@ -47,29 +47,29 @@ def before_draw(
         slid: whether what is drawn is another
         now: seconds on the main view's clock
     """
-    draft = draft if held else replace(draft, slider_ms=())
-    full = replace(draft, pixels=1, rest_at=None)
+    known = known if held else replace(known, slider_ms=())
+    full = replace(known, pixels=1, rest_at=None)
     if mode == "off":
         return full
     if turned or slid:
-        pays = mode == "on" or draft.pixels > 1 or _slow(draft.camera_ms if turned else draft.slider_ms)
-        return replace(draft, pixels=COARSE, rest_at=now + REST_S) if held and pays else full
-    return full if draft.rest_at is None or now >= draft.rest_at else draft
+        pays = mode == "on" or known.pixels > 1 or _slow(known.camera_ms if turned else known.slider_ms)
+        return replace(known, pixels=COARSE, rest_at=now + REST_S) if held and pays else full
+    return full if known.rest_at is None or now >= known.rest_at else known
 
 
-def after_draw(draft: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
+def after_draw(known: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
     """After a picture was drawn: what it took. A coarse one tells nothing of a full one."""
-    if draft.pixels > 1:
-        return draft
+    if known.pixels > 1:
+        return known
     if timings.share == 1.0:
-        draft = replace(draft, camera_ms=(*draft.camera_ms[-1:], timings.total_ms))
-    return draft if turned else replace(draft, slider_ms=(*draft.slider_ms[-1:], timings.total_ms))
+        known = replace(known, camera_ms=(*known.camera_ms[-1:], timings.total_ms))
+    return known if turned else replace(known, slider_ms=(*known.slider_ms[-1:], timings.total_ms))
 
 
 def _slow(pictures_ms: tuple[float, ...]) -> bool:
     return len(pictures_ms) == 2 and min(pictures_ms) > SLOW_MS
 
 
-def next_frame_delay(draft: DynamicResolution, now: float) -> float | None:
+def next_frame_delay(known: DynamicResolution, now: float) -> float | None:
     """Seconds until the picture has to be drawn in full; None where it is."""
-    return None if draft.rest_at is None else max(draft.rest_at - now, 0.0)
+    return None if known.rest_at is None else max(known.rest_at - now, 0.0)

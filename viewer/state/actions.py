@@ -284,7 +284,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
     "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
     "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),
-    "draft": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
+    "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
     **{name: _timeline_action(name) for name in playback.ACTIONS},

@@ -114,7 +114,7 @@ class ViewState:
         overshoot: sliders go on to `stack.OVERSHOOT`, which extrapolates
         unfolded: which edits (`LayerState.gdf`) show their gains and curve
         brush: what paints
-        draft: when the window draws coarsely while something moves, of `RESOLUTION_MODES`; files never are
+        dynamic_resolution: of `RESOLUTION_MODES`: when the window draws coarsely while something moves
     """
 
     camera: ViewCamera = ViewCamera()
@@ -128,15 +128,14 @@ class ViewState:
     unfolded: tuple[int, ...] = ()
     brush: Brush = Brush()
     timeline: Timeline = Timeline()
-    draft: str = "auto"
+    dynamic_resolution: str = "auto"
 
 
 RESOLUTION_MODES = ("auto", "on", "off")
-"""`ViewState.draft`: where it pays, always, never."""
+"""`ViewState.dynamic_resolution`: where it pays, always, never."""
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:
     """The state with the next of `RESOLUTION_MODES`."""
-    return replace(
-        view, draft=RESOLUTION_MODES[(RESOLUTION_MODES.index(view.draft) + 1) % len(RESOLUTION_MODES)]
-    )
+    following = RESOLUTION_MODES.index(view.dynamic_resolution) + 1
+    return replace(view, dynamic_resolution=RESOLUTION_MODES[following % len(RESOLUTION_MODES)])

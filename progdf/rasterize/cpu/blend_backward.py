@@ -26,7 +26,7 @@ SUMS = 9
 
 _ZERO: Number = np.float32(0.0)
 _ONE: Number = np.float32(1.0)
-# planes of the state: transmittance after the splat at hand; what lies behind it, times the gradient; the
+# planes of the state: transmittance after the current splat; what lies behind it, times the gradient; the
 # image's gradient (3); place of the last contributor
 _BEHIND, _G0, _G1 = spans.PLANE, spans.PLANE * np.uint64(2), spans.PLANE * np.uint64(3)
 _G2, _LAST = spans.PLANE * np.uint64(4), spans.PLANE * np.uint64(5)

@@ -128,7 +128,7 @@ def _share(kernel: Callable[[int, int], _T], count: int, block: int) -> list[_T]
 def _keep_freed_memory() -> None:
     """Free one large block: from then on glibc keeps blocks up to this size, the largest that it ever keeps.
 
-    Otherwise every pass would hand its memory back to the system and take it anew page by page, which was a
+    Otherwise every pass would return its memory to the system and take it again page by page, which was a
     fifth of the time of 20 000 Gaussians. Nothing touches the block, so it costs nothing, there or elsewhere.
     """
     np.empty((32 << 20) - (64 << 10), np.uint8)

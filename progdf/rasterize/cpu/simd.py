@@ -3,8 +3,8 @@
 numba has no vector type, and whether LLVM turns a loop into vector code, and in which order it adds up, is
 LLVM's choice: plain loops are 1.3 to 1.5 times slower, and their bits differ from processor to processor.
 A `Vector` is LLVM's <8 x float>: one AVX register, two of SSE's or NEON's. Arithmetic and comparisons are
-Python's own, lane by lane, with the float flags of the kernel that they stand in; a float32 beside a vector
-stands for eight equal ones.
+Python's own, lane by lane, with the float flags of the kernel around them; a float32 beside a vector
+counts as eight equal ones.
 """
 
 from __future__ import annotations

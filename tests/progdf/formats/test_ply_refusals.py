@@ -69,9 +69,12 @@ def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
         (b"ply\nformat ascii 1.0\n", "end_header"),
         (b"ply\nend_header\n", "format"),
         (b"ply\nformat ascii 1.0\nend_header\n", "vertex"),
-        (b"ply\nformat ascii 2.0\nend_header\n", "header line"),
-        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "header line"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty int x\nend_header\n", "twice"),
+        (b"ply\nformat ascii 2.0\nend_header\n", "line 2: expected version"),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "broken header"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty int x\nend_header\n",
+            "same name",
+        ),
     ):
         path.write_bytes(content)
         assert said in refusal(load_ply, path)
@@ -139,7 +142,7 @@ def test_words_between_the_numbers_are_refused(tmp_path: Path) -> None:
     lines = path.read_bytes().split(b"\n")
     lines[-3] = lines[-3].replace(b" ", b" ?", 1)
     path.write_bytes(b"\n".join(lines))
-    assert "not a number" in refusal(load_ply, path)
+    assert "no number, at row" in refusal(load_ply, path)
 
 
 def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:
@@ -148,7 +151,7 @@ def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:
     lines[-3] = lines[-3].replace(b" ", b" " + b"1" * 400_000, 1)
     path.write_bytes(b"\n".join(lines))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert "numbers in row" in refusal(load_ply, path)
+    assert "at row 48" in refusal(load_ply, path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
@@ -160,6 +163,16 @@ def test_millions_of_lists_before_the_vertices_are_refused_and_not_stepped_over(
     face = b"element face 2000000\nproperty list uchar uchar corners\nelement vertex"
     path.write_bytes(head + face + columns + b"end_header\n" + b"\0" * 2_000_000 + rows)
     assert "vertices first" in refusal(load_ply, path)
+
+
+def test_a_million_million_rows_of_nothing_cost_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(path, scene_of())
+    content = path.read_bytes().replace(b"element vertex", b"element a 1000000000000\nelement vertex")
+    path.write_bytes(content)
+    assert len(load_ply(path)) == COUNT
+    path.write_bytes(content.replace(b"binary_little_endian", b"ascii"))
+    assert "truncated" in refusal(load_ply, path)
 
 
 def test_a_header_is_looked_through_once(tmp_path: Path) -> None:

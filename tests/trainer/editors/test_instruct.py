@@ -91,10 +91,10 @@ def test_one_target_by_default_and_strengths_by_guidance_on_request(pix2pix: str
     assert editor_of(settings_of(pix2pix)).stages == (1.0,)
     with pytest.raises(ValueError, match=r"not 0\.5"):
         editor_of(settings_of(pix2pix)).edit(view, 0.5)
-    dial = editor_of(settings_of(pix2pix, dial=True))
-    assert dial.stages == ()
+    graded = editor_of(settings_of(pix2pix, graded=True))
+    assert graded.stages == ()
     half = editor_of(settings_of(pix2pix, guidance=4.25)).edit(view, 1.0)  # half way from 1 to 7.5
-    assert torch.equal(dial.edit(view, 0.5), half)
+    assert torch.equal(graded.edit(view, 0.5), half)
 
 
 def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> None:

@@ -85,8 +85,8 @@ def test_steps_are_even_wherever_they_begin() -> None:
         return torch.tensor([s + 0.8 * (1 - math.cos(9 * s)) / 9 + 2.0 * s**4], dtype=torch.float64)
 
     before = uniformity(torch.cat([seen(i / 20) for i in range(21)]))
-    dial = equalizing_remap(seen)
-    back = type(dial)(dial.new, dial.old)
+    remap = equalizing_remap(seen)
+    back = type(remap)(remap.new, remap.old)
     assert before < 0.4
     for phase in (0.0, 0.25, 0.5, 0.75):
         steps = torch.cat([seen(back.at((i + phase) / 20)) for i in range(20)])
@@ -94,8 +94,8 @@ def test_steps_are_even_wherever_they_begin() -> None:
 
 
 def test_what_never_changes_keeps_its_slider() -> None:
-    dial = equalizing_remap(lambda s: torch.zeros(4))
-    assert dial.at(0.3) == pytest.approx(0.3)
+    remap = equalizing_remap(lambda s: torch.zeros(4))
+    assert remap.at(0.3) == pytest.approx(0.3)
 
 
 def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
@@ -109,7 +109,7 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
     field = fit_separable(strengths, offsets, {"sh0": 2})
     train, held_out = case.views[:4], case.views[4:]
     setup = TrainingSetup(case.scene, case.region, train, held_out, WHITE)
-    even, dial = equalize_slider(field, setup)
+    even, remap = equalize_slider(field, setup)
     crops = [crop_scene(case.scene, members, view.camera, view.box, WHITE) for view in held_out]
     before, after = (
         slider_statistics(lambda s, f=f: render_all(crops, original + f.offsets(s))) for f in (field, even)
@@ -117,7 +117,7 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
     assert before.uniformity < 0.3
     assert after.uniformity > 0.85
     assert torch.equal(even.offsets(1.0), field.offsets(1.0))
-    assert dial.at(0.5) < 0.3, "half the strength is far less than half of the change"
+    assert remap.at(0.5) < 0.3, "half the strength is far less than half of the change"
 
 
 def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given() -> None:

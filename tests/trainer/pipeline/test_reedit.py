@@ -76,7 +76,15 @@ def test_a_run_that_goes_on_between_two_edits_has_the_last_one_s_pictures(tmp_pa
 
 
 def styled(folder: Path, out: str, **more: object) -> TrainOptions:
-    settings = {"steps": 24, "stages": 2, "views": 4, "image_size": 48, "reedit_every": 5, **more}
+    settings = {
+        "steps": 24,
+        "stages": 2,
+        "views": 4,
+        "image_size": 48,
+        "reedit_every": 5,
+        "edit_size": 64,
+        **more,
+    }
     return quick_options(folder, out, editor="style:14", field="keyframes", **settings)
 
 

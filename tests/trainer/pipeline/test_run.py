@@ -27,6 +27,7 @@ from trainer.option_checks import resolve_options
 from trainer.options import FitOptions
 from trainer.pipeline.refit import refit
 from trainer.pipeline.run import RunResult, train
+from trainer.report.plots import LINES, draw_plot
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +40,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def done(folder: Path) -> RunResult:
-    """A finished run of a few seconds, shared by the tests that only look."""
-    return train(quick_options(folder), quiet=True)
+    """A finished run of a few seconds, shared by the tests that only look; with its curves drawn."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trainer.report.report.draw_plot", draw_plot)
+        return train(quick_options(folder), quiet=True)
+
+
+def test_the_report_s_picture_ends_in_curves(done: RunResult) -> None:
+    with Image.open(done.folder.root / "report.png") as picture:
+        last = np.asarray(picture.convert("RGB"), dtype=int)[-200:]
+    for line in LINES[:2]:
+        assert (np.abs(last - line).max(axis=2) <= 12).sum() > 50
 
 
 def test_training_lowers_the_loss_and_reaches_held_out_views(done: RunResult) -> None:

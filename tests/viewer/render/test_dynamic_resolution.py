@@ -10,7 +10,7 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys, Press
-from viewer.render import dynamic_resolution as draft
+from viewer.render import dynamic_resolution
 from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution
 from viewer.render.timings import FrameTimings
 
@@ -21,71 +21,103 @@ MIDDLE = (170.0, 270.0)
 
 
 def twice(known: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
-    return draft.after_draw(draft.after_draw(known, timings, turned), timings, turned)
+    return dynamic_resolution.after_draw(
+        dynamic_resolution.after_draw(known, timings, turned), timings, turned
+    )
 
 
 def test_a_slow_picture_is_coarse_while_the_camera_is_held() -> None:
     known = twice(DynamicResolution(), SLOW, turned=True)
-    moving = draft.before_draw(known, "auto", held=True, turned=True, slid=False, now=1.0)
+    moving = dynamic_resolution.before_draw(known, "auto", held=True, turned=True, slid=False, now=1.0)
     assert moving.pixels == COARSE
-    assert draft.next_frame_delay(moving, 1.0) == pytest.approx(REST_S)
+    assert dynamic_resolution.next_frame_delay(moving, 1.0) == pytest.approx(REST_S)
 
 
 def test_a_quick_picture_never_is() -> None:
     known = twice(DynamicResolution(), QUICK, turned=True)
-    assert draft.before_draw(known, "auto", held=True, turned=True, slid=True, now=1.0).pixels == 1
+    assert (
+        dynamic_resolution.before_draw(known, "auto", held=True, turned=True, slid=True, now=1.0).pixels == 1
+    )
 
 
 def test_one_slow_picture_among_quick_ones_changes_nothing() -> None:
     """The first one of all waits for the kernels."""
-    known = draft.after_draw(DynamicResolution(), SLOW, turned=True)
-    for then in (known, draft.after_draw(draft.after_draw(known, QUICK, turned=True), SLOW, turned=True)):
-        assert draft.before_draw(then, "auto", held=True, turned=True, slid=False, now=1.0).pixels == 1
+    known = dynamic_resolution.after_draw(DynamicResolution(), SLOW, turned=True)
+    for then in (
+        known,
+        dynamic_resolution.after_draw(
+            dynamic_resolution.after_draw(known, QUICK, turned=True), SLOW, turned=True
+        ),
+    ):
+        assert (
+            dynamic_resolution.before_draw(then, "auto", held=True, turned=True, slid=False, now=1.0).pixels
+            == 1
+        )
 
 
 def test_a_slider_that_touches_little_stays_sharp_in_a_slow_scene() -> None:
     known = twice(twice(DynamicResolution(), SLOW, turned=True), PART, turned=False)
-    assert draft.before_draw(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels == 1
+    assert (
+        dynamic_resolution.before_draw(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels == 1
+    )
 
 
 def test_a_slider_whose_first_steps_were_slow_goes_on_coarse() -> None:
-    first = draft.before_draw(DynamicResolution(), "auto", held=True, turned=False, slid=True, now=1.0)
+    first = dynamic_resolution.before_draw(
+        DynamicResolution(), "auto", held=True, turned=False, slid=True, now=1.0
+    )
     assert first.pixels == 1, "nothing is known of it yet"
     second = twice(first, SLOW, turned=False)
-    assert draft.before_draw(second, "auto", held=True, turned=False, slid=True, now=1.1).pixels == COARSE
-    let_go = draft.before_draw(second, "auto", held=False, turned=False, slid=False, now=1.1)
-    assert draft.before_draw(let_go, "auto", held=True, turned=False, slid=True, now=1.2).pixels == 1
+    assert (
+        dynamic_resolution.before_draw(second, "auto", held=True, turned=False, slid=True, now=1.1).pixels
+        == COARSE
+    )
+    let_go = dynamic_resolution.before_draw(second, "auto", held=False, turned=False, slid=False, now=1.1)
+    assert (
+        dynamic_resolution.before_draw(let_go, "auto", held=True, turned=False, slid=True, now=1.2).pixels
+        == 1
+    )
 
 
 def test_one_click_is_drawn_sharp_at_once() -> None:
     known = twice(DynamicResolution(), SLOW, turned=True)
-    assert draft.before_draw(known, "on", held=False, turned=True, slid=True, now=1.0).pixels == 1
+    assert (
+        dynamic_resolution.before_draw(known, "on", held=False, turned=True, slid=True, now=1.0).pixels == 1
+    )
 
 
 def test_it_stays_coarse_between_two_steps_of_a_hand_and_is_sharp_at_rest() -> None:
-    moving = draft.before_draw(DynamicResolution(), "on", held=True, turned=True, slid=False, now=1.0)
-    between = draft.before_draw(moving, "on", held=True, turned=False, slid=False, now=1.0 + 0.5 * REST_S)
+    moving = dynamic_resolution.before_draw(
+        DynamicResolution(), "on", held=True, turned=True, slid=False, now=1.0
+    )
+    between = dynamic_resolution.before_draw(
+        moving, "on", held=True, turned=False, slid=False, now=1.0 + 0.5 * REST_S
+    )
     assert between.pixels == COARSE
-    rested = draft.before_draw(between, "on", held=True, turned=False, slid=False, now=1.0 + REST_S)
+    rested = dynamic_resolution.before_draw(
+        between, "on", held=True, turned=False, slid=False, now=1.0 + REST_S
+    )
     assert rested.pixels == 1
-    assert draft.next_frame_delay(rested, 2.0) is None
+    assert dynamic_resolution.next_frame_delay(rested, 2.0) is None
 
 
 def test_what_a_coarse_picture_took_is_not_remembered() -> None:
-    moving = draft.before_draw(
+    moving = dynamic_resolution.before_draw(
         DynamicResolution(camera_ms=(90.0, 90.0)), "auto", held=True, turned=True, slid=False, now=1.0
     )
-    assert draft.after_draw(moving, QUICK, turned=True).camera_ms == (90.0, 90.0)
+    assert dynamic_resolution.after_draw(moving, QUICK, turned=True).camera_ms == (90.0, 90.0)
 
 
 def test_off_is_off() -> None:
     moving = DynamicResolution(pixels=COARSE, rest_at=2.0, camera_ms=(500.0, 500.0))
-    assert draft.before_draw(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
+    assert (
+        dynamic_resolution.before_draw(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
+    )
 
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(replace(first_view(bear(), 0.5, 0.5), draft="on")) as made:
+    with rig(replace(first_view(bear(), 0.5, 0.5), dynamic_resolution="on")) as made:
         yield made
 
 
@@ -161,9 +193,9 @@ def test_a_split_is_coarse_on_both_sides_and_a_difference_never(hand: Rig) -> No
 
 @pytest.mark.gl
 def test_the_key_goes_through_the_modes(hand: Rig) -> None:
-    modes = [hand.main_view.work.view.draft]
+    modes = [hand.main_view.work.view.dynamic_resolution]
     for _ in range(3):
         hand.main_view.wake()
         hand.frame(keys=Keys((Press("Shift+F10"),), frozenset({"F10"})))
-        modes.append(hand.main_view.work.view.draft)
+        modes.append(hand.main_view.work.view.dynamic_resolution)
     assert modes == ["on", "off", "auto", "on"]
