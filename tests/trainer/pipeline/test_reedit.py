@@ -71,7 +71,7 @@ def test_a_run_that_goes_on_between_two_edits_has_the_last_one_s_pictures(tmp_pa
     assert first is not None
     assert gone_on is not None
     assert all(torch.equal(a, b) for a, b in zip(first, gone_on, strict=True))
-    with pytest.raises(ProgdfError, match="gone; "):
+    with pytest.raises(ProgdfError, match="missing; "):
         reedit_of(tmp_path)(27, 27, 1.0, nothing_moved())
 
 
