@@ -28,8 +28,8 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 ORDER = {
     "progdf": """gaussians lens sh terminal errors region camera interpolation color metrics demo_scenes io
         rasterize field formats gdf scene compose cli __init__ __main__""",
-    "trainer": """__init__ options option_checks presets plan store views editors segmenters setup regions
-        optimize fit report pipeline cli""",
+    "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
+        optimize fit report plan pipeline cli""",
     "viewer": "__init__ camera gl state render files pictures ui panel app commands",
     "benchmarks": """__init__ courses joint_svd table position_floor ablation field_forms rasterizer
         recorded_runs viewer field_network field_plot field __main__""",

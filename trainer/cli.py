@@ -15,8 +15,9 @@ def train(argv: Sequence[str]) -> int:
     """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
     options = train_options(argv)
     from trainer.pipeline.run import train as run  # only now: --help and a mistyped option need no torch
+    from trainer.plan import make_plan
 
-    run(options)
+    run(make_plan(options), options.out, options.threads, options.resume)
     return 0
 
 

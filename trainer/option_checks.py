@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
 
 from progdf.errors import ProgdfError
 from progdf.metrics.image import NO_DIFFERENCE
@@ -16,30 +14,20 @@ from trainer.options import (
     MOST_STEPS,
     MOST_THREADS,
     NETWORK_OPTIONS,
-    QUICK_STAGES,
-    QUICK_STEPS,
-    QUICK_VIEWS,
     SMALLEST_VIEW,
     VIEWS,
     FitOptions,
     TrainOptions,
 )
+from trainer.presets import PRESETS
 
 
-def resolve_options(options: TrainOptions) -> TrainOptions:
-    """The options with `quick` and the name worked in, and checked.
+def check_options(options: TrainOptions) -> None:
+    """Refuse what makes no sense, and what would be passed over in silence.
 
     Raises:
-        ProgdfError: a number that makes no sense.
+        ProgdfError: a number out of its range, or an option that the editor or the field does not know.
     """
-    if options.quick:
-        options = replace(
-            options,
-            steps=min(options.steps, QUICK_STEPS),
-            stages=min(options.stages, QUICK_STAGES),
-            views=min(options.views or QUICK_VIEWS, QUICK_VIEWS),
-        )
-    name = check_name(options.name or options.out.resolve().name)
     check_ranges(
         ("--views", options.views or VIEWS, 3, 96),
         ("--image-size", options.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
@@ -47,8 +35,6 @@ def resolve_options(options: TrainOptions) -> TrainOptions:
         ("--group-steps", options.group_steps, 0, 10_000),
         ("--seed", options.seed, 0, LARGEST_SEED),
         ("--threads", options.threads, 0, MOST_THREADS),
-        ("--guidance", options.guidance, 1, 100),
-        ("--image-guidance", options.image_guidance, 1, 100),
         ("--edit-steps", options.edit_steps, 1, 1000),
         ("--edit-size", options.edit_size, 32, 4096),
         ("--lift-threshold", options.lift_threshold, 0, 1),
@@ -63,11 +49,27 @@ def resolve_options(options: TrainOptions) -> TrainOptions:
     weight = options.perceptual_weight
     if weight is not None and not 0 <= weight < math.inf:
         raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
-    if not 0 <= options.save_every < math.inf:
-        raise ProgdfError(f"--save-every must be 0 or more seconds, got {options.save_every}")
     _check_editor_options(options)
-    check_network_options(options)
-    return replace(options, name=name)
+    check_network_options(options, PRESETS[options.preset])
+
+
+def guidance_of(text: str) -> tuple[float | None, float | None]:
+    """What --guidance says of the sentence and of the picture; None where it says nothing.
+
+    Raises:
+        ProgdfError: it is neither one number nor two.
+    """
+    words = text.split(",") if text else []
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = [math.nan]
+    if len(numbers) > 2 or not all(1 <= number <= 100 for number in numbers):
+        raise ProgdfError(
+            f"--guidance must be one or two numbers between 1 and 100, such as 7.5,1.5; got {text}"
+        )
+    sentence, picture = (*numbers, None, None)[:2]
+    return sentence, picture
 
 
 def check_name(name: str) -> str:
@@ -99,7 +101,7 @@ def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
 def _check_editor_options(options: TrainOptions) -> None:
     """No option is passed over in silence: one that the editor does not know is refused."""
     kind = options.editor.partition(":")[0]
-    of_instruct = ("model", "guidance", "image_guidance", "edit_steps")
+    of_instruct = ("model", "guidance", "edit_steps")
     of_painters = ("edit_size", "reedit_every")
     for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
         for name in names:
@@ -109,8 +111,10 @@ def _check_editor_options(options: TrainOptions) -> None:
                 raise ProgdfError(f"{option} does not apply to {kind}; it is for {' and '.join(kinds)}")
 
 
-def check_network_options(options: TrainOptions | FitOptions) -> None:
-    """Options of the field that make sense, and those of a network only where there is one.
+def check_network_options(
+    options: TrainOptions | FitOptions, preset: Mapping[str, object] = PRESETS["default"]
+) -> None:
+    """Options of the field that make sense, and those of a network only where there is one, or by a preset.
 
     Raises:
         ProgdfError: one does not.
@@ -122,23 +126,12 @@ def check_network_options(options: TrainOptions | FitOptions) -> None:
         )
     for name, default in NETWORK_OPTIONS.items():
         option = "--" + name.replace("_", "-")
-        if options.field != "neural" and getattr(options, name, default) != default:
+        if options.field != "neural" and getattr(options, name) not in (default, preset.get(name)):
             raise ProgdfError(f"{option} does not apply to --field {options.field}; add --field neural")
     if options.bytes_budget is not None:
         if options.field in ("neural", "lossless"):
             raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
         if not 1 <= options.bytes_budget < math.inf:
             raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")
-    if not 0 <= options.code <= 64:
-        raise ProgdfError(f"--code must be between 0 and 64, got {options.code}")
     if not 0 <= options.picture_loss < math.inf:
         raise ProgdfError(f"--picture-loss must be 0 or more, got {options.picture_loss}")
-
-
-def plain_options(options: TrainOptions) -> dict[str, Any]:
-    """The options that the result depends on or came from, as JSON values."""
-    return {
-        name: str(v) if isinstance(v, Path) else v
-        for name, v in asdict(options).items()
-        if name not in ("resume", "save_every")
-    }

@@ -13,25 +13,18 @@ from progdf.field.neural import Size
 from progdf.scene.up_axis import UpChoice
 
 Slider = Literal["auto", "even", "stages", "time"]
-"""What slider values mean; auto becomes one of the others (`settings.resolve_slider`)."""
-
-
+"""What slider values mean; auto becomes one of the others (`trainer.optimize.settings.resolve_slider`)."""
 Rates = Literal["kind", "3dgs"]
-
-
 Progressive = Literal["warmup", "decay", "growth", "off"]
-
-
+LiftRule = Literal["share", "count", "paper"]
+Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
 
-CLIP_MODEL = "openai/clip-vit-large-patch14"
 DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
 
 NETWORK_OPTIONS: Mapping[str, Any] = {
-    "fit": "after",
     "size": "tiny",
-    "code": 8,
     "picture_loss": 0.0,
 }
 """Options of a neural field, and what they are where nothing is said."""
@@ -75,7 +68,7 @@ class TrainOptions:
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     photographs:EDITED,ORIGINALS (of what the cameras took), style:N (a painting, N from 0 to 25),
     instruct:"turn him into Batman"."""
-    lift_rule: Literal["share", "count", "paper"] = "share"
+    lift_rule: LiftRule = "share"
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
     lift_threshold: float | None = None
@@ -88,16 +81,13 @@ class TrainOptions:
     """text: minimum detection confidence, 0 to 1; a lower one finds more, including false matches."""
     model: str = ""
     """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
-    guidance: float | None = None
-    """instruct: how closely the instruction is followed; by default the model's own value (paper: 7.5)."""
-    image_guidance: float | None = None
-    """instruct: how closely the picture is followed, where the model supports it (paper: 1.5)."""
+    guidance: str = ""
+    """instruct: how closely the instruction is followed and, after a comma, the picture, where the model
+    supports that; by default the model's own values (paper: 7.5,1.5)."""
     edit_steps: int | None = None
     """instruct: denoising steps per picture; by default the model's own number (paper: 20)."""
     edit_size: int | None = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
-    confine: Literal["auto", "yes", "no"] = "auto"
-    """Put back what the editor changed outside the region; auto: unless --kind is geometry."""
     reedit_every: int = 0
     """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
     preset: Preset = "default"
@@ -130,7 +120,7 @@ class TrainOptions:
     steps, but 1 for a style, which is the paper's way, towards the end alone. instruct is asked for
     strengths, by rising guidance, only if more than 1 are asked for here: each is another pass over the
     views."""
-    sh: Literal["auto", "on", "off"] = "auto"
+    sh: Bands = "auto"
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
     hardly change with the view (auto)."""
@@ -140,9 +130,6 @@ class TrainOptions:
     progressive: Progressive = "off"
     """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as the loss that it
     is, which lets go of the steps (decay) or tightens (growth). As a loss it freezes the edit."""
-    sharpness: Literal["auto", "hinge", "paper", "off"] = "auto"
-    """Sharpness of the renders: not less than the target's (hinge), or the printed term, which pulls at no
-    pixel but the rim's (paper). auto: hinge for style, off for color and geometry."""
     slider: Slider = "auto"
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
@@ -150,13 +137,8 @@ class TrainOptions:
     field: FieldKind = "auto"
     """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
     keeps every recording."""
-    fit: Literal["after", "joint"] = NETWORK_OPTIONS["fit"]
-    """neural: trained on the finished recording, or step by step while it is made (paper); what it sees is
-    then --inputs position."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
-    code: int = NETWORK_OPTIONS["code"]
-    """neural: bytes of learned code per Gaussian, for what its position cannot predict."""
     picture_loss: float = NETWORK_OPTIONS["picture_loss"]
     """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
@@ -175,12 +157,8 @@ class TrainOptions:
     is measured (ViT-L/14; pip install progdf-studio[clip])."""
     text_after: str = ""
     """What they show after it, such as "a golden bear"; instruct: its sentence, if nothing is given."""
-    clip_model: str = CLIP_MODEL
-    """Id or folder of the CLIP model; download it first."""
     resume: bool = False
     """Continue a run that was stopped in this folder; the result is the same as without the stop."""
-    save_every: float = 10.0
-    """Seconds between saves of the run's state, more where saving takes long; 0: after every step."""
 
 
 @dataclass(frozen=True)
@@ -194,8 +172,6 @@ class FitOptions:
     keeps every recording."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
-    code: int = NETWORK_OPTIONS["code"]
-    """neural: bytes of learned code per Gaussian, for what its position cannot predict."""
     picture_loss: float = NETWORK_OPTIONS["picture_loss"]
     """neural: weight of L1 + LPIPS between pictures of field and recording (paper: 1), in the last steps."""
     target_psnr: float = 40.0
@@ -208,8 +184,6 @@ class FitOptions:
     text_before: str = ""
     """As for progdf train; the run's own, if nothing is given."""
     text_after: str = ""
-    """As for progdf train; the run's own, if nothing is given."""
-    clip_model: str = ""
     """As for progdf train; the run's own, if nothing is given."""
     threads: int = 0
     """CPU threads; 0 takes all cores."""

@@ -1,35 +1,139 @@
-"""What a run will do with its field and its report: the options that these need, resolved once."""
+"""What a run will do: the options, resolved once into parts; below, each function is given its own.
+
+What the kind of the edit decides is resolved by `plan_optimization`, as a trial may have to find the kind.
+What the scene decides (the axis that is up, the number and size of the views, the SH bands) is found where
+the scene is looked at. A plan is all that the bits of a result depend on, but for the files that it names.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal
 
-from progdf.field.neural import Bins, Inputs, Size
+from trainer.editors import GIVEN, UNTOLD, VIEW_BY_VIEW
+from trainer.editors.base import EditKind, EditorSettings
+from trainer.fit.network import NetworkPlan
+from trainer.optimize.objective import LossWeights, Sharpness
+from trainer.optimize.settings import Optimization
+from trainer.report.clip import Texts
+from trainer.segmenters.base import SegmenterSettings
+from trainer.setup.resolution import ViewSettings
 
-from .options import CLIP_MODEL, FieldKind, Slider, TrainOptions
+from .option_checks import check_name, check_options, guidance_of
+from .options import (
+    MOST_STAGES,
+    QUICK_STAGES,
+    QUICK_STEPS,
+    QUICK_VIEWS,
+    STAGE_STEPS,
+    VIEWS,
+    Bands,
+    FieldKind,
+    LiftRule,
+    Progressive,
+    Rates,
+    Slider,
+    TrainOptions,
+)
 from .presets import CONSTANTS
+
+PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
+SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
+SHARPNESS_WEIGHT: Mapping[Sharpness, float] = {"hinge": 0.1, "paper": 1.0, "off": 0.0}
+PROGRESSIVE_WEIGHT = 5.0  # λ2 of the paper
+STAGES: Mapping[EditKind, int] = {"color": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
 
 
 @dataclass(frozen=True)
-class NetworkPlan:
-    """The network of a neural field.
+class RegionPlan:
+    """What may change.
 
     Args:
-        joint: trained jointly with the optimization, not on the finished recording
-        size, code: see `TrainOptions`
-        inputs, bins: see `Constants`; a jointly trained one sees positions alone, as the end is not known yet
-        picture_loss: weight of L1 + LPIPS between pictures of field and recording, ≥ 0
-        draft: a third of the steps
-        seed: of its weights and draws
+        region: as typed
+        lift_rule, lift_threshold: how masks vote, see `lift.score`; None: the rule's own threshold
+        segmenter: finds what text:"…" names
     """
 
+    region: str
+    lift_rule: LiftRule
+    lift_threshold: float | None
+    segmenter: SegmenterSettings
+
+
+@dataclass(frozen=True)
+class EditorPlan:
+    """Who edits the views.
+
+    Args:
+        editor: `KIND:WHAT`
+        the others: see `EditorSettings`
+    """
+
+    editor: str
+    model: str
+    guidance: float | None
+    image_guidance: float | None
+    edit_steps: int | None
+    edit_size: int | None
+    graded: bool
+    seed: int
+
+    @property
+    def family(self) -> str:
+        """The KIND."""
+        return self.editor.partition(":")[0]
+
+    @property
+    def knows_kind(self) -> bool:
+        """Whether the editor knows what its pictures move."""
+        return self.family not in UNTOLD
+
+    def settings(self, kept: Path) -> EditorSettings:
+        """For the editor's factory. `kept`: folder in which painted pictures are kept"""
+        return EditorSettings(
+            self.model,
+            self.guidance,
+            self.image_guidance,
+            self.edit_steps,
+            self.seed,
+            self.edit_size,
+            self.graded,
+            kept,
+        )
+
+
+@dataclass(frozen=True)
+class OptimizationPlan:
+    """What is asked of the optimization, before it is known what the edit moves; see `plan_optimization`.
+
+    Args:
+        kind: what moves; None: what the editor knows, or else a trial finds
+        steps: over all stages
+        stages: strengths that an editor with a dial is asked for; None: by kind and steps
+        group_steps: steps per strength in which parts move as wholes first; None: a trial finds
+        sh: whether the SH bands beyond DC are trained; auto: where they show
+        perceptual_weight: None: by kind
+        progressive: the progressive constraint
+        reedit_every: steps between two edits of the current renders; 0: none
+        rates, perceptual_every, sharpness, raw, joint: see `Constants`
+        seed: order of the views
+    """
+
+    kind: EditKind | None
+    steps: int
+    stages: int | None
+    group_steps: int | None
+    sh: Bands
+    perceptual_weight: float | None
+    progressive: Progressive
+    reedit_every: int
+    rates: Rates
+    perceptual_every: int
+    sharpness: Literal["kind"] | Sharpness
+    raw: bool
     joint: bool
-    size: Size
-    inputs: Inputs
-    bins: Bins
-    code: int
-    picture_loss: float
-    draft: bool
     seed: int
 
 
@@ -38,79 +142,198 @@ class FieldPlan:
     """Which field is fitted.
 
     Args:
-        kind: see `TrainOptions.field`
+        field: its kind, see `TrainOptions.field`
         target_psnr: worst PSNR over the slider that it should reach, dB
         bytes_budget: most bytes a member; None: as many as the target takes
         network: of a neural field
     """
 
-    kind: FieldKind
+    field: FieldKind
     target_psnr: float
     bytes_budget: float | None
     network: NetworkPlan
 
-    @property
-    def joint(self) -> bool:
-        """Whether a network is trained jointly with the optimization."""
-        return self.kind == "neural" and self.network.joint
-
-
-@dataclass(frozen=True)
-class Texts:
-    """What the pictures show before and after, in words, and which CLIP reads them; "" is not given.
-
-    `asked`: whether a text was given for this; an instruction alone asks for nothing.
-    """
-
-    before: str
-    after: str
-    model: str
-    asked: bool = False
-
 
 @dataclass(frozen=True)
 class Plan:
-    """The end of a run: field, slider and report.
+    """A run, from the scene to the report.
 
     Args:
+        scene: its file
         name: of the layer and of the .gdf file
-        editor: `KIND:WHAT`
-        slider: what slider values mean; "auto" is decided by the strengths that were recorded
+        region, editor, views, optimization: see their classes
+        slider: what slider values mean; auto: stages where pictures of several strengths are given, else even
         field: see `FieldPlan`
-        texts: what CLIP is asked; a learned editor's instruction says what one sees after
+        texts: what CLIP is asked
     """
 
+    scene: Path
     name: str
-    editor: str
+    region: RegionPlan
+    editor: EditorPlan
+    views: ViewSettings
+    optimization: OptimizationPlan
     slider: Slider
     field: FieldPlan
     texts: Texts
 
+    @property
+    def edit(self) -> dict[str, str]:
+        """What identifies the edit: a run folder holds runs of one."""
+        return {
+            "scene": str(self.scene.resolve()),
+            "region": self.region.region,
+            "editor": self.editor.editor,
+        }
+
 
 def make_plan(options: TrainOptions) -> Plan:
-    """The options, resolved. `options`: checked, see `resolve_options`"""
-    joint, constants = options.fit == "joint", CONSTANTS[options.preset]
-    network = NetworkPlan(
-        joint,
-        options.size,
-        "position" if joint else constants.inputs,
-        constants.bins,
-        options.code,
-        options.picture_loss,
-        options.quick,
-        options.seed,
-    )
-    kind, _, instruction = options.editor.partition(":")
-    after = options.text_after or (instruction.strip().strip("\"'") if kind == "instruct" else "")
+    """The options, checked and resolved.
+
+    Raises:
+        ProgdfError: one makes no sense.
+    """
+    check_options(options)
+    constants, quick = CONSTANTS[options.preset], options.quick
+    steps, views, stages = options.steps, options.views, options.stages
+    if quick:
+        steps, views = min(steps, QUICK_STEPS), min(views or QUICK_VIEWS, QUICK_VIEWS)
+        stages = min(stages, QUICK_STAGES)
+    family, _, what = options.editor.partition(":")
+    joint = constants.joint and options.field == "neural"
     return Plan(
-        options.name,
-        options.editor,
-        options.slider,
-        FieldPlan(options.field, options.target_psnr, options.bytes_budget, network),
+        options.scene,
+        check_name(options.name or options.out.resolve().name),
+        RegionPlan(
+            options.region,
+            options.lift_rule,
+            options.lift_threshold,
+            SegmenterSettings(options.detector, options.sam_model, options.box_threshold),
+        ),
+        EditorPlan(
+            options.editor,
+            options.model,
+            *guidance_of(options.guidance),
+            options.edit_steps,
+            options.edit_size,
+            graded=stages > 1,
+            seed=options.seed,
+        ),
+        ViewSettings(
+            options.cameras,
+            options.up,
+            views or None,
+            options.image_size or None,
+            dense=not quick and family not in VIEW_BY_VIEW,
+        ),
+        OptimizationPlan(
+            None if options.kind == "auto" else options.kind,
+            steps,
+            stages or None,
+            options.group_steps,
+            options.sh,
+            options.perceptual_weight,
+            options.progressive,
+            options.reedit_every,
+            constants.rates,
+            constants.perceptual_every,
+            constants.sharpness,
+            constants.raw,
+            joint,
+            options.seed,
+        ),
+        "even" if options.slider == "auto" and family not in GIVEN else options.slider,
+        FieldPlan(
+            options.field,
+            options.target_psnr,
+            options.bytes_budget,
+            NetworkPlan(
+                options.size,
+                constants.inputs,
+                constants.bins,
+                constants.code,
+                options.picture_loss,
+                quick,
+                options.seed,
+            ),
+        ),
         Texts(
             options.text_before,
-            after,
-            options.clip_model or CLIP_MODEL,
+            options.text_after or (what.strip().strip("\"'") if family == "instruct" else ""),
             bool(options.text_before or options.text_after),
         ),
     )
+
+
+def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int) -> Optimization:
+    """What the plan means for an edit of this kind.
+
+    What each of the defaults gives, alone, is in docs/experiments.md, Terms and options of a descent.
+
+    Args:
+        asked: see `OptimizationPlan`
+        kind: what the edit moves
+        group_steps: as asked, or as a trial found; without effect where nothing moves
+    """
+    sharpness = SHARPNESS[kind] if asked.sharpness == "kind" else asked.sharpness
+    weights = LossWeights(
+        PERCEPTUAL_WEIGHT[kind] if asked.perceptual_weight is None else asked.perceptual_weight,
+        asked.perceptual_every,
+        asked.progressive,
+        PROGRESSIVE_WEIGHT,
+        sharpness,
+        SHARPNESS_WEIGHT[sharpness],
+    )
+    most = STAGES[kind]
+    return Optimization(
+        kind,
+        asked.steps,
+        asked.stages or min(most, QUICK_STAGES if asked.steps < STAGE_STEPS * most else most),
+        group_steps if kind == "geometry" else 0,
+        # only an edit of colors may leave the bands alone; the paper's trainer leaves nothing
+        "on" if asked.sh == "auto" and (kind != "color" or asked.rates == "3dgs") else asked.sh,
+        weights,
+        asked.rates,
+        asked.raw,
+        # colors alone change, and nothing is asked for that only a descent view by view has
+        solves_colors=kind == "color"
+        and asked.rates == "kind"
+        and asked.progressive == "off"
+        and sharpness == "off"
+        and not asked.perceptual_weight
+        and not asked.raw
+        and not asked.joint
+        and not asked.reedit_every,
+        seed=asked.seed,
+    )
+
+
+def segmented_views(plan: Plan) -> int:
+    """How many pictures are segmented, at most, to find what text:"…" names."""
+    return plan.views.views or VIEWS
+
+
+def plan_difference(was: Plan, now: Plan) -> str:
+    """A value that differs, in words, "--steps 24, not 40"; "" where none does. What was typed goes first."""
+    typed = {field.name for field in fields(TrainOptions)}
+    pairs = zip(_values(was), _values(now), strict=True)
+    found = [(name, before, after) for (name, before), (_, after) in pairs if before != after]
+    if not found:
+        return ""
+    name, before, after = min(found, key=lambda value: value[0] not in typed)
+    said = "--" + name.replace("_", "-") if name in typed else name.replace("_", " ")
+    return f"{said} {_said(before)}, not {_said(after)}"
+
+
+def _values(part: Any) -> Iterator[tuple[str, Any]]:
+    """All values of a plan with their names, in order; paths as places."""
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if is_dataclass(value):
+            yield from _values(value)
+        else:
+            yield field.name, value.resolve() if isinstance(value, Path) else value
+
+
+def _said(value: object) -> object:
+    return "by default" if value is None or value == "" else value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from progdf.field.neural import Bins, Inputs
 
@@ -19,23 +19,30 @@ class Constants:
         rates: learning rates as the kind of edit needs, with short steps on the last stretch; or 3DGS's own,
             flat, for all attributes, which hardly move in 600 steps
         perceptual_every: LPIPS is paid for every so many steps
+        sharpness: of the renders: for a style not less than the target's, or the printed term, which pulls at
+            no pixel but the rim's
         raw: record the bare iterates at even steps, between which the slider's steps differ far more; not a
             running mean of the parameters whenever the pictures have moved
         inputs: what a network sees, the position alone, or also what the Gaussian looks like and where it
             ends: 38 dB instead of 34 at no cost
         bins: a network's ten bins of the slider, interpolated, or hard, between which the edit jumps
+        code: a byte each for so many learned numbers per Gaussian, which tell what its place does not
+        joint: a network is trained step by step while the edit is recorded, not on the finished recording
     """
 
     rates: Rates = "kind"
     perceptual_every: int = 2
+    sharpness: Literal["kind", "paper"] = "kind"
     raw: bool = False
     inputs: Inputs = "own"
     bins: Bins = "smooth"
+    code: int = 8
+    joint: bool = False
 
 
 CONSTANTS: Mapping[Preset, Constants] = {
     "default": Constants(),
-    "paper": Constants("3dgs", 1, True, "position", "hard"),
+    "paper": Constants("3dgs", 1, "paper", True, "position", "hard", 0, True),
 }
 
 PRESETS: Mapping[Preset, Mapping[str, Any]] = {
@@ -52,12 +59,9 @@ PRESETS: Mapping[Preset, Mapping[str, Any]] = {
         "group_steps": 0,
         "perceptual_weight": 1.0,
         "progressive": "decay",
-        "sharpness": "paper",
         "slider": "time",
         "field": "neural",
-        "fit": "joint",
         "size": "paper",
-        "code": 0,
         "picture_loss": 1.0,
     },
 }

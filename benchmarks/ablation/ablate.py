@@ -23,17 +23,16 @@ from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import write_image
-from progdf.io.json_values import decode_json
+from progdf.io.json_values import decode_json, plain
 from progdf.metrics.slider import slider_statistics
-from trainer.editors.base import EditKind
 from trainer.fit.fit import drop_idle_attributes, fit_field
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.settings import objective_line, resolve_slider
-from trainer.options import TrainOptions
+from trainer.optimize.settings import Optimization, resolve_slider
 from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.threads import use_threads
 from trainer.pipeline.training import optimize_members, retime_trajectory
+from trainer.plan import Plan, plan_optimization
 from trainer.report.curves import against_editor
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.store.images import read_picture
@@ -43,7 +42,7 @@ from trainer.store.run_folder import RunFolder, lock_folder, write_json
 from trainer.store.state import StateFolder
 
 from .options import AblateOptions
-from .setup import AblationSetup, digest_of, make_ablation_setup, plain, run_options
+from .setup import AblationSetup, digest_of, make_ablation_setup, run_plan
 from .table import Outcome, outcome_line, sheet_of, table_of
 from .variants import Variant, choose_variants, differing_variants
 
@@ -78,10 +77,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
     """
     use_threads(options.threads)
     run = reopen_run(options.run, options.scene)
-    own = run_options(run)
-    if run.about.get("kind") is None:
-        raise ProgdfError(f"{options.run} was written by an earlier version; train it again first")
-    kind: EditKind = run.about["kind"]
+    own, kind = run_plan(run), run.record.kind
     variants = differing_variants(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
     wanted = choose_variants(variants, options.only)
     root = run.folder.root / "ablation"
@@ -116,14 +112,15 @@ def _run_variant(root: Path, variant: Variant, shared: AblationSetup, quiet: boo
     """Train and judge one variant, and keep what became of it."""
     folder = root / variant.name
     folder.mkdir(exist_ok=True)
-    options = replace(shared.options, **variant.changes)
+    plan = variant.plan(shared.plan)
+    optimization = plan_optimization(plan.optimization, shared.kind, plan.optimization.group_steps or 0)
     measure, _ = perceptual_loss()
     perceptual = perceptual_loss()[0]
-    objective = objective_line(options, shared.kind, perceptual.name)
+    objective = optimization.objective(perceptual.name)
     outcome = Outcome(variant.name, variant.what, objective=objective)
     log = RunLog(folder / "log.txt", quiet)
     try:
-        trajectory = _record(root, variant, shared, options, perceptual, log)
+        trajectory = _record(root, variant, shared, plan, optimization, perceptual, log)
         seconds = log.seconds["optimize"]
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
@@ -132,11 +129,11 @@ def _run_variant(root: Path, variant: Variant, shared: AblationSetup, quiet: boo
         return
     finally:
         log.close()
-    field, asked = _fit(variant, trajectory, shared, options)
+    field, asked = _fit(variant, trajectory, shared, plan)
     outcome = _evaluate(replace(outcome, seconds=seconds), field, shared, asked, measure)
     region, scene = shared.run.region, shared.run.scene
-    told = {"name": variant.name, **plain(options)}
-    gdf = Gdf(variant.name, region, field, fingerprint(scene), options.editor, told)
+    told = plain(replace(plan, name=variant.name))
+    gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, told)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
     _save_outcome(folder, outcome, strip(shared.evaluator, field, shared.columns, _WIDTH), variant, shared)
 
@@ -145,7 +142,8 @@ def _record(
     root: Path,
     variant: Variant,
     shared: AblationSetup,
-    options: TrainOptions,
+    plan: Plan,
+    optimization: Optimization,
     perceptual: Perceptual,
     log: RunLog,
 ) -> Trajectory:
@@ -156,24 +154,24 @@ def _record(
     begun = {"digest": digest_of(shared, variant, optimization=True)}
     if state.identity() != begun:
         state.begin(begun)
-    edited = shared.edited if options.stages != 1 else {1.0: shared.edited[1.0]}
+    edited = shared.edited if plan.optimization.stages != 1 else {1.0: shared.edited[1.0]}
     with log.stage("optimize"):
-        trajectory, _ = optimize_members(options, shared.setup, edited, shared.kind, perceptual, state, log)
+        trajectory, _ = optimize_members(optimization, shared.setup, edited, perceptual, state, log)
     trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator)
-    return retime_trajectory(trajectory, shared.setup, options, log)
+    return retime_trajectory(trajectory, shared.setup, plan.slider, optimization.raw, log)
 
 
 def _fit(
-    variant: Variant, trajectory: Trajectory, shared: AblationSetup, options: TrainOptions
+    variant: Variant, trajectory: Trajectory, shared: AblationSetup, plan: Plan
 ) -> tuple[BakedField, Mapping[float, float]]:
     """The variant's field, and where on its slider it was shown which of the editor's strengths."""
     if variant.linear:
         offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
         return fit_keyframes(trajectory.s, offsets, 2), {}
-    target = shared.options.target_psnr
+    target = shared.plan.field.target_psnr
     fitted = fit_field(trajectory, shared.seen, shared.evaluator, shared.weights, "auto", target)
     field, remap = fitted.chosen.field, identity_remap()
-    if resolve_slider(options.slider, options.editor, trajectory.strengths) == "even":
+    if resolve_slider(plan.slider, trajectory.strengths) == "even":
         field, remap = equalize_slider(field, shared.setup)
     return field, {strength: remap.at(s) for s, strength in trajectory.asked}
 
@@ -228,12 +226,12 @@ def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> 
     """Table and picture of all that is done."""
     kept = [_load_outcome(root, variant, shared) for variant in variants]
     outcomes = [outcome for outcome in kept if outcome is not None]
-    options, setup, evaluator = shared.options, shared.setup, shared.evaluator
-    title = f"{options.name}: {options.editor}, part by part"
+    plan, setup, evaluator = shared.plan, shared.setup, shared.evaluator
+    title = f"{plan.name}: {plan.editor.editor}, part by part"
     size = setup.held_out[0].camera
     note = (
-        f"{options.steps} steps, {len(setup.train)} views to train on and {len(setup.held_out)} to measure "
-        f"with, {size.width}x{size.height} pixels, {len(shared.run.region)} members."
+        f"{plan.optimization.steps} steps, {len(setup.train)} views to train on and {len(setup.held_out)} "
+        f"to measure with, {size.width}x{size.height} pixels, {len(shared.run.region)} members."
     )
     measure = perceptual_loss()[0].name
     distance = "LPIPS" if measure.startswith("lpips") else measure
@@ -248,6 +246,6 @@ def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> 
     with atomic_write(root / "ablation.md") as beside:
         beside.write_text(table.markdown() + "\n", encoding="utf-8")
     rows: list[Mapping[str, Any]] = [asdict(outcome) for outcome in outcomes]
-    about = {"machine": machine(), "note": note, "perceptual": measure, "options": plain(options)}
+    about = {"machine": machine(), "note": note, "perceptual": measure, "plan": plain(plan)}
     write_json(root / "ablation.json", {**about, "variants": rows})
     return Ablation(title, outcomes, distance)

@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS
+from progdf.io.json_values import plain
 from trainer.editors.base import EditKind
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
-from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, TrainOptions
-from trainer.pipeline.reopen import FinishedRun, options_of, render_run_views
+from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS
+from trainer.pipeline.reopen import FinishedRun, render_run_views
+from trainer.plan import Plan
 from trainer.report.report import Columns, columns_of
 from trainer.setup.training_setup import Pictures, TrainingSetup, widen_views
 from trainer.store.run_folder import read_views
@@ -25,8 +26,6 @@ from trainer.views.view import View
 from .variants import Variant
 
 _T = TypeVar("_T")
-_LAID_OVER = ("slider",)  # options that the optimization does not depend on
-_COMMAND = ("out", "scene", "threads", "resume", "save_every", "quick")  # nor anything else
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class AblationSetup:
 
     Args:
         run: the finished run
-        options: its own, as a draft if asked for
+        plan: its own, as a draft if asked for
         kind: what the edit moves
         setup: scene, region, views whose boxes hold the edit
         edited: strength → the edited training views, whole
@@ -43,11 +42,11 @@ class AblationSetup:
         columns: where on the run's slider the variants are shown, and what the editor was asked there
         seen: a few training views, on which the field's ranks are chosen
         weights: how visible each member is. [M]
-        digest: of all of this but the options
+        digest: of all of this but the plan
     """
 
     run: FinishedRun
-    options: TrainOptions
+    plan: Plan
     kind: EditKind
     setup: TrainingSetup
     edited: Pictures
@@ -58,22 +57,20 @@ class AblationSetup:
     digest: str
 
 
-def run_options(run: FinishedRun) -> TrainOptions:
-    """The options of a finished run, with the group steps that it found out."""
-    options = options_of(run.about)
-    if options.group_steps is None:
-        return replace(options, group_steps=run.about.get("group_steps"))
-    return options
+def run_plan(run: FinishedRun) -> Plan:
+    """The plan of a finished run, with the group steps that it found out."""
+    plan = run.record.plan
+    if plan.optimization.group_steps is not None:
+        return plan
+    return replace(plan, optimization=replace(plan.optimization, group_steps=run.record.group_steps))
 
 
-def make_ablation_setup(
-    run: FinishedRun, options: TrainOptions, kind: EditKind, quick: bool
-) -> AblationSetup:
+def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: bool) -> AblationSetup:
     """The run's views and edited views; for a draft every so manieth of them.
 
     Args:
         run: the finished run
-        options: its own
+        plan: its own
         kind: what the edit moves
         quick: a draft
 
@@ -81,12 +78,13 @@ def make_ablation_setup(
         ProgdfError: an edited view is gone.
     """
     setup, strengths = render_run_views(run), run.trajectory.strengths
-    options = replace(options, reedit_every=0)
+    optimization = replace(plan.optimization, reedit_every=0)
     if quick:
         strengths = tuple(_thin(strengths, QUICK_STAGES))
         train = _thin(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))
         setup = replace(setup, train=train)
-        options = replace(options, steps=min(options.steps, QUICK_STEPS), stages=len(strengths))
+        steps = min(optimization.steps, QUICK_STEPS)
+        optimization = replace(optimization, steps=steps, stages=len(strengths))
     edited = {s: _read_edited(run, setup.train, s) for s in strengths}
     setup = widen_views(setup, edited)
     columns = columns_of(run.trajectory.asked)
@@ -106,7 +104,7 @@ def make_ablation_setup(
         digest.update(view.image.numpy().tobytes())
     return AblationSetup(
         run,
-        options,
+        replace(plan, optimization=optimization),
         kind,
         setup,
         edited,
@@ -120,16 +118,12 @@ def make_ablation_setup(
 
 def digest_of(shared: AblationSetup, variant: Variant, optimization: bool = False) -> str:
     """Of all that decides a variant's figures, or of its optimization alone."""
-    without = (*_COMMAND, *_LAID_OVER) if optimization else _COMMAND
-    options = plain(replace(shared.options, **variant.changes))
-    decides = {name: value for name, value in options.items() if name not in without}
+    decides = plain(variant.plan(shared.plan))
+    del decides["scene"]  # its pictures are in the setup's digest
+    if optimization:
+        del decides["slider"]
     told = json.dumps([shared.digest, decides, variant.linear and not optimization], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
-
-
-def plain(options: TrainOptions) -> dict[str, Any]:
-    """The options as JSON values."""
-    return {name: str(v) if isinstance(v, Path) else v for name, v in asdict(options).items()}
 
 
 def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> list[Tensor]:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from progdf.errors import ProgdfError
 from trainer.editors.base import EditKind
-from trainer.optimize.settings import PERCEPTUAL_WEIGHT, SHARPNESS, resolve_slider, solves_colors
-from trainer.options import TrainOptions
-from trainer.presets import PRESETS
+from trainer.optimize.settings import GROUP_STEPS, Optimization, resolve_slider
+from trainer.options import Slider, TrainOptions
+from trainer.plan import Plan, make_plan, plan_optimization
+from trainer.presets import apply_preset
 
 BASE, LINEAR = "base", "2-keyframes"
-
-_AS_PRINTED = {
-    "preset": "paper",
-    **{name: value for name, value in PRESETS["paper"].items() if name not in ("steps", "views")},
-}
 
 
 @dataclass(frozen=True)
@@ -27,19 +24,37 @@ class Variant:
     Args:
         name: short, as --only takes it
         what: what is different, in words
-        changes: options in place of the run's
+        changes: values of the optimization's plan in place of the run's
+        slider: in place of the run's
         linear: the slider goes straight from the original to the end, whatever was recorded
     """
 
     name: str
     what: str
     changes: Mapping[str, Any] = field(default_factory=dict)
+    slider: Slider | None = None
     linear: bool = False
 
     @property
     def trains_as(self) -> str:
         """Name of the variant whose optimization it shares: the slider is laid over what was recorded."""
-        return BASE if set(self.changes) <= {"slider"} else self.name
+        return self.name if self.changes else BASE
+
+    def plan(self, own: Plan) -> Plan:
+        """The run's plan with what is different."""
+        optimization = replace(own.optimization, **self.changes)
+        return replace(own, optimization=optimization, slider=self.slider or own.slider)
+
+
+def _as_printed() -> Mapping[str, Any]:
+    """What the paper's preset asks of the optimization, but for the number of steps."""
+    options = TrainOptions(Path("scene.ply"), Path("run"), region="all", editor="night")
+    default, paper = make_plan(options).optimization, make_plan(apply_preset(options, "paper")).optimization
+    return {
+        name: value
+        for name, value in vars(paper).items()
+        if value != getattr(default, name) and name != "steps"
+    }
 
 
 VARIANTS = (
@@ -56,18 +71,18 @@ VARIANTS = (
     Variant("no-lpips", "L1 alone", {"perceptual_weight": 0.0}),
     Variant("no-sh", "view-dependent color left as it is", {"sh": "off"}),
     Variant("no-groups", "parts are not moved as wholes first", {"group_steps": 0}),
-    Variant("slider-stages", "the editor's own strengths, even in between", {"slider": "stages"}),
-    Variant("slider-even", "even over the whole slider", {"slider": "even"}),
-    Variant("slider-time", "the optimizer's time", {"slider": "time"}),
-    Variant("paper", "all as the paper prints it", _AS_PRINTED),
+    Variant("slider-stages", "the editor's own strengths, even in between", slider="stages"),
+    Variant("slider-even", "even over the whole slider", slider="even"),
+    Variant("slider-time", "the optimizer's time", slider="time"),
+    Variant("paper", "all as the paper prints it", _as_printed(), "time"),
 )
 
 
-def differing_variants(options: TrainOptions, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
+def differing_variants(plan: Plan, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
     """The variants that differ from a run.
 
     Args:
-        options: the run's own
+        plan: the run's own
         kind: what the edit moves
         stages: how many strengths the editor was asked for
         sh_degree: of the scene
@@ -77,12 +92,12 @@ def differing_variants(options: TrainOptions, kind: EditKind, stages: int, sh_de
         *(() if sh_degree > 0 else ("no-sh",)),
         *(() if kind == "geometry" else ("no-groups",)),
     }
-    own = _resolve(options, kind, stages)
+    own = _resolve(plan, kind, stages)
     return [
         variant
         for variant in VARIANTS
         if variant.name not in idle
-        and (not variant.changes or _resolve(replace(options, **variant.changes), kind, stages) != own)
+        and (variant.name in (BASE, LINEAR) or _resolve(variant.plan(plan), kind, stages) != own)
     ]
 
 
@@ -102,10 +117,11 @@ def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
     return [variant for variant in variants if not names or variant.name in names]
 
 
-def _resolve(options: TrainOptions, kind: EditKind, stages: int) -> TrainOptions:
-    """With the kind's own values in place of "auto" and None."""
-    weight = PERCEPTUAL_WEIGHT[kind] if options.perceptual_weight is None else options.perceptual_weight
-    weight = 0.0 if solves_colors(options, kind) else weight
-    sharpness = SHARPNESS[kind] if options.sharpness == "auto" else options.sharpness
-    slider = resolve_slider(options.slider, options.editor, (1.0,) * stages)
-    return replace(options, perceptual_weight=weight, sharpness=sharpness, slider=slider)
+def _resolve(plan: Plan, kind: EditKind, stages: int) -> tuple[Optimization, Slider]:
+    """All that decides a variant's bits; weights that nothing pays are as good as none."""
+    asked = plan.optimization
+    groups = GROUP_STEPS if asked.group_steps is None else asked.group_steps
+    found = plan_optimization(asked, kind, groups)
+    if found.solves_colors:
+        found = replace(found, weights=replace(found.weights, perceptual=0.0))
+    return found, resolve_slider(plan.slider, (1.0,) * stages)

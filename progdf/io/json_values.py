@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -51,9 +52,20 @@ def convert_json(value: object, kind: type[_T]) -> _T:
         ValueError: it is of another type; the message says where.
     """
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, kind, dec_hook=_path)
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from None
+
+
+def plain(value: object) -> Any:
+    """The JSON value that `convert_json` reads back; paths are text."""
+    return msgspec.to_builtins(value, enc_hook=str)
+
+
+def _path(kind: type, value: object) -> object:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"expected {kind.__name__}, got {value!r:.40}")
 
 
 def _parse_finite(digits: str) -> float:

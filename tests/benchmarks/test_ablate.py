@@ -15,7 +15,7 @@ import benchmarks.ablation.ablate
 from benchmarks.__main__ import ablate as ablate_command
 from benchmarks.ablation.ablate import ablate
 from benchmarks.ablation.options import AblateOptions
-from benchmarks.ablation.setup import run_options
+from benchmarks.ablation.setup import run_plan
 from benchmarks.ablation.table import Outcome, table_of
 from benchmarks.ablation.variants import choose_variants, differing_variants
 from progdf.compose.reference import Layer, compose_layers
@@ -24,11 +24,11 @@ from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.blank_plots import blank_plots
-from tests.helpers.trained import quick_options, write_bear
-from trainer.option_checks import resolve_options
+from tests.helpers.trained import quick_options, train, write_bear
+from trainer.optimize.settings import Optimization
 from trainer.options import TrainOptions
 from trainer.pipeline.reopen import reopen_run
-from trainer.pipeline.run import train
+from trainer.plan import make_plan
 from trainer.store.run_folder import RunFolder
 
 ONLY = "base,2-keyframes,one-target,slider-time"
@@ -39,7 +39,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
     """Of a run of a second or two on a small bear, which is finished."""
     made = tmp_path_factory.mktemp("bear")
     write_bear(made)
-    options = resolve_options(quick_options(made, steps=100, views=4, image_size=48))
+    options = quick_options(made, steps=100, views=4, image_size=48)
     with blank_plots():
         train(options, quiet=True)
     return options
@@ -57,7 +57,7 @@ def _nothing_trains(*_: object, **__: object) -> tuple[Trajectory, object]:
 
 
 def _names(options: TrainOptions, *about: object) -> set[str]:
-    return {variant.name for variant in differing_variants(options, *about)}  # type: ignore[arg-type]
+    return {variant.name for variant in differing_variants(make_plan(options), *about)}  # type: ignore[arg-type]
 
 
 def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
@@ -78,7 +78,7 @@ def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions)
 
 
 def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
-    variants = differing_variants(options, "color", 4, 1)
+    variants = differing_variants(make_plan(options), "color", 4, 1)
     assert [v.name for v in choose_variants(variants, "no-sh, base")] == ["base", "no-sh"]
     with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
         choose_variants(variants, "base,warmup")
@@ -98,8 +98,10 @@ def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
         ablate(AblateOptions(copy, threads=1), quiet=True)
 
 
-def test_the_options_of_a_run_are_read_back_as_they_were(options: TrainOptions) -> None:
-    assert run_options(reopen_run(options.out)) == replace(options, group_steps=0), "as the run resolved it"
+def test_the_plan_of_a_run_is_read_back_as_it_was(options: TrainOptions) -> None:
+    plan = make_plan(options)
+    resolved = replace(plan, optimization=replace(plan.optimization, group_steps=0))
+    assert run_plan(reopen_run(options.out)) == resolved, "with what the run found out"
 
 
 def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to_open(
@@ -143,7 +145,7 @@ def test_what_is_done_is_not_done_again_until_the_edited_views_change(
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", _nothing_trains)
     again = ablate(AblateOptions(run, only="base,one-target", threads=1), quiet=True)
     assert [outcome.name for outcome in again.outcomes] == ONLY.split(",")
-    name = reopen_run(run).about["held_out"][0]
+    name = reopen_run(run).record.held_out[0]
     path = RunFolder(run).view("edited", name)
     kept = path.read_bytes()
     try:
@@ -212,9 +214,9 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
 ) -> None:
     copy = tmp_path / "run"
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
-    asked: list[TrainOptions] = []
+    asked: list[Optimization] = []
 
-    def noted(wanted: TrainOptions, *_: object) -> object:
+    def noted(wanted: Optimization, *_: object) -> object:
         asked.append(wanted)
         raise ProgdfError("enough") from FloatingPointError("enough")
 

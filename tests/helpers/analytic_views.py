@@ -26,8 +26,8 @@ from progdf.rasterize import render
 from progdf.scene.region_spec import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.paths import SHARED_DATA
-from trainer.option_checks import resolve_options
 from trainer.options import TrainOptions
+from trainer.plan import make_plan
 from trainer.setup.training_setup import make_training_setup
 
 PLAYBOT = SHARED_DATA / "playbot_31k.ply"
@@ -88,9 +88,9 @@ def write_analytic_views(
         options: as `train` will be given them; of these, what decides about the views counts
         strengths: ascending, the last 1
     """
-    options = resolve_options(options)
-    region = parse_region(options.region, truth.scene, options.name)
-    stand = make_training_setup(options, truth.scene, region)
+    plan = make_plan(options)
+    region = parse_region(plan.region.region, truth.scene, plan.name)
+    stand = make_training_setup(plan.views, truth.scene, region)
     for strength in strengths:
         where = folder if strength == 1.0 else folder / f"{strength:g}"
         edited = truth.edit.apply(truth.scene, region.members, strength)

@@ -28,10 +28,9 @@ from tests.helpers.hostile import NPY_HEADERS
 from tests.helpers.hostile import npy as write_npy
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
 from tests.helpers.scenes import orbit_camera, random_gaussians
-from tests.helpers.trained import quick_options, write_bear
+from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import FitOptions, TrainOptions
 from trainer.pipeline.refit import refit
-from trainer.pipeline.run import train
 from trainer.regions.from_pictures import RegionSettings, region_kinds
 from trainer.store.state import PeriodicSave
 
@@ -181,7 +180,7 @@ def _kernels(folder: Path) -> Reader:
 def _run(name: str, folder: Path) -> Reader:
     """A run, stopped or finished, of which one file is changed each time."""
     write_bear(folder, 400)
-    options = quick_options(folder, views=4, image_size=48, steps=64, stages=2, save_every=0.0)
+    options = quick_options(folder, views=4, image_size=48, steps=64, stages=2)
     resumes, file = name.startswith("resume"), FILES_OF_RUNS[name]
     _train(options, stop_at=5 if resumes else None)
     good = folder / "good"
@@ -218,4 +217,5 @@ def _train(options: TrainOptions, stop_at: int | None) -> None:
 
     with pytest.MonkeyPatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
         patch.setattr(PeriodicSave, "step_done", step_done)
+        patch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
         train(options, quiet=True)

@@ -2,10 +2,11 @@
 
     python -m tests.helpers.stopped SCENE_FOLDER OPTIONS MOMENT[,MOMENT…]
 
-trains with these OPTIONS, a JSON table, into the folder `run` of the current one, again and again with
---resume, and is killed -9 each time: at a whole MOMENT just before (even) or after (odd) that many files were
-put in place, at a broken one after so many seconds. The processes are forked from one that has imported
-everything. After the last moment nothing is killed. Prints a line for each: the moment and how it ended.
+trains with these OPTIONS, a JSON table that may have `save_every` in seconds, into the folder `run` of the
+current one, again and again with --resume, and is killed -9 each time: at a whole MOMENT just before (even)
+or after (odd) that many files were put in place, at a broken one after so many seconds. The processes are
+forked from one that has imported everything. After the last moment nothing is killed. Prints a line for each:
+the moment and how it ended.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import trainer.store.state
 from tests.helpers.blank_plots import blank_plots
-from tests.helpers.trained import quick_options
+from tests.helpers.trained import quick_options, train
 from trainer.options import TrainOptions
-from trainer.pipeline.run import train
 
 OUT = Path("run")
 
@@ -92,7 +93,9 @@ def killed_again_and_again(options: TrainOptions, moments: Sequence[float]) -> l
 
 
 if __name__ == "__main__":
-    run = small_run(Path(sys.argv[1]), **json.loads(sys.argv[2]))
+    asked = json.loads(sys.argv[2])
+    trainer.store.state.SAVE_EVERY = asked.pop("save_every", trainer.store.state.SAVE_EVERY)
+    run = small_run(Path(sys.argv[1]), **asked)
     with blank_plots():
         ends = killed_again_and_again(run, [float(at) for at in sys.argv[3].split(",") if at])
     sys.exit(ends[-1])

@@ -21,8 +21,7 @@ import trainer.pipeline.run
 from progdf.field.trajectory import load_trajectory
 from tests.helpers.paths import ROOT
 from tests.helpers.stopped import OUT, small_run
-from tests.helpers.trained import write_bear
-from trainer.pipeline.run import train
+from tests.helpers.trained import train, write_bear
 from trainer.store.run_folder import RunFolder
 from trainer.store.state import PeriodicSave
 
@@ -59,9 +58,10 @@ def interrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     made = tmp_path_factory.mktemp("interrupted")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(made)
+        patch.setattr("trainer.store.state.SAVE_EVERY", NEVER)
         at_step(patch, 9, lambda: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
-            train(small_run(bear_folder, save_every=NEVER), quiet=True)
+            train(small_run(bear_folder), quiet=True)
     return made / OUT
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import trainer.pipeline.run
 from progdf.camera import Camera
 from progdf.demo_scenes.bear_parts import LABELS
 from progdf.formats.ply import save_ply
@@ -21,6 +22,8 @@ from trainer.optimize.losses import GradientL1
 from trainer.optimize.objective import LossWeights, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
 from trainer.options import TrainOptions
+from trainer.pipeline.fit_and_report import RunResult
+from trainer.plan import make_plan
 from trainer.views.choose import choose_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop, region_rig, render_colors
@@ -91,6 +94,11 @@ def quick_options(folder: Path, out: str = "run", part: str = "body", **more: ob
         **more,
     }
     return TrainOptions(**settings)  # type: ignore[arg-type]
+
+
+def train(options: TrainOptions, quiet: bool = True) -> RunResult:
+    """`progdf train`, with its options."""
+    return trainer.pipeline.run.train(make_plan(options), options.out, options.threads, options.resume, quiet)
 
 
 def masked_psnr(image: Tensor, target: Tensor, mask: Tensor) -> float:

@@ -13,9 +13,6 @@ from trainer.views.view import View
 EditKind = Literal["color", "style", "geometry"]
 """What an edit moves, which chooses learning rates and loss weights (docs/method.md 3)."""
 
-Confine = Literal["auto", "yes", "no"]
-"""Whether what changed outside the region is put back; auto: unless the edit moves parts."""
-
 
 @dataclass(frozen=True)
 class EditorSettings:
@@ -29,7 +26,6 @@ class EditorSettings:
         seed: of the noise, the same in every view
         size: longer side in pixels at which pictures are painted
         graded: edit at several strengths by rising guidance, not the finished edit alone
-        confine: see `Confine`
         kept: folder in which painted pictures are kept; None keeps nothing
     """
 
@@ -40,7 +36,6 @@ class EditorSettings:
     seed: int = 0
     size: int | None = None
     graded: bool = False
-    confine: Confine = "auto"
     kept: Path | None = None
 
 

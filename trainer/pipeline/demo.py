@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,6 +29,7 @@ from progdf.io.images import contact_sheet, write_image
 from progdf.rasterize import render
 from trainer.option_checks import check_ranges
 from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions
+from trainer.plan import Plan, make_plan
 from trainer.store.state import StateFolder
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -230,16 +231,16 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
     from .resume import find_run  # only now: `--help` and the pictures need none of it
     from .run import train
 
-    runs = {edit.name: _run(options, show, scene, edit) for edit in show.edits}
-    here = {name: find_run(run) for name, run in runs.items()}
+    runs = {edit.name: _plan(options, show, scene, edit) for edit in show.edits}
+    here = {name: find_run(options.out / name, run) for name, run in runs.items()}
     for edit in show.edits:
         print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
-        run = runs[edit.name]
+        out = options.out / edit.name
         goes_on = "stopped" in here.values() and here[edit.name] != "nothing"
         if not goes_on:
-            StateFolder(run.out / "state").clear()  # of a demo with other options
+            StateFolder(out / "state").clear()  # of a demo with other options
         try:
-            train(replace(run, resume=goes_on))
+            train(runs[edit.name], out, options.threads, goes_on)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"what is done is kept in {options.out}; give the same command again to go on"
@@ -247,12 +248,12 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
     return {edit.name: _gdf(options.out, edit) for edit in show.edits}
 
 
-def _run(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
+def _plan(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> Plan:
     """How one edit is trained."""
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
     effort = show.draft if options.quick else show.full
-    return TrainOptions(
+    asked = TrainOptions(
         scene=folder / "scene.ply",
         out=folder / edit.name,
         region=f"labels:{folder / 'labels.npy'}:{ids}",
@@ -262,8 +263,8 @@ def _run(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> 
         image_size=effort.image_size,
         steps=effort.steps,
         seed=options.seed,
-        threads=options.threads,
     )
+    return make_plan(asked)
 
 
 def _gdf(folder: Path, edit: DemoEdit) -> Path:

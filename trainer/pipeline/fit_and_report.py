@@ -17,15 +17,14 @@ from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
-from progdf.io.json_values import convert_json, decode_json
+from progdf.io.json_values import convert_json, decode_json, plain
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility
 from trainer.fit.network import fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
 from trainer.optimize.settings import resolve_slider
-from trainer.options import TrainOptions
-from trainer.plan import Plan
+from trainer.pipeline.record import RunRecord
 from trainer.report.measures import clip_curve, expected_measures, figures, measure
 from trainer.report.report import report_picture
 from trainer.setup.training_setup import TrainingSetup
@@ -36,7 +35,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 _RANK_VIEWS = 4
-_REPORT_ALONE = ("options", "time", "memory_mb", "memory_by_stage_mb", "curves")
+_REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves")
 
 
 @dataclass(frozen=True)
@@ -60,10 +59,9 @@ def finish_run(
     folder: RunFolder,
     setup: TrainingSetup,
     trajectory: Trajectory,
-    about: Mapping[str, Any],
+    record: RunRecord,
     perceptual: Perceptual,
     log: RunLog,
-    plan: Plan,
     begun: Saved | None = None,
 ) -> RunResult:
     """Fit, measure, and write NAME.gdf, report.json and report.png.
@@ -72,12 +70,12 @@ def finish_run(
         folder: of the run
         setup: scene, region, views
         trajectory: what was recorded
-        about: what the trajectory's file says of the run; the report repeats it
+        record: see `RunRecord`; its plan says which field is fitted, and the report repeats the rest
         perceptual: distance of pictures
         log: of the run
-        plan: see `Plan`
         begun: see `network.fit_network`
     """
+    plan = record.plan
     target, budget = plan.field.target_psnr, plan.field.bytes_budget
     scene, region = setup.scene, setup.region
     with log.stage("fit"):
@@ -86,25 +84,25 @@ def finish_run(
         seen = load_evaluator(folder, setup, few, trajectory)
         with log.looks("weigh the members", len(setup.train)) as looked:
             weights = visibility(scene, region.members, setup.train, looked)
-        if plan.field.kind == "neural":
+        if plan.field.field == "neural":
             network = fit_network(
                 trajectory, setup, seen, evaluator, weights, plan.field.network, perceptual, log, begun
             )
             fitted = evaluate_field(trajectory, evaluator, network.field, target)
         else:
             network = None
-            with log.looks("fit the field", expected_looks(trajectory, plan.field.kind)) as looked:
+            with log.looks("fit the field", expected_looks(trajectory, plan.field.field)) as looked:
                 fitted = fit_field(
                     trajectory,
                     replace(seen, looked=looked),
                     replace(evaluator, looked=looked),
                     weights,
-                    plan.field.kind,
+                    plan.field.field,
                     target,
                     budget,
                 )
     with log.stage("even"):
-        slider = resolve_slider(plan.slider, plan.editor, trajectory.strengths)
+        slider = resolve_slider(plan.slider, trajectory.strengths)
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, setup, log)
@@ -126,10 +124,11 @@ def finish_run(
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
             watched = replace(evaluator, looked=looked)
             measured = measure(watched, trajectory, fitted, field, remap, perceptual, clip)
-        gdf = Gdf(plan.name, region, field, fingerprint(scene), plan.editor, about["options"])
+        editor, told = plan.editor.editor, plain(plan)
+        gdf = Gdf(plan.name, region, field, fingerprint(scene), editor, told)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
-        title = f"{plan.name}: {plan.editor}"
-        picture = report_picture(evaluator, measured, about["losses"], title)
+        title = f"{plan.name}: {editor}"
+        picture = report_picture(evaluator, measured, record.losses, title)
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -141,22 +140,22 @@ def finish_run(
             "s": [round(float(s), 4) for s in shown.s],
             "stages": list(trajectory.strengths),
             "stages_at": [round(s, 4) for s, _ in shown.asked],
-            "attribute_worth_db": about["attribute_worth_db"],
+            "attribute_worth_db": record.attribute_worth_db,
         },
-        "objective": about["objective"],
-        "losses": about["losses"],
-        "kind": about.get("kind"),
-        "kind_trial": about.get("kind_trial"),
-        "agreement": about.get("agreement"),
-        "followed": about.get("followed", 0),
-        "up": about.get("up"),
+        "objective": record.objective,
+        "losses": record.losses,
+        "kind": record.kind,
+        "kind_trial": record.kind_trial,
+        "agreement": record.agreement,
+        "followed": record.followed,
+        "up": record.up,
         "time": {**(_earlier_figures(folder, "time") if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.memory.peak(),
         "memory_by_stage_mb": {
             **(_earlier_figures(folder, "memory_by_stage_mb") if log.refits else {}),
             **log.memory.by_stage,
         },
-        "options": about["options"],
+        "plan": told,
     }
     # the .gdf has the options beside it, is small, and the same training writes the same file
     own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}
@@ -217,9 +216,9 @@ def _earlier_figures(folder: RunFolder, part: str) -> dict[str, float]:
         return {}
 
 
-def load_result(folder: RunFolder, options: TrainOptions, scene: Gaussians, log: RunLog) -> RunResult:
+def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> RunResult:
     """The result of a run that is finished."""
-    path = folder.gdf(options.name)
+    path = folder.gdf(name)
     gdf = load_gdf(path, scene)
     trajectory, _, _ = load_trajectory(folder.trajectory)
     log.say(f"{folder.root} is finished: there is nothing left to do, and {path} is complete")

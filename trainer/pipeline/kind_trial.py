@@ -19,14 +19,14 @@ from torch.nn.functional import interpolate
 from progdf.gaussians import pack
 from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
-from trainer.editors import UNTOLD, ImageEditor, check_editor
+from trainer.editors import ImageEditor
 from trainer.editors.base import EditKind
 from trainer.optimize.groups import group_stage
 from trainer.optimize.losses import GradientL1
 from trainer.optimize.objective import LossWeights, Objective
 from trainer.optimize.pgs import TargetStage, optimize
-from trainer.optimize.settings import GROUP_STEPS, group_steps, pgs_settings
-from trainer.options import TrainOptions
+from trainer.optimize.settings import GROUP_STEPS, pgs_settings
+from trainer.plan import OptimizationPlan, plan_optimization
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import Advance, RunLog
 from trainer.views.crops import CropScene, crop_scene, render_all
@@ -116,44 +116,51 @@ class Trial:
 
 
 def choose_approach(
-    options: TrainOptions, setup: TrainingSetup, editor: ImageEditor, log: RunLog
+    asked: OptimizationPlan, setup: TrainingSetup, editor: ImageEditor, knows_kind: bool, log: RunLog
 ) -> tuple[Approach, dict[str, Any] | None]:
-    """What options and editor say, or a trial finds where they leave it open; and the trial's figures.
+    """What plan and editor say, or a trial finds where they leave it open; and the trial's figures.
+
+    Args:
+        asked: see `OptimizationPlan`
+        setup: the training views
+        editor: pictures the finished edit
+        knows_kind: the editor knows what its pictures move
+        log: of the run
 
     Raises:
         ProgdfError: an edited view is missing or broken.
     """
-    kind = options.kind
-    if kind == "auto" and check_editor(options.editor)[0] not in UNTOLD:
-        kind = editor.kind
-    if kind in ("color", "style") or (kind == "geometry" and options.group_steps is not None):
-        return Approach(kind, group_steps(options, kind)), None
+    kind = editor.kind if asked.kind is None and knows_kind else asked.kind
+    if kind in ("color", "style"):
+        return Approach(kind), None
+    if kind == "geometry" and asked.group_steps is not None:
+        return Approach(kind, asked.group_steps), None
     edited = [editor.edit(view, 1.0) for view in setup.train]
-    ways = approaches(options, setup, edited)
+    ways = approaches(asked, setup, edited)
     if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
         return ways[0], None
     with log.steps("try kinds", len(ways)) as advance:
-        trial = try_approaches(options, setup, edited, ways, advance)
+        trial = try_approaches(asked, setup, edited, ways, advance)
     log.say(trial.line())
     return trial.chosen, trial.figures()
 
 
-def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
-    """The ways that the options leave open, those that move least first.
+def approaches(asked: OptimizationPlan, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
+    """The ways that the plan leaves open, those that move least first.
 
     Where a tool repaints the whole picture nothing tells what moved from what was painted anew beside it, and
     moving the region over that is no edit of it: geometry is then not tried unless it is asked for.
 
     Args:
-        options: see `TrainOptions`
+        asked: see `OptimizationPlan`
         setup: the training views
         edited: the finished edit of each, not confined. [H,W,3]
     """
-    groups = GROUP_STEPS if options.group_steps is None else options.group_steps
-    geometry = [Approach("geometry")] if not groups or options.group_steps is None else []
+    groups = GROUP_STEPS if asked.group_steps is None else asked.group_steps
+    geometry = [Approach("geometry")] if not groups or asked.group_steps is None else []
     geometry += [Approach("geometry", groups)] if groups else []
-    if options.kind != "auto":
-        return geometry if options.kind == "geometry" else [Approach(options.kind)]
+    if asked.kind is not None:
+        return geometry if asked.kind == "geometry" else [Approach(asked.kind)]
     changed = beside = 0.0
     for view, picture in zip(setup.train, edited, strict=True):
         outside = view.mask < 0.05
@@ -164,7 +171,7 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
 
 
 def try_approaches(
-    options: TrainOptions,
+    asked: OptimizationPlan,
     setup: TrainingSetup,
     edited: Sequence[Tensor],
     ways: Sequence[Approach],
@@ -173,7 +180,7 @@ def try_approaches(
     """Try some ways; the same inputs give the same figures.
 
     Args:
-        options: of the run
+        asked: of the run
         setup: scene, region and training views
         edited: the finished edit of each training view, not confined. [H,W,3]
         ways: see `approaches`
@@ -190,18 +197,18 @@ def try_approaches(
     crops, targets = [one.scene for one in taught], [one.target for one in taught]
     original = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0)
     extent = 2.0 * scene_sphere(setup.scene[members])[1]
-    steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.steps)))
+    steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * asked.steps)))
     objective = Objective(GradientL1(), LossWeights(perceptual=0.0))
     psnrs: dict[Approach, float] = {}
     for way in ways:
         stages = [TargetStage(1.0, targets, steps)]
         if way.group_steps:
             # how far parts get as wholes; what the members add to that takes longer than a trial
-            groups = group_stage(original, crops, [targets], steps, options.seed)
+            groups = group_stage(original, crops, [targets], steps, asked.seed)
             end = groups.to_stages(original, crops, stages)[0].place(torch.zeros_like(original))
         else:
-            own = replace(options, steps=steps, group_steps=0, sh="on")
-            settings = pgs_settings(own, way.kind, original.shape[1], extent, 1)
+            own = plan_optimization(replace(asked, steps=steps), way.kind, 0)
+            settings = pgs_settings(own, True, original.shape[1], extent, 1)
             *_, last = optimize(
                 original, crops, [], stages, objective, replace(settings, smoothing=0.9, every=0, snapshots=1)
             )

@@ -2,43 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
+from pathlib import Path
 
 from progdf.io.atomic import check_regular, open_error
 from progdf.io.cameras import load_cameras
 from progdf.scene.region_spec import check_region
 from trainer.editors import check_editor, check_new_editor
-from trainer.options import TrainOptions
-from trainer.regions.from_pictures import region_checks, region_settings
-from trainer.setup.training_setup import editor_settings
-from trainer.store.run_folder import check_folder
+from trainer.plan import Plan, segmented_views
+from trainer.regions.from_pictures import RegionSettings, region_checks
+from trainer.store.run_folder import check_folder, open_run_folder
 
 from .resume import load_region
 
 
-def check_command(options: TrainOptions, edit: Mapping[str, str]) -> None:
+def check_command(plan: Plan, out: Path, resume: bool) -> None:
     """Look at everything that the command names, as far as it can be seen without the scene.
 
     A run that goes on needs no longer what it began with: its region and its edited views are kept.
 
     Args:
-        options: resolved
-        edit: see `check_folder`
+        plan: see `Plan`
+        out: folder of the run
+        resume: go on with a run that was stopped in it
 
     Raises:
-        ProgdfError: --out is taken, the editor or the segmenter cannot run, or a file is not there.
+        ProgdfError: the folder is taken, the editor or the segmenter cannot run, or a file is not there.
     """
-    check_editor(options.editor)
-    folder = check_folder(options.out, edit)
-    if not options.scene.is_dir():  # some formats are folders
-        check_regular(options.scene)
+    check_editor(plan.editor.editor)
+    folder = check_folder(out, plan.edit)
+    if not plan.scene.is_dir():  # some formats are folders
+        check_regular(plan.scene)
         try:
-            options.scene.open("rb").close()
+            plan.scene.open("rb").close()
         except OSError as error:
-            raise open_error(options.scene, error) from None
-    if options.cameras is not None and not options.resume:
-        load_cameras(options.cameras)
-    if load_region(options) is None:
-        check_region(options.region, region_checks(region_settings(options, edit, quiet=True)))
+            raise open_error(plan.scene, error) from None
+    if plan.views.cameras is not None and not resume:
+        load_cameras(plan.views.cameras)
+    if not resume or load_region(out) is None:
+        check_region(plan.region.region, region_checks(region_settings(plan, out, quiet=True)))
     if not folder.root.is_dir() or not any(folder.root.iterdir()):
-        check_new_editor(options.editor, editor_settings(options, folder))
+        check_new_editor(plan.editor.editor, plan.editor.settings(folder.painted))
+
+
+def region_settings(
+    plan: Plan, out: Path, quiet: bool, say: Callable[[str], None] | None = None
+) -> RegionSettings:
+    """How the region is made of pictures; those that are segmented are kept in the run's folder.
+
+    Args:
+        plan: see `Plan`
+        out: folder of the run
+        quiet, say: see `RegionSettings`
+    """
+
+    def kept() -> Path:
+        # nothing is written into a folder that is no run of ours
+        return open_run_folder(out, plan.edit).segmented
+
+    region = plan.region
+    return RegionSettings(
+        plan.views.cameras,
+        segmented_views(plan),
+        kept,
+        region.lift_rule,
+        region.lift_threshold,
+        region.segmenter,
+        quiet,
+        plan.views.up,
+        plan.scene,
+        say,
+    )

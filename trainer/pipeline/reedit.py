@@ -17,8 +17,8 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import pack
 from trainer.editors import RepaintingEditor, make_editor
 from trainer.editors.base import EditKind
-from trainer.options import TrainOptions
-from trainer.setup.training_setup import TrainingSetup, confines_edit, editor_settings, quantize_image
+from trainer.plan import EditorPlan
+from trainer.setup.training_setup import TrainingSetup, confines_edit, quantize_image
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import crop, render_view
@@ -71,17 +71,17 @@ class Reedit:
 
 
 def reedit(
-    options: TrainOptions, setup: TrainingSetup, kind: EditKind, folder: RunFolder, log: RunLog
+    editor: EditorPlan, every: int, setup: TrainingSetup, kind: EditKind, folder: RunFolder, log: RunLog
 ) -> Reedit | None:
     """What --reedit-every asks for; None where it asks for nothing.
 
     Raises:
         ProgdfError: the editor cannot look at a picture again.
     """
-    if not options.reedit_every:
+    if not every:
         return None
     views = [*setup.train, *setup.held_out]
-    editor = make_editor(options.editor, setup.scene, setup.region, views, editor_settings(options, folder))
-    if not isinstance(editor, RepaintingEditor):
-        raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
-    return Reedit(editor, setup, options.reedit_every, confines_edit(editor, options, kind), log)
+    made = make_editor(editor.editor, setup.scene, setup.region, views, editor.settings(folder.painted))
+    if not isinstance(made, RepaintingEditor):
+        raise ProgdfError(f"--reedit-every does not apply to {editor.editor}; leave it out")
+    return Reedit(made, setup, every, confines_edit(made, kind), log)

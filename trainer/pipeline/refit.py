@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from trainer.optimize.losses import perceptual_loss
-from trainer.option_checks import check_network_options, plain_options
+from trainer.option_checks import check_network_options
 from trainer.options import FitOptions
 from trainer.pipeline.fit_and_report import RunResult, finish_run
-from trainer.pipeline.reopen import options_of, render_run_views, reopen_run
+from trainer.pipeline.reopen import render_run_views, reopen_run
 from trainer.pipeline.threads import use_threads
-from trainer.plan import make_plan
+from trainer.plan import FieldPlan
+from trainer.report.clip import Texts
 from trainer.setup.training_setup import widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import read_views
@@ -36,21 +37,19 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
-        own = options_of(run.about)
-        now = replace(
-            own,
-            field=options.field,
-            fit="after",
-            size=options.size,
-            code=options.code,
-            picture_loss=options.picture_loss,
-            target_psnr=options.target_psnr,
-            bytes_budget=options.bytes_budget,
-            text_before=options.text_before or own.text_before,
-            text_after=options.text_after or own.text_after,
-            clip_model=options.clip_model or own.clip_model,
+        own = run.record.plan
+        network = replace(own.field.network, size=options.size, picture_loss=options.picture_loss)
+        texts = Texts(
+            options.text_before or own.texts.before,
+            options.text_after or own.texts.after,
+            own.texts.asked or bool(options.text_before or options.text_after),
         )
-        about = {**run.about, "options": plain_options(now)}
-        return finish_run(run.folder, setup, run.trajectory, about, perceptual, log, make_plan(now))
+        plan = replace(
+            own,
+            field=FieldPlan(options.field, options.target_psnr, options.bytes_budget, network),
+            texts=texts,
+        )
+        record = replace(run.record, plan=plan)
+        return finish_run(run.folder, setup, run.trajectory, record, perceptual, log)
     finally:
         log.close()

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import torch
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
-from progdf.io.json_values import convert_json, decode_json
+from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
-from trainer.option_checks import plain_options, resolve_options
-from trainer.options import MOST_THREADS, TrainOptions
+from trainer.options import MOST_THREADS
+from trainer.plan import Plan, plan_difference
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
-
-_ABOUT_THE_COMMAND = {"out", "threads", "resume", "save_every", "quick"}
-"""Options that change no bit of the result; `quick` is worked into others."""
 
 REGION = "region"
 """Of the saved state: members and score."""
@@ -42,10 +39,10 @@ class ResumeDecision:
     notes: tuple[str, ...] = ()
 
 
-def load_region(options: TrainOptions) -> Region | None:
+def load_region(out: Path) -> Region | None:
     """The region of a stopped run that is to go on: what it was made from need not be looked at again."""
-    state = RunFolder(options.out).state
-    saved = state.load(REGION) if options.resume and state.identity() is not None else None
+    state = RunFolder(out).state
+    saved = state.load(REGION) if state.identity() is not None else None
     if saved is None:
         return None
     with state.restore_part(REGION):
@@ -53,63 +50,61 @@ def load_region(options: TrainOptions) -> Region | None:
 
 
 def decide_resume(
-    folder: RunFolder, options: TrainOptions, edit: Mapping[str, str], region: Region, threads: int
+    folder: RunFolder, plan: Plan, region: Region, threads: int, resume: bool
 ) -> ResumeDecision:
     """Find out what is to be done, and make the folder ready for it.
 
     Args:
         folder: opened and locked
-        options: resolved
-        edit: see `open_run_folder`
+        plan: of the run that is asked for
         region: what may change
-        threads: that the options ask for
+        threads: that are asked for
+        resume: go on with what was stopped
 
     Raises:
-        ProgdfError: a stopped run that would be lost without --resume; with it, other options than the run's.
+        ProgdfError: a stopped run that would be lost without --resume; with it, another plan than the run's.
     """
     saved = _saved_identity(folder)
-    if options.resume and saved is None and folder.report.is_file():
-        _check_options(folder, _finished_options(folder), options, "leave out --resume to train again")
+    if resume and saved is None and folder.report.is_file():
+        _check_plan(folder, _finished_plan(folder), plan, "leave out --resume to train again")
         return ResumeDecision("nothing", threads)
     remove_leftovers(folder)
-    now = _identity(options, threads)
-    if options.resume and saved is not None:
+    now = _identity(plan, threads)
+    if resume and saved is not None:
         remedy = "give --resume the run's own options, or train again in another folder"
-        _check_options(folder, saved.options, options, remedy)
-        for what, was in (("scene", saved.scene), ("cameras", saved.cameras)):
-            if was != now[what]:
+        _check_plan(folder, saved.plan, plan, remedy)
+        for what in ("scene", "cameras"):
+            if getattr(saved, what) != getattr(now, what):
                 raise ProgdfError(
                     f"the {what} has changed since {folder.root} was started; restore it and continue "
                     "with --resume, or train again in another folder"
                 )
         notes = []
-        if saved.torch != now["torch"]:
-            notes.append(f"torch was {saved.torch} and is {now['torch']}: the last bits may differ")
+        if saved.torch != now.torch:
+            notes.append(f"torch was {saved.torch} and is {now.torch}: the last bits may differ")
         if saved.threads != threads:
             notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
         return ResumeDecision("go on", saved.threads, tuple(notes))
     if saved is not None and (step := _saved_step(folder)):
         raise ProgdfError(
-            f"{folder.root} holds a run that was stopped at step {step} of {saved.options.get('steps')}; "
+            f"{folder.root} holds a run that was stopped at step {step} of {saved.plan.optimization.steps}; "
             f"add --resume to continue it, or delete {folder.state.path} to start over"
         )
-    begin_log(folder, edit)
-    folder.state.begin(now)
+    begin_log(folder, plan.edit)
+    folder.state.begin(plain(now))
     folder.state.save(REGION, {"members": region.members, "score": region.score}, {"name": region.name})
-    notes = (
-        ["nothing to resume was saved yet, so the run starts from the beginning"] if options.resume else []
-    )
+    notes = ["nothing to resume was saved yet, so the run starts from the beginning"] if resume else []
     return ResumeDecision("start", threads, tuple(notes))
 
 
-def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
-    """What --resume would find in the folder, of a run with these very options."""
-    folder, options = RunFolder(options.out), resolve_options(options)
+def find_run(out: Path, plan: Plan) -> Literal["nothing", "stopped", "finished"]:
+    """What a run that resumes would find in the folder, of a run with this very plan."""
+    folder = RunFolder(out)
     saved = _saved_identity(folder)
     if saved is None and not folder.report.is_file():
         return "nothing"
     try:
-        _check_options(folder, saved.options if saved else _finished_options(folder), options, "")
+        _check_plan(folder, saved.plan if saved else _finished_plan(folder), plan, "")
     except ProgdfError:
         return "nothing"
     return "stopped" if saved else "finished"
@@ -145,25 +140,21 @@ def check_exists(folder: RunFolder) -> Iterator[None]:
         raise ProgdfError(f"{folder.state.path} was removed during the run; train again") from error
 
 
-def _identity(options: TrainOptions, threads: int) -> dict[str, Any]:
-    """All that decides the bits of a run's result, as JSON values."""
-    return {
-        "options": plain_options(options),
-        "scene": _digest(options.scene),
-        "cameras": _digest(options.cameras) if options.cameras is not None else None,
-        "threads": threads,
-        "torch": torch.__version__,
-    }
-
-
 class _Identity(msgspec.Struct):
-    """What `_identity` gave, read from run.json."""
+    """All that decides the bits of a run's result, as run.json has it; of files their hashes."""
 
-    options: dict[str, Any]
+    plan: Plan
     scene: str
     cameras: str | None
     threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
     torch: str
+
+
+def _identity(plan: Plan, threads: int) -> _Identity:
+    cameras = plan.views.cameras
+    return _Identity(
+        plan, _digest(plan.scene), _digest(cameras) if cameras else None, threads, str(torch.__version__)
+    )
 
 
 def _saved_identity(folder: RunFolder) -> _Identity | None:
@@ -176,19 +167,14 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
         raise folder.state.damage_error(folder.state.path / "run.json", error) from None
 
 
-def _check_options(folder: RunFolder, saved: Mapping[str, Any], options: TrainOptions, remedy: str) -> None:
-    for name, now in plain_options(options).items():
-        was = saved.get(name)
-        if name in ("scene", "cameras") and was is not None and now is not None:
-            was, now = (str(Path(path).resolve()) for path in (was, now))
-        if was != now and name not in _ABOUT_THE_COMMAND:
-            option = "--" + name.replace("_", "-")
-            raise ProgdfError(f"{folder.root} was started with {option} {was}, not {now}; {remedy}")
+def _check_plan(folder: RunFolder, was: Plan, now: Plan, remedy: str) -> None:
+    if difference := plan_difference(was, now):
+        raise ProgdfError(f"{folder.root} was started with {difference}; {remedy}")
 
 
-def _finished_options(folder: RunFolder) -> Mapping[str, Any]:
+def _finished_plan(folder: RunFolder) -> Plan:
     try:
-        return convert_json(decode_json(folder.report.read_bytes())["options"], dict[str, Any])
+        return convert_json(decode_json(folder.report.read_bytes())["plan"], Plan)
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave out --resume to train again") from error
 

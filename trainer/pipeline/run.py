@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.trajectory import load_trajectory, save_trajectory
+from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.io.cameras import save_cameras
+from progdf.io.json_values import convert_json, plain
 from progdf.region import Region
 from progdf.scene.region_spec import parse_region
-from trainer.editors import GIVEN, VIEW_BY_VIEW, check_editor, make_editor
+from trainer.editors import GIVEN, VIEW_BY_VIEW, make_editor
 from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor
 from trainer.fit.fit import drop_idle_attributes
@@ -24,22 +25,18 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.own_path import choose_path
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.settings import idle_options, objective_line, resolve_slider, stage_count
+from trainer.optimize.settings import Optimization, resolve_slider
 from trainer.optimize.unseen import unseen_members_of
-from trainer.option_checks import plain_options, resolve_options
-from trainer.options import TrainOptions
 from trainer.pipeline.fit_and_report import load_result
 from trainer.pipeline.threads import use_threads, wanted_threads
-from trainer.plan import make_plan
-from trainer.presets import CONSTANTS
-from trainer.regions.from_pictures import region_kinds, region_settings
+from trainer.plan import Plan, plan_optimization
+from trainer.regions.from_pictures import region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.setup.training_setup import (
     Pictures,
     TrainingSetup,
     confines_edit,
     edit_views,
-    editor_settings,
     editor_strengths,
     make_training_setup,
     quantize_image,
@@ -60,46 +57,48 @@ from trainer.views.view import BACKGROUND, render_view
 
 from .fit_and_report import RunResult, end_rows, finish_run, load_evaluator
 from .kind_trial import Approach, choose_approach
-from .preflight import check_command
+from .preflight import check_command, region_settings
+from .record import RunRecord
 from .reedit import reedit
 from .resume import check_exists, decide_resume, explain_stop, load_region
-from .training import optimize_members, retime_trajectory
+from .training import JointNetwork, optimize_members, retime_trajectory
 
 __all__ = ["RunResult", "train"]
 
 
-def train(options: TrainOptions, quiet: bool = False) -> RunResult:
+def train(plan: Plan, out: Path, threads: int = 0, resume: bool = False, quiet: bool = False) -> RunResult:
     """Edit a region of a scene and write its .gdf file.
 
     Args:
-        options: see TrainOptions
+        plan: see `make_plan`
+        out: folder of the run
+        threads: CPU threads; 0 takes all cores
+        resume: go on with a run that was stopped in this folder
         quiet: nothing on the screen; log.txt is written all the same
 
     Raises:
-        ProgdfError: options, scene, region, cameras or edited views that do not work; no .gdf is touched.
+        ProgdfError: scene, region, cameras or edited views that do not work; no .gdf is touched.
         KeyboardInterrupt: interrupted; the message says how to go on. No .gdf is touched.
     """
-    options = resolve_options(options)
-    edit = {"scene": str(options.scene.resolve()), "region": options.region, "editor": options.editor}
-    check_command(options, edit)
-    use_threads(options.threads)
-    scene = load_scene(options.scene)
-    region, notes = load_region(options), list[str]()
+    check_command(plan, out, resume)
+    use_threads(threads)
+    scene = load_scene(plan.scene)
+    region, notes = load_region(out) if resume else None, list[str]()
     if region is None:
-        kinds = region_kinds(region_settings(options, edit, quiet, notes.append))
-        region = parse_region(options.region, scene, options.name, kinds)
-    folder = open_run_folder(options.out, edit)
+        kinds = region_kinds(region_settings(plan, out, quiet, notes.append))
+        region = parse_region(plan.region.region, scene, plan.name, kinds)
+    folder = open_run_folder(out, plan.edit)
     with interrupt_on_signals(), lock_folder(folder), explain_stop(folder):
-        session = decide_resume(folder, options, edit, region, wanted_threads(options.threads))
+        session = decide_resume(folder, plan, region, wanted_threads(threads), resume)
         log = RunLog(folder.log, quiet)
         try:
             for note in (*session.notes, *notes):
                 log.say(note)
             if session.does == "nothing":
-                return load_result(folder, options, scene, log)
+                return load_result(folder, plan.name, scene, log)
             use_threads(session.threads)
             with check_exists(folder):
-                result = _run_training(options, scene, region, folder, log)
+                result = _run_training(plan, scene, region, folder, log)
             folder.state.end()
             return result
         except KeyboardInterrupt:
@@ -109,15 +108,13 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
             log.close()
 
 
-def _run_training(
-    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
-) -> RunResult:
+def _run_training(plan: Plan, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog) -> RunResult:
     """Everything; what the saved state says is done is not done again, or is repeated to the same bits."""
     perceptual, warning = perceptual_loss()
     if warning:
         log.say(warning)
     with log.stage("views"):
-        setup = _render_originals(options, scene, region, folder)
+        setup = _render_originals(plan, scene, region, folder)
     views = [*setup.train, *setup.held_out]
     log.say(
         f"{len(scene)} Gaussians, {len(region)} in the region; {len(setup.train)} views to train on and "
@@ -126,28 +123,27 @@ def _run_training(
     for note in setup.notes:
         log.say(note)
     with log.stage("edit"):
-        edited, approach, trial = _edit_views(options, setup, folder, log)
+        edited, approach, trial = _edit_views(plan, setup, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
         setup = widen_views(setup, train_edits)
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
-            agreement = _agreement(options, setup, edited, approach.kind, log)
-        _record(options, setup, train_edits, approach, trial, perceptual, folder, log, agreement)
+            agreement = _agreement(plan, setup, edited, approach.kind, log)
+        optimization = plan_optimization(plan.optimization, approach.kind, approach.group_steps)
+        _record(plan, optimization, setup, train_edits, trial, perceptual, folder, log, agreement)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
     trajectory, _, about = load_trajectory(folder.trajectory)
     begun = folder.state.load(NETWORK)
-    return finish_run(folder, setup, trajectory, about, perceptual, log, make_plan(options), begun)
+    return finish_run(folder, setup, trajectory, convert_json(about, RunRecord), perceptual, log, begun)
 
 
-def _render_originals(
-    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder
-) -> TrainingSetup:
+def _render_originals(plan: Plan, scene: Gaussians, region: Region, folder: RunFolder) -> TrainingSetup:
     """The views, rendered and on disk."""
-    setup = make_training_setup(options, scene, region)
+    setup = make_training_setup(plan.views, scene, region)
     views = [*setup.train, *setup.held_out]
     remove_stale_views(folder, [view.camera.name for view in views])
     write_views(folder, "original", {view.camera.name: view.image for view in views})
@@ -158,7 +154,7 @@ def _render_originals(
 
 
 def _edit_views(
-    options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
+    plan: Plan, setup: TrainingSetup, folder: RunFolder, log: RunLog
 ) -> tuple[dict[float, list[Tensor]], Approach, dict[str, Any] | None]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
     what a trial of that found.
@@ -173,46 +169,48 @@ def _edit_views(
             return edited, Approach(done.values["kind"], done.values["group_steps"]), done.values["trial"]
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
-    editor = make_editor(options.editor, setup.scene, setup.region, views, editor_settings(options, folder))
+    spec = plan.editor.editor
+    editor = make_editor(spec, setup.scene, setup.region, views, plan.editor.settings(folder.painted))
     if isinstance(editor, FolderEditor) and editor.warning is not None:
         log.say(editor.warning)
-    approach, trial = choose_approach(options, setup, editor, log)
+    approach, trial = choose_approach(plan.optimization, setup, editor, plan.editor.knows_kind, log)
     kind = approach.kind
-    strengths = editor_strengths(editor, stage_count(options, kind))
-    if resolve_slider(options.slider, options.editor, strengths) == "even":
-        strengths = equalized_strengths(editor, options.editor, views, strengths)
-    confined = confines_edit(editor, options, kind)
+    stages = plan_optimization(plan.optimization, kind, approach.group_steps).stages
+    strengths = editor_strengths(editor, stages)
+    if resolve_slider(plan.slider, strengths) == "even":
+        strengths = equalized_strengths(editor, spec, views, strengths)
+    confined = confines_edit(editor, kind)
     with log.steps("edit", len(views) * len(strengths)) as advance:
         edited = edit_views(editor, views, strengths, folder, confined, advance)
     if all(
         torch.equal(p, quantize_image(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
     ):
         raise ProgdfError(
-            f"{options.editor} changes none of the views; check the region and what the editor is asked for"
+            f"{spec} changes none of the views; check the region and what the editor is asked for"
         )
-    log.say(f"{options.editor}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
+    log.say(f"{spec}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
     saved = {"strengths": list(edited), "kind": kind, "group_steps": approach.group_steps, "trial": trial}
     folder.state.save("edited", {}, saved)
     return edited, approach, trial
 
 
 def _agreement(
-    options: TrainOptions, setup: TrainingSetup, edited: Pictures, kind: EditKind, log: RunLog
+    plan: Plan, setup: TrainingSetup, edited: Pictures, kind: EditKind, log: RunLog
 ) -> Agreement | None:
     """Whether the edited views agree; None where an editor cannot but edit all alike."""
-    if kind == "geometry" or check_editor(options.editor)[0] not in VIEW_BY_VIEW:
+    if kind == "geometry" or plan.editor.family not in VIEW_BY_VIEW:
         return None
     count = len(setup.train)
     found = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:])
-    log.say(found.line(check_editor(options.editor)[0]))
+    log.say(found.line(plan.editor.family))
     return found
 
 
 def _record(
-    options: TrainOptions,
+    plan: Plan,
+    optimization: Optimization,
     setup: TrainingSetup,
     edited: Pictures,
-    approach: Approach,
     trial: Mapping[str, Any] | None,
     perceptual: Perceptual,
     folder: RunFolder,
@@ -220,25 +218,29 @@ def _record(
     agreement: Agreement | None,
 ) -> None:
     """Optimize, and write the trajectory and the finished edit's views."""
-    kind, scene, region = approach.kind, setup.scene, setup.region
-    objective = objective_line(options, kind, perceptual.name)
+    kind, scene, region = optimization.kind, setup.scene, setup.region
+    objective = optimization.objective(perceptual.name)
     log.say(f"loss: {objective}")
-    if idle := idle_options(options, kind):
-        log.say(f"{', '.join(idle)}: without effect on this {kind} edit, whose loss is {objective}")
+    if plan.optimization.group_steps and kind != "geometry":
+        log.say(f"--group-steps: without effect on this {kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
-        renewal = reedit(options, setup, kind, folder, log)
+        renewal = reedit(plan.editor, plan.optimization.reedit_every, setup, kind, folder, log)
         unseen_members = unseen_members_of(setup, kind)
         trajectory, losses = optimize_members(
-            replace(options, group_steps=approach.group_steps),
+            optimization,
             setup,
             edited,
-            kind,
             perceptual,
             folder.state,
             log,
             renewal,
             unseen_members,
+            JointNetwork(plan.field.network, plan.slider) if plan.optimization.joint else None,
         )
+
+    def retimed(trajectory: Trajectory) -> Trajectory:
+        return retime_trajectory(trajectory, setup, plan.slider, optimization.raw, log)
+
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
@@ -246,38 +248,36 @@ def _record(
             trajectory, costs = drop_idle_attributes(trajectory, evaluator)
         recorded = len(trajectory)
         way = ""
-        if not CONSTANTS[options.preset].raw and options.field != "neural" and len(edited) == 1:
+        if not optimization.raw and plan.field.field != "neural" and len(edited) == 1:
             editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
-            if check_editor(options.editor)[0] not in GIVEN:
-                views = [*setup.train, *setup.held_out]
-                editor = make_editor(options.editor, scene, region, views, editor_settings(options, folder))
-            in_parts = bool(approach.group_steps)
-            trajectory, way = choose_path(
-                trajectory, setup, editor, in_parts, lambda t: retime_trajectory(t, setup, options, log)
-            )
+            if plan.editor.family not in GIVEN:
+                views, settings = [*setup.train, *setup.held_out], plan.editor.settings(folder.painted)
+                editor = make_editor(plan.editor.editor, scene, region, views, settings)
+            trajectory, way = choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)
         else:
-            trajectory = retime_trajectory(trajectory, setup, options, log)
+            trajectory = retimed(trajectory)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
     if way:
         log.say(f"between original and edit: {way}")
-    about = {
-        "scene": str(options.scene.resolve()),
-        "held_out": [view.camera.name for view in setup.held_out],
-        "background": list(BACKGROUND),
-        "options": plain_options(options),
-        "kind": kind,
-        "group_steps": approach.group_steps,
-        "kind_trial": trial,
-        "objective": objective,
-        "losses": losses,
-        "attribute_worth_db": costs,
-        "agreement": agreement.figures() if agreement is not None else None,
-        "followed": len(unseen_members.places),
-        "up": setup.up.to_json() if setup.up is not None else None,
-    }
-    save_trajectory(folder.trajectory, trajectory, {"members": region.members, "score": region.score}, about)
+    record = RunRecord(
+        plan,
+        plan.scene.resolve(),
+        [view.camera.name for view in setup.held_out],
+        BACKGROUND,
+        kind,
+        optimization.group_steps,
+        trial,
+        objective,
+        losses,
+        costs,
+        agreement.figures() if agreement is not None else None,
+        len(unseen_members.places),
+        setup.up.to_json() if setup.up is not None else None,
+    )
+    extra = {"members": region.members, "score": region.score}
+    save_trajectory(folder.trajectory, trajectory, extra, plain(record))
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(setup, trajectory))
         views = [*setup.train, *setup.held_out]

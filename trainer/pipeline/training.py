@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -13,8 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.scene.bounds import scene_sphere
-from trainer.editors.base import EditKind
-from trainer.fit.network import begin_joint_training, save_network
+from trainer.fit.network import NetworkPlan, begin_joint_training, save_network
 from trainer.optimize.color_solver import iterations, make_solver, solve
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Perceptual, erode
@@ -22,13 +21,11 @@ from trainer.optimize.objective import Losses, Objective, loss_table
 from trainer.optimize.optimizer_state import PgsState
 from trainer.optimize.pgs import Renewal, TargetStage, learning_rates, optimize
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
-from trainer.optimize.settings import group_steps, loss_weights, pgs_settings, resolve_slider, solves_colors
+from trainer.optimize.settings import Optimization, pgs_settings, resolve_slider
 from trainer.optimize.unseen import UnseenMembers
 from trainer.optimize.view_dependence import NEEDED, view_dependence
-from trainer.options import TrainOptions
+from trainer.options import Slider
 from trainer.pipeline.recordings import Recordings
-from trainer.plan import make_plan
-from trainer.presets import CONSTANTS
 from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views
 from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
@@ -50,29 +47,42 @@ PART = "training"
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
 
+@dataclass(frozen=True)
+class JointNetwork:
+    """A network that is trained jointly with the members.
+
+    Args:
+        network: see `NetworkPlan`
+        slider: what slider values will mean
+    """
+
+    network: NetworkPlan
+    slider: Slider
+
+
 def optimize_members(
-    options: TrainOptions,
+    optimization: Optimization,
     setup: TrainingSetup,
     edited: Pictures,
-    kind: EditKind,
     perceptual: Perceptual,
     folder: StateFolder,
     log: RunLog,
     renewal: Renewal | None = None,
     unseen_members: UnseenMembers | None = None,
+    network: JointNetwork | None = None,
 ) -> tuple[Trajectory, Losses]:
     """Optimize the members, from the beginning or from the saved state.
 
     Args:
-        options: see `TrainOptions`
+        optimization: see `Optimization`
         setup: scene, region, views with boxes that hold the edit
         edited: strength → the edited training views, whole
-        kind: what the edit moves
         perceptual: distance of pictures
         folder: where the state is saved
         log: of the run
         renewal: see `pgs.Renewal`
         unseen_members: members that take their colors from others
+        network: trained jointly with the members
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -81,35 +91,37 @@ def optimize_members(
         ProgdfError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state is saved.
     """
-    scene, members = setup.scene, setup.region.members
-    options = _decide_bands(options, setup, kind, log)
+    scene, members, kind = setup.scene, setup.region.members, optimization.kind
+    bands = _trains_bands(optimization, setup, log)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    rates = learning_rates(kind, original.shape[1], 1.0, CONSTANTS[options.preset].rates)
+    rates = learning_rates(kind, original.shape[1], 1.0, optimization.rates)
     still = not moving_attributes(rates[None], GEOMETRY)
     crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
-    steps = iterations(options.steps) if solves_colors(options, kind) else options.steps
+    steps = iterations(optimization.steps) if optimization.solves_colors else optimization.steps
     steps = max(steps, len(edited) + 1)  # each stage is to have one
     stages = [
         TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
     ]
     groups = None
-    if group_steps(options, kind):
-        groups = _groups(options, original, crops, [stage.targets for stage in stages], folder, log)
+    if optimization.group_steps:
+        groups = _groups(optimization, original, crops, [stage.targets for stage in stages], folder, log)
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
-    settings = pgs_settings(options, kind, original.shape[1], extent, len(stages))
+    settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
     inside = [erode(crop(view.mask, view.box)) for view in setup.train]
-    objective = Objective(perceptual, loss_weights(options, kind), inside)
+    objective = Objective(perceptual, optimization.weights, inside)
     solver = None
-    if solves_colors(options, kind):
+    if optimization.solves_colors:
         with log.stage("weights"):
-            solver = make_solver(crops, original, options.sh != "off" and original.shape[1] > BASE_CHANNELS)
+            solver = make_solver(crops, original, bands and original.shape[1] > BASE_CHANNELS)
 
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
-    joint = begin_joint_training(make_plan(options), setup, settings.rates, stages)
+    joint = None
+    if network is not None:
+        joint = begin_joint_training(network.network, network.slider, setup, settings.rates, stages)
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
-    kept = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}), every_s=options.save_every)
+    kept = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}))
     if kept.restore():
         if joint is not None:
             joint.refill([(made.step, made.offsets) for made in recordings.made])
@@ -190,23 +202,21 @@ def is_no_worse(
     return error(unseen_members.propagate(end)) <= 1.01 * error(end)
 
 
-def _decide_bands(options: TrainOptions, setup: TrainingSetup, kind: EditKind, log: RunLog) -> TrainOptions:
-    """`options.sh` as "on" or "off": a color edit trains the bands where the region's own show."""
-    if options.sh != "auto" or setup.scene.sh_degree == 0:
-        return options
-    if kind != "color" or CONSTANTS[options.preset].rates == "3dgs":
-        return replace(options, sh="on")
+def _trains_bands(optimization: Optimization, setup: TrainingSetup, log: RunLog) -> bool:
+    """Whether the SH bands beyond DC are trained: a color edit trains them where the region's own show."""
+    if optimization.sh != "auto" or setup.scene.sh_degree == 0:
+        return optimization.sh != "off"
     change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
     needed = change >= NEEDED
     log.say(
         f"the region's colors change with the view by {change:.3f} of 1: "
         f"the SH bands beyond DC are {'trained' if needed else 'left as they are'} ({NEEDED:g} is needed)"
     )
-    return replace(options, sh="on" if needed else "off")
+    return needed
 
 
 def _groups(
-    options: TrainOptions,
+    optimization: Optimization,
     original: Tensor,
     crops: Sequence[CropScene],
     targets: Sequence[Sequence[Tensor]],
@@ -217,7 +227,7 @@ def _groups(
     done = folder.load("groups")
     if done is not None:
         return restore_groups(original, done.tensors)
-    steps = group_steps(options, "geometry")
+    steps = optimization.group_steps
     try:
         with log.steps("move parts", steps * len(targets)) as advance:
             groups = group_stage(
@@ -225,7 +235,7 @@ def _groups(
                 crops,
                 targets,
                 steps,
-                options.seed,
+                optimization.seed,
                 lambda step, loss: advance(step, f"loss {loss:.4f}"),
             )
     except FloatingPointError as error:
@@ -239,9 +249,17 @@ def _groups(
 
 
 def retime_trajectory(
-    trajectory: Trajectory, setup: TrainingSetup, options: TrainOptions, log: RunLog
+    trajectory: Trajectory, setup: TrainingSetup, slider: Slider, raw: bool, log: RunLog
 ) -> Trajectory:
-    """Without jitter, and at the slider values where its change is due; every recording is rendered once."""
+    """Without jitter, and at the slider values where its change is due; every recording is rendered once.
+
+    Args:
+        trajectory: as recorded
+        setup: scene, region, views
+        slider: what slider values mean
+        raw: keep the jitter
+        log: of the run
+    """
     moving = moving_attributes(trajectory.end)
     small = probe_views(setup, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
     rows = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
@@ -251,11 +269,10 @@ def retime_trajectory(
             images = render_all(small, rows + trajectory.node(i), moving)
             shown.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
-    if not CONSTANTS[options.preset].raw:
+    if not raw:
         kept = straight_recordings(trajectory, shown)
         trajectory, shown = select_recordings(trajectory, kept), [shown[i] for i in kept]
-    slider = resolve_slider(options.slider, options.editor, trajectory.strengths)
-    return retime(trajectory, shown, slider)
+    return retime(trajectory, shown, resolve_slider(slider, trajectory.strengths))
 
 
 def _steps_by_stage(steps: int, stages: int) -> list[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -22,10 +22,9 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import Check, Kind
 from progdf.scene.up_axis import UpChoice, find_up
 from trainer.editors.cache import KeptPictures, Recipe
-from trainer.options import VIEWS, TrainOptions
+from trainer.options import LiftRule
 from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
-from trainer.store.run_folder import open_run_folder
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -36,7 +35,7 @@ from trainer.views.view import (
     with_near_plane,
 )
 
-from .lift import Rule, lift_masks
+from .lift import lift_masks
 
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
@@ -62,7 +61,7 @@ class RegionSettings:
     cameras: Path | None
     views: int
     kept: Callable[[], Path]
-    rule: Rule = "share"
+    rule: LiftRule = "share"
     threshold: float | None = None
     segmenter: SegmenterSettings = SegmenterSettings()
     quiet: bool = False
@@ -73,36 +72,6 @@ class RegionSettings:
     def up_of(self, scene: Gaussians) -> Tensor:
         """The direction that is up in a scene without cameras. [3]"""
         return find_up(scene, (), self.up).direction
-
-
-def region_settings(
-    options: TrainOptions, edit: Mapping[str, str], quiet: bool, say: Callable[[str], None] | None = None
-) -> RegionSettings:
-    """What the options of a run say; pictures that are segmented are kept in its folder.
-
-    Args:
-        options: resolved
-        edit: see `open_run_folder`
-        quiet, say: see `RegionSettings`
-    """
-
-    def kept() -> Path:
-        return open_run_folder(
-            options.out, edit
-        ).segmented  # nothing is written into a folder that is no run of ours
-
-    return RegionSettings(
-        options.cameras,
-        options.views or VIEWS,
-        kept,
-        options.lift_rule,
-        options.lift_threshold,
-        SegmenterSettings(options.detector, options.sam_model, options.box_threshold),
-        quiet,
-        options.up,
-        options.scene,
-        say,
-    )
 
 
 def region_kinds(settings: RegionSettings) -> dict[str, Kind]:

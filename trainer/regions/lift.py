@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,13 +13,12 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.rasterize.conventions import ALPHA_MIN
 from progdf.region import Region
+from trainer.options import LiftRule
 
 from .few_masks import FEW, drop_strays, find_holes
 from .surface import surface_vote
 
-Rule = Literal["share", "count", "paper"]
-
-THRESHOLDS: dict[Rule, float] = {"share": 0.7, "count": 0.8, "paper": 0.8}
+THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "count": 0.8, "paper": 0.8}
 """Least score of a member under each rule; those of `count` and `paper` are the paper's."""
 
 HIDDEN = 0.06
@@ -80,7 +78,7 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     return Evidence(inside, pixels_inside, weight, pixels, clearness, views, views_inside)
 
 
-def score(evidence: Evidence, rule: Rule = "share") -> Tensor:
+def score(evidence: Evidence, rule: LiftRule = "share") -> Tensor:
     """How surely the masks mean each Gaussian. [N] 0..1; 0 where no view shows it.
 
     share: Σ w·m / Σ w, the part of its visible contribution that falls inside the masks. count: Σ m / n.
@@ -97,7 +95,7 @@ def lift_masks(
     cameras: Sequence[Camera],
     masks: Sequence[Tensor],
     name: str = "masks",
-    rule: Rule = "share",
+    rule: LiftRule = "share",
     threshold: float | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Region:

@@ -19,12 +19,26 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pad
 
 from progdf.errors import ProgdfError
-from trainer.options import CLIP_MODEL
 from trainer.store.pretrained import BROKEN
+
+CLIP_MODEL = "openai/clip-vit-large-patch14"
+"""The one whose figures are compared in papers."""
 
 EXTRA = "pip install progdf-studio[clip]"
 
 _MEAN, _SPREAD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of CLIP's input
+
+
+@dataclass(frozen=True)
+class Texts:
+    """What the pictures show before and after, in words; "" is not given.
+
+    `asked`: whether a text was given for this; an instruction alone asks for nothing.
+    """
+
+    before: str
+    after: str
+    asked: bool = False
 
 
 @dataclass(frozen=True)
@@ -81,7 +95,7 @@ def load_clip(model: str = CLIP_MODEL) -> Clip:
     except BROKEN as error:
         raise ProgdfError(_missing(model)) from error
     if config.model_type != "clip":
-        raise ProgdfError(f"{model} is a {config.model_type} model, not CLIP; give --clip-model {CLIP_MODEL}")
+        raise ProgdfError(f"{model} is a {config.model_type} model, not CLIP")
     try:
         network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
         tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
@@ -132,8 +146,8 @@ def _name(model: str) -> str:
 
 def _missing(model: str) -> str:
     if Path(model).is_dir() or model.startswith((".", "/", "~")):
-        return f"{model} does not hold a complete CLIP model with safetensors weights; give --clip-model one"
+        return f"{model} does not hold a complete CLIP model with safetensors weights"
     return (
         f"the weights of {model} are not on this machine or are incomplete; download them with "
-        f"'hf download {model}', or give --clip-model the folder of a saved model"
+        f"'hf download {model}'"
     )

@@ -18,11 +18,10 @@ from progdf.metrics.slider import SliderStatistics, slider_statistics
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
-from trainer.plan import Texts
 from trainer.report.curves import ErrorCurve, against_editor, error_curves
 from trainer.views.view import View
 
-from .clip import Clip, direction, load_clip
+from .clip import CLIP_MODEL, Clip, Texts, direction, load_clip
 
 COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
@@ -137,7 +136,7 @@ def clip_curve(evaluator: Evaluator, views: Sequence[View], field: BakedField, t
         if not text.strip():
             return Direction(reason=f"{option} was not given: it takes a text for each end of the slider")
     try:
-        clip = load_clip(texts.model)
+        clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
         return Direction(reason=str(error))
     before, after = clip.texts([texts.before, texts.after])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -10,8 +12,8 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
-from trainer.editors import VIEW_BY_VIEW
-from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
+from progdf.scene.up_axis import UpChoice
+from trainer.options import MOST_VIEWS, VIEWS
 from trainer.views.view import fit_size
 
 SIZES = (256, 320, 384)
@@ -21,6 +23,26 @@ _WELCOME, _BEARABLE = 0.3, 0.5
 """Share of unresolved members up to which a size will do, and above which it is said."""
 
 _LOOK, _LOOKS = 96, 4  # pixels of the views in which members are measured, and how many
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """Which views there are.
+
+    Args:
+        cameras: file or folder of cameras; None: a rig that looks at the region
+        up: the axis of the scene that is up
+        views: how many are edited; None: as the members' density asks for
+        image_size: longer side in pixels; None: the same
+        dense: dense members get more and larger views; what is painted or given picture by picture stays as
+            small as can be, as does a draft
+    """
+
+    cameras: Path | None = None
+    up: UpChoice = "auto"
+    views: int | None = None
+    image_size: int | None = None
+    dense: bool = True
 
 
 def unresolved_share(
@@ -47,28 +69,27 @@ def unresolved_share(
 
 
 def choose_resolution(
-    options: TrainOptions,
+    settings: ViewSettings,
     scene: Gaussians,
     region: Region,
     cameras_of: Callable[[int, int], Sequence[Camera]],
 ) -> tuple[Sequence[Camera], int, str]:
     """Cameras, how many of them to choose, and a line where the members are not resolved by these.
 
-    `--views` and `--image-size` are kept to. Else there are more and larger views where members are dense,
-    and only larger ones where the cameras are given and few. What is painted or given picture by picture
-    stays as small as can be, as does a draft. Why 40 of 320 and not 30 of 384:
-    docs/experiments.md, Views.
+    What was typed is kept to. Else there are more and larger views where members are dense, and only larger
+    ones where the cameras are given and few. Why 40 of 320 and not 30 of 384: docs/experiments.md, Views.
 
     Args:
-        options: see `TrainOptions`
+        settings: see `ViewSettings`
         scene, region: what they look at
         cameras_of: longer side in pixels, number of views -> cameras
     """
-    fixed = options.quick or options.editor.partition(":")[0] in VIEW_BY_VIEW
-    tried = [(SIZES[0], VIEWS)] if fixed else list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True))
-    if not fixed and options.cameras is None and not options.views:
+    tried = list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True)) if settings.dense else []
+    if settings.dense and settings.cameras is None and settings.views is None:
         tried.pop()
-    tried = [(options.image_size or size, options.views or views) for size, views in tried]
+    tried = [
+        (settings.image_size or size, settings.views or views) for size, views in tried or [(SIZES[0], VIEWS)]
+    ]
     for size, views in tried:
         cameras = cameras_of(size, views)
         count = min(views, len(cameras)) * 4 // 5  # every fifth is held out

@@ -18,10 +18,8 @@ from progdf.rasterize.cpu.parallel import threads
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up
-from trainer.editors import EditorSettings, ImageEditor
-from trainer.editors.base import EditKind
+from trainer.editors.base import EditKind, ImageEditor
 from trainer.editors.procedural import ColorEditor
-from trainer.options import TrainOptions
 from trainer.store.picture_list import add_pictures
 from trainer.store.progress import Advance
 from trainer.store.run_folder import RunFolder
@@ -29,7 +27,7 @@ from trainer.views.choose import choose_views, split_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import BACKGROUND, INSIDE, View, fit_size, name_cameras, region_rig, with_near_plane
 
-from .resolution import choose_resolution
+from .resolution import ViewSettings, choose_resolution
 
 _PROBES = 3
 
@@ -50,26 +48,26 @@ class TrainingSetup:
     up: UpAxis | None = None
 
 
-def make_training_setup(options: TrainOptions, scene: Gaussians, region: Region) -> TrainingSetup:
+def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: the best of the given cameras, or of a rig that looks at the region.
 
     Raises:
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
     """
     background = torch.tensor(BACKGROUND)
-    given = [] if options.cameras is None else load_cameras(options.cameras)
-    up = find_up(scene, given, options.up)
-    if options.cameras is None and is_surrounding(scene, up.direction):
-        raise ProgdfError(f"{options.scene} {INSIDE}")
+    given = [] if settings.cameras is None else load_cameras(settings.cameras)
+    up = find_up(scene, given, settings.up)
+    if settings.cameras is None and is_surrounding(scene, up.direction):
+        raise ProgdfError(f"the scene {INSIDE}")
 
     def cameras_of(image_size: int, views: int) -> list[Camera]:
-        if options.cameras is not None:
+        if settings.cameras is not None:
             found = [fit_size(camera, image_size) for camera in given]
         else:  # half as many again, as some will find the region hidden
             found = region_rig(scene, region, views + views // 2, image_size, up.direction)
         return with_near_plane(name_cameras(found), scene)
 
-    cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
+    cameras, views, unresolved = choose_resolution(settings, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [f"up is {up.name}, {up.reason}"]
@@ -88,25 +86,9 @@ def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
     return editor.stages or tuple((i + 1) / stages for i in range(stages))
 
 
-def editor_settings(options: TrainOptions, folder: RunFolder) -> EditorSettings:
-    """What the options say to a learned editor, and where it keeps its pictures."""
-    return EditorSettings(
-        options.model,
-        options.guidance,
-        options.image_guidance,
-        options.edit_steps,
-        options.seed,
-        options.edit_size,
-        options.stages > 1,
-        options.confine,
-        folder.painted,
-    )
-
-
-def confines_edit(editor: ImageEditor, options: TrainOptions, kind: EditKind) -> bool:
-    """Whether what the editor changed outside the region is to be put back."""
-    wanted = kind != "geometry" if options.confine == "auto" else options.confine == "yes"
-    return wanted and not editor.confined
+def confines_edit(editor: ImageEditor, kind: EditKind) -> bool:
+    """Whether what the editor changed outside the region is put back: unless the edit moves parts."""
+    return kind != "geometry" and not editor.confined
 
 
 def edit_views(

@@ -31,6 +31,8 @@ from progdf.io.tensors import read_tensors, write_tensors
 
 SHARE = 0.01
 """Of the time, at most, that saving the state may take."""
+SAVE_EVERY = 10.0
+"""Seconds between two saves, more where saving takes long; 0: after every step."""
 
 
 @dataclass(frozen=True)
@@ -176,15 +178,20 @@ class PeriodicSave:
         part: name of the file
         members: what trains, by name
         every_s: seconds between two saves, longer where saving would take more than a hundredth of the time;
-            0 saves after every step
+            0 saves after every step; None: `SAVE_EVERY`
     """
 
     def __init__(
-        self, folder: StateFolder, part: str, members: Mapping[str, Resumable], every_s: float
+        self,
+        folder: StateFolder,
+        part: str,
+        members: Mapping[str, Resumable],
+        every_s: float | None = None,
     ) -> None:
         self.seconds = 0.0
         self.saves = 0
-        self._folder, self._part, self._members, self._every_s = folder, part, members, every_s
+        self._folder, self._part, self._members = folder, part, members
+        self._every_s = SAVE_EVERY if every_s is None else every_s
         self._last = time.perf_counter()
 
     def restore(self) -> bool:

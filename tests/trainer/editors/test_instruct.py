@@ -15,11 +15,10 @@ from PIL import Image
 
 from progdf.errors import ProgdfError
 from tests.helpers.tiny_pipelines import tiny_flux2_klein, tiny_flux_kontext, tiny_instruct_pix2pix
-from tests.helpers.trained import quick_options, small, write_bear
+from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer.editors import EditorSettings, make_editor
 from trainer.editors.adapters import ADAPTERS
 from trainer.editors.instruct import InstructEditor
-from trainer.pipeline.run import train
 
 BATMAN = 'instruct:"turn him into Batman"'
 
@@ -159,7 +158,7 @@ def test_a_folder_that_is_no_whole_pipeline_is_one_line(pix2pix: str, damage: st
 
 
 def test_image_guidance_for_a_model_without_it_is_one_line(diffusers: None, tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="does not support --image-guidance; "):
+    with pytest.raises(ProgdfError, match="does not support guidance of the picture; "):
         editor_of(settings_of(str(tiny_flux_kontext(tmp_path)), image_guidance=1.5))
 
 

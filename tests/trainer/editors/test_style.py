@@ -11,9 +11,9 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import write_image
-from tests.helpers.trained import quick_options, small
+from tests.helpers.trained import small
 from trainer.editors import EditorSettings, make_editor
-from trainer.editors.base import Confine, EditKind
+from trainer.editors.base import EditKind
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor, cross_fade
 from trainer.setup.training_setup import confines_edit
@@ -39,16 +39,6 @@ def test_a_style_changes_the_region_and_nothing_else() -> None:
         edited = editor.edit(view, 1.0)
         assert torch.equal(edited[view.mask == 0], view.image[view.mask == 0])
         assert float((edited - view.image)[view.mask > 0.9].abs().mean()) > 0.1
-
-
-@pytest.mark.usefixtures("styles")
-def test_an_unconfined_style_is_the_whole_painting() -> None:
-    case = small()
-    view = case.views[0]
-    settings = EditorSettings(confine="no")
-    editor = make_editor("style:14", case.scene, case.region, case.views, settings)
-    assert not editor.confined
-    assert float((editor.edit(view, 1.0) - view.image)[view.mask == 0].abs().mean()) > 0.1
 
 
 @pytest.mark.usefixtures("styles")
@@ -203,22 +193,19 @@ def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(t
 
 
 @pytest.mark.parametrize(
-    ("editor", "confine", "kind", "expected"),
+    ("editor", "kind", "expected"),
     [
-        ("folder", "auto", "style", True),
-        ("folder", "auto", "geometry", False),
-        ("folder", "yes", "geometry", True),
-        ("folder", "no", "style", False),
-        ("night", "yes", "color", False),  # it leaves the rest alone by itself
+        ("folder", "style", True),
+        ("folder", "geometry", False),
+        ("night", "color", False),  # it leaves the rest alone by itself
     ],
 )
-def test_what_changed_outside_is_put_back_unless_parts_move_or_the_user_says(
-    tmp_path: Path, editor: str, confine: Confine, kind: EditKind, expected: bool
+def test_what_changed_outside_is_put_back_unless_parts_move(
+    tmp_path: Path, editor: str, kind: EditKind, expected: bool
 ) -> None:
     case = small()
     for view in case.views:
         write_image(tmp_path / f"{view.camera.name}.png", 1.0 - view.image)
     spec = f"folder:{tmp_path}" if editor == "folder" else editor
-    options = quick_options(tmp_path, editor=spec, confine=confine)
     made = make_editor(spec, case.scene, case.region, case.views)
-    assert confines_edit(made, options, kind) == expected
+    assert confines_edit(made, kind) == expected

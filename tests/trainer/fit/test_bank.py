@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import trainer.pipeline.run
 from progdf.errors import ProgdfError
 from progdf.field import neural_fit
 from progdf.field.neural_fit import NeuralFit, NeuralSettings
@@ -19,10 +20,11 @@ from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options, write_bear
 from trainer.fit.memory_bank import JointTraining, MemoryBank
-from trainer.option_checks import check_network_options, resolve_options
-from trainer.options import FitOptions, TrainOptions
+from trainer.option_checks import check_network_options, check_options
+from trainer.options import FitOptions
 from trainer.pipeline.refit import refit
-from trainer.pipeline.run import RunResult, train
+from trainer.pipeline.run import RunResult
+from trainer.plan import make_plan
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,15 +46,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def joint_options(folder: Path, out: str) -> TrainOptions:
-    settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "fit": "joint"}
-    return quick_options(folder, out, **settings)
+def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:
+    """A short run whose network sees positions and is trained beside the members."""
+    settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "name": "joint"}
+    plan = make_plan(quick_options(folder, out, **settings))
+    network = replace(plan.field.network, inputs="position")
+    plan = replace(
+        plan,
+        optimization=replace(plan.optimization, joint=True),
+        field=replace(plan.field, network=network),
+    )
+    return trainer.pipeline.run.train(plan, folder / out, 1, resume, quiet=True)
 
 
 @pytest.fixture(scope="module")
 def alongside(folder: Path) -> RunResult:
     """A finished run whose network was trained beside the edit."""
-    return train(joint_options(folder, "joint"), quiet=True)
+    return train_jointly(folder, "joint")
 
 
 # ---- the bank
@@ -145,7 +155,6 @@ def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
 def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
     folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = replace(joint_options(folder, "again"), name="joint", save_every=0.0)
     step, steps = JointTraining.step, 0
 
     def interrupted(self: JointTraining) -> None:
@@ -155,11 +164,12 @@ def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
             raise KeyboardInterrupt
         step(self)
 
+    monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
     monkeypatch.setattr(JointTraining, "step", interrupted)
     with pytest.raises(KeyboardInterrupt, match="--resume"):
-        train(options, quiet=True)
+        train_jointly(folder, "again")
     monkeypatch.setattr(JointTraining, "step", step)
-    found = train(replace(options, resume=True), quiet=True)
+    found = train_jointly(folder, "again", resume=True)
     scene = load_ply(folder / "scene.ply")
     one, other = (load_gdf(result.gdf, scene).field.origin for result in (alongside, found))
     assert one is not None
@@ -171,13 +181,11 @@ def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
 def test_a_refit_trains_a_network_on_what_was_recorded(folder: Path, alongside: RunResult) -> None:
     before = alongside.folder.trajectory.read_bytes()
     kept = alongside.gdf.read_bytes()
-    found = refit(
-        FitOptions(alongside.folder.root, field="neural", code=2, picture_loss=0.5, threads=1), quiet=True
-    )
+    found = refit(FitOptions(alongside.folder.root, field="neural", picture_loss=0.5, threads=1), quiet=True)
     assert alongside.folder.trajectory.read_bytes() == before
     origin = load_gdf(found.gdf, load_ply(folder / "scene.ply")).field.origin
     assert origin is not None
-    assert (origin.network.shape.inputs, origin.network.shape.code) == ("own", 2)
+    assert (origin.network.shape.inputs, origin.network.shape.code) == ("position", 8)
     trajectory, _, _ = load_trajectory(found.folder.trajectory)
     assert _end(found, folder).equal(trajectory.end)
     alongside.gdf.write_bytes(kept)
@@ -191,9 +199,7 @@ def _end(result: RunResult, folder: Path) -> Tensor:
     ("changed", "message"),
     [
         ({"size": "small"}, "--size does not apply to --field auto; add --field neural"),
-        ({"fit": "joint", "field": "keyframes"}, "--fit does not apply to --field keyframes"),
         ({"picture_loss": 1.0, "field": "separable"}, "--picture-loss does not apply to --field separable"),
-        ({"field": "neural", "code": 65}, "--code must be between 0 and 64, got 65"),
         ({"field": "neural", "picture_loss": -1.0}, "--picture-loss must be 0 or more"),
     ],
 )
@@ -201,7 +207,7 @@ def test_network_options_that_mean_nothing_are_told(
     folder: Path, changed: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ProgdfError, match=message):
-        resolve_options(quick_options(folder, **changed))
+        check_options(quick_options(folder, **changed))
 
 
 def test_a_refit_knows_its_options_too(folder: Path) -> None:

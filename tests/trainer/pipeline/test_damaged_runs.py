@@ -13,9 +13,8 @@ from torch import Tensor
 
 from progdf.field.trajectory import load_trajectory, save_trajectory
 from tests.helpers.refused import refusal
-from tests.helpers.trained import quick_options, write_bear
+from tests.helpers.trained import quick_options, train, write_bear
 from trainer.pipeline.reopen import reopen_run
-from trainer.pipeline.run import train
 
 Change = Callable[[dict[str, Any], dict[str, Tensor]], object]
 
@@ -24,10 +23,10 @@ CHANGES: dict[str, Change] = {
     "losses of one number": lambda about, _: about.update(losses={"step": 1.0, "left": [1.0]}),
     "losses that do not fit": lambda about, _: about["losses"]["left"].append(1.0),
     "no objective": lambda about, _: about.pop("objective"),
-    "no name": lambda about, _: about["options"].pop("name"),
-    "a name that leads elsewhere": lambda about, _: about["options"].update(name="../../elsewhere"),
-    "no editor": lambda about, _: about["options"].pop("editor"),
-    "an option of another type": lambda about, _: about["options"].update(target_psnr=[1]),
+    "no name": lambda about, _: about["plan"].pop("name"),
+    "a name that leads elsewhere": lambda about, _: about["plan"].update(name="../../elsewhere"),
+    "no editor": lambda about, _: about["plan"].pop("editor"),
+    "an option of another type": lambda about, _: about["plan"]["field"].update(target_psnr=[1]),
     "an unknown kind": lambda about, _: about.update(kind="else"),
 }
 

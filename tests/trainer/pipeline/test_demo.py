@@ -26,8 +26,8 @@ from progdf.io.cameras import load_cameras
 from progdf.region import from_labels
 from progdf.scene.region_spec import parse_region
 from tests.helpers import demo_scenes
-from trainer.options import TrainOptions
 from trainer.pipeline import demo
+from trainer.plan import Plan
 
 SIZE = 1500
 
@@ -63,12 +63,12 @@ def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
 def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Sequence[str]]:
     """Replaces the training by a formula and the window by a list of the commands that would open it."""
 
-    def train(options: TrainOptions) -> None:
-        edit = next(edit for edit in demo.SHOWS["bear"].edits if edit.name == options.out.name)
-        region = parse_region(options.region, load_ply(options.scene), edit.name)
+    def train(plan: Plan, out: Path, threads: int, resume: bool) -> None:
+        edit = next(edit for edit in demo.SHOWS["bear"].edits if edit.name == plan.name == out.name)
+        region = parse_region(plan.region.region, load_ply(plan.scene), edit.name)
         assert torch.equal(region.members, bear.members(*edit.parts))
-        options.out.mkdir()
-        save_gdf(options.out / f"{edit.name}.gdf", _edit(options.out.parent, bear, edit))
+        out.mkdir()
+        save_gdf(out / f"{edit.name}.gdf", _edit(out.parent, bear, edit))
 
     opened: list[Sequence[str]] = []
 
@@ -184,21 +184,21 @@ def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
 ) -> None:
     asked: list[tuple[str, bool]] = []
 
-    def train(options: TrainOptions) -> None:
-        asked.append((options.out.name, options.resume))
+    def train(plan: Plan, out: Path, threads: int, resume: bool) -> None:
+        asked.append((out.name, resume))
         if len(asked) == 2:
             raise KeyboardInterrupt("--resume")
 
     here = {"scarf": "finished", "gold": "stopped", "frost": "nothing"}
     monkeypatch.setattr(trainer.pipeline.run, "train", train)
-    monkeypatch.setattr(trainer.pipeline.resume, "find_run", lambda options: here[options.out.name])
+    monkeypatch.setattr(trainer.pipeline.resume, "find_run", lambda out, plan: here[out.name])
     arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
     with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
         demo.main(arguments)
     assert asked == [("scarf", True), ("gold", True)]
     here["gold"] = "nothing"
     monkeypatch.setattr(
-        trainer.pipeline.run, "train", lambda options: asked.append((options.out.name, options.resume))
+        trainer.pipeline.run, "train", lambda plan, out, threads, resume: asked.append((out.name, resume))
     )
     with pytest.raises(ProgdfError):  # this training writes nothing
         demo.main(arguments)

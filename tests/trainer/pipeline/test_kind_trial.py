@@ -16,16 +16,17 @@ from progdf.rasterize import render
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
-from trainer.options import TrainOptions
 from trainer.pipeline.kind_trial import Approach, Trial, approaches, try_approaches
+from trainer.plan import OptimizationPlan, make_plan
 from trainer.setup.training_setup import TrainingSetup
 
 COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")
 IN_PARTS = Approach("geometry", 120)
 
 
-def options(**more: object) -> TrainOptions:
-    return replace(quick_options(Path("nowhere")), **{"steps": 144, **more})  # type: ignore[arg-type]
+def asked(**more: object) -> OptimizationPlan:
+    options = replace(quick_options(Path("nowhere")), **{"steps": 144, **more})  # type: ignore[arg-type]
+    return make_plan(options).optimization
 
 
 def setup(case: Small) -> TrainingSetup:
@@ -54,7 +55,7 @@ def test_a_recolor_given_as_pictures_is_a_color_edit() -> None:
     case = scarf()
     editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
     pictures = [editor.edit(view, 1.0) for view in case.views]
-    trial = try_approaches(options(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
+    trial = try_approaches(asked(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == COLOR
     assert trial.psnrs[COLOR] > trial.psnrs[FREE] + 2
 
@@ -62,7 +63,7 @@ def test_a_recolor_given_as_pictures_is_a_color_edit() -> None:
 def test_a_part_that_moved_is_geometry_in_parts() -> None:
     case = small("ears", count=6, image_size=72)
     edit, _ = bear_edits(bear(1500))["big ears"]
-    trial = try_approaches(options(), setup(case), pictured(case, edit), [COLOR, STYLE, FREE, IN_PARTS])
+    trial = try_approaches(asked(), setup(case), pictured(case, edit), [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == IN_PARTS
     assert trial.psnrs[IN_PARTS] > trial.psnrs[FREE] + 2
 
@@ -70,7 +71,7 @@ def test_a_part_that_moved_is_geometry_in_parts() -> None:
 def test_what_bends_softly_is_geometry_without_parts() -> None:
     case = scarf()
     pictures = pictured(case, AnalyticEdit("waves", waves))
-    trial = try_approaches(options(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
+    trial = try_approaches(asked(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == FREE
     assert trial.psnrs[FREE] > trial.psnrs[STYLE]
 
@@ -78,8 +79,8 @@ def test_what_bends_softly_is_geometry_without_parts() -> None:
 def test_the_same_trial_gives_the_same_figures() -> None:
     case = scarf()
     pictures = pictured(case, AnalyticEdit("waves", waves))
-    assert try_approaches(options(), setup(case), pictures, [STYLE]) == try_approaches(
-        options(), setup(case), pictures, [STYLE]
+    assert try_approaches(asked(), setup(case), pictures, [STYLE]) == try_approaches(
+        asked(), setup(case), pictures, [STYLE]
     )
 
 
@@ -116,11 +117,11 @@ def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
 )
 def test_what_the_options_say_is_not_tried(more: dict[str, object], expected: list[Approach]) -> None:
     case = scarf()
-    assert approaches(options(**more), setup(case), [view.image for view in case.views]) == expected
+    assert approaches(asked(**more), setup(case), [view.image for view in case.views]) == expected
 
 
 def test_pictures_that_are_repainted_all_over_do_not_move_the_region() -> None:
     case = scarf()
     repainted = [0.8 * view.image for view in case.views]
-    assert approaches(options(), setup(case), repainted) == [COLOR, STYLE]
-    assert approaches(options(kind="geometry"), setup(case), repainted) == [FREE, IN_PARTS]
+    assert approaches(asked(), setup(case), repainted) == [COLOR, STYLE]
+    assert approaches(asked(kind="geometry"), setup(case), repainted) == [FREE, IN_PARTS]

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import get_args
 
 import pytest
 import torch
 
 from progdf.errors import ProgdfError
+from progdf.io.json_values import convert_json, plain
 from trainer.cli import train_options
+from trainer.editors.base import EditKind
 from trainer.optimize.objective import LossWeights
-from trainer.optimize.settings import idle_options, loss_weights, pgs_settings, stage_count
-from trainer.option_checks import resolve_options
+from trainer.optimize.settings import Optimization, pgs_settings
 from trainer.options import Preset, TrainOptions
+from trainer.plan import Plan, make_plan, plan_difference, plan_optimization
 from trainer.presets import PRESETS, apply_preset
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
@@ -21,6 +25,10 @@ ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
 
 def asked(*more: str) -> TrainOptions:
     return train_options([*ASKED, *more])
+
+
+def planned(kind: EditKind, *more: str, group_steps: int = 0) -> Optimization:
+    return plan_optimization(make_plan(asked(*more)).optimization, kind, group_steps)
 
 
 def test_every_preset_is_there_and_the_default_one_changes_nothing() -> None:
@@ -58,65 +66,102 @@ def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too()
 
 
 def test_the_papers_trainer_is_as_printed() -> None:
-    options = resolve_options(asked("--preset", "paper"))
-    assert loss_weights(options, "color") == LossWeights(1.0, 1, "decay", 5.0, "paper", 1.0)
-    assert loss_weights(options, "geometry") == loss_weights(options, "color"), "whatever the edit"
-    settings = pgs_settings(options, "color", 23, 1.0, 1)
+    plan, found = make_plan(asked("--preset", "paper")), planned("color", "--preset", "paper")
+    assert found.weights == LossWeights(1.0, 1, "decay", 5.0, "paper", 1.0)
+    assert planned("geometry", "--preset", "paper").weights == found.weights, "whatever the edit"
+    settings = pgs_settings(found, found.sh != "off", 23, 1.0, 1)
     assert bool((settings.rates > 0).all()), "all attributes are free"
     assert (settings.damped, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
-    assert (settings.smoothing, settings.every) == (0.0, options.steps // 32)
-    assert 1500 <= options.steps <= 2000
-    assert (options.stages, options.views, options.slider) == (1, 96, "time")
+    assert (settings.smoothing, settings.every) == (0.0, found.steps // 32)
+    assert 1500 <= found.steps <= 2000
+    assert (found.stages, plan.views.views, plan.slider) == (1, 96, "time")
+    network = plan.field.network
+    assert (network.size, network.inputs, network.bins, network.code) == ("paper", "position", "hard", 0)
+    assert plan.optimization.joint
+
+
+def test_the_papers_trainer_can_leave_out_its_network() -> None:
+    plan = make_plan(asked("--preset", "paper", "--field", "auto"))
+    assert not plan.optimization.joint
+    assert plan.field.field == "auto"
 
 
 def test_the_paper_can_tighten_instead_of_letting_go() -> None:
-    options = asked("--preset", "paper", "--progressive", "growth")
-    assert loss_weights(options, "style").progressive == "growth"
+    assert planned("style", "--preset", "paper", "--progressive", "growth").weights.progressive == "growth"
 
 
 def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
-    color, style, geometry = (loss_weights(asked(), kind) for kind in ("color", "style", "geometry"))
+    color, style, geometry = (planned(kind).weights for kind in ("color", "style", "geometry"))
     assert (color.perceptual, style.perceptual, geometry.perceptual) == (0.1, 0.3, 0.3)
     assert (color.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
 
 
+def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has() -> None:
+    assert planned("color").solves_colors
+    assert planned("color", "--perceptual-weight", "0").solves_colors
+    assert not planned("style").solves_colors
+    for words in (("--perceptual-weight", "0.1"), ("--progressive", "warmup"), ("--preset", "paper")):
+        assert not planned("color", *words).solves_colors
+    asks = make_plan(replace(asked("--reedit-every", "9"), editor="style:14"))
+    assert not plan_optimization(asks.optimization, "color", 0).solves_colors
+
+
 def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
-    asks = {kind: stage_count(resolve_options(asked()), kind) for kind in ("color", "style", "geometry")}
+    asks = {kind: planned(kind).stages for kind in ("color", "style", "geometry")}
     assert asks == {"color": 8, "style": 1, "geometry": 8}
-    assert stage_count(resolve_options(asked("--stages", "4")), "style") == 4
-    assert stage_count(resolve_options(asked("--quick")), "color") == 4
-    assert stage_count(resolve_options(asked("--steps", "200")), "color") == 4, "a stage needs its steps"
-    assert stage_count(resolve_options(asked("--steps", "320")), "color") == 8
-    assert stage_count(resolve_options(asked("--steps", "32")), "style") == 1
-    assert stage_count(resolve_options(asked("--quick", "--stages", "2")), "color") == 2
+    assert planned("style", "--stages", "4").stages == 4
+    assert planned("color", "--quick").stages == 4
+    assert planned("color", "--steps", "200").stages == 4, "a stage needs its steps"
+    assert planned("color", "--steps", "320").stages == 8
+    assert planned("style", "--steps", "32").stages == 1
+    assert planned("color", "--quick", "--stages", "2").stages == 2
 
 
 def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() -> None:
-    options = asked("--perceptual-weight", "0", "--sharpness", "hinge")
     for kind in ("color", "style"):
-        weights = loss_weights(options, kind)
-        assert (weights.perceptual, weights.sharpness, weights.sharpness_weight) == (0.0, "hinge", 0.1)
+        assert planned(kind, "--perceptual-weight", "0").weights.perceptual == 0.0
 
 
-def test_options_that_change_nothing_are_named() -> None:
-    assert idle_options(asked(), "color") == []
-    assert idle_options(asked("--preset", "paper"), "color") == []
-    assert idle_options(asked("--group-steps", "9"), "color") == ["--group-steps"]
-    assert idle_options(asked("--group-steps", "9"), "geometry") == []
+def test_parts_move_as_wholes_only_where_something_moves() -> None:
+    assert planned("geometry", group_steps=9).group_steps == 9
+    assert planned("color", group_steps=9).group_steps == 0
 
 
 def test_only_the_warm_up_shortens_the_first_steps() -> None:
     for progressive, warm in (("warmup", True), ("decay", False), ("growth", False), ("off", False)):
-        settings = pgs_settings(asked("--progressive", progressive), "color", 14, 1.0, 4)
+        settings = pgs_settings(planned("color", "--progressive", progressive), True, 14, 1.0, 4)
         assert settings.warmup == warm
 
 
 def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
-    ours = pgs_settings(asked(), "color", 23, 1.0, 4).rates
-    plain = pgs_settings(asked("--preset", "paper"), "color", 23, 1.0, 4).rates
+    ours = pgs_settings(planned("color"), True, 23, 1.0, 4).rates
+    plain = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
     assert float(plain[:11].min()) > 0
     assert float(ours[11]) > 10 * float(plain[11])
+
+
+def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
+    assert planned("color").sh == "auto"
+    assert planned("style").sh == planned("color", "--preset", "paper").sh == "on"
+    assert planned("style", "--sh", "off").sh == "off"
+
+
+def test_a_plan_is_read_back_from_json_as_it_was() -> None:
+    for words in ((), ("--preset", "paper"), ("--quick", "--cameras", "c.json", "--text-before", "a bear")):
+        plan = make_plan(asked(*words))
+        assert convert_json(json.loads(json.dumps(plain(plan))), Plan) == plan
+
+
+def test_two_plans_differ_by_the_first_option_that_does() -> None:
+    plan = make_plan(asked())
+    assert plan_difference(plan, plan) == ""
+    assert plan_difference(plan, make_plan(asked("--steps", "40", "--stages", "2"))) == "--steps 800, not 40"
+    assert plan_difference(plan, make_plan(asked("--views", "9"))) == "--views by default, not 9"
+    paper = make_plan(asked("--preset", "paper", "--views", "9"))
+    assert plan_difference(make_plan(asked("--views", "9")), paper) == "--steps 800, not 1500"
+    here = make_plan(replace(asked(), scene=Path.cwd() / "scene.ply"))
+    assert plan_difference(plan, here) == "", "the same file"
 
 
 @pytest.mark.parametrize(
@@ -129,4 +174,4 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
 )
 def test_weights_and_presets_that_make_no_sense_are_named(words: tuple[str, ...], named: str) -> None:
     with pytest.raises(ProgdfError, match=named):
-        resolve_options(asked(*words))
+        make_plan(asked(*words))

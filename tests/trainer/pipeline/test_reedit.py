@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from tests.helpers.trained import WHITE, quick_options, small, write_bear
+from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor
 from trainer.options import TrainOptions
 from trainer.pipeline.reedit import Reedit
-from trainer.pipeline.run import train
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import RunLog
 
@@ -104,7 +103,7 @@ def test_a_run_with_edits_on_the_way_is_the_same_again_and_after_a_stop(
     steps = {path.name for path in painted.iterdir() if path.is_dir()}
     assert steps == {"step_00005", "step_00010", "step_00015", "step_00020"}
 
-    options = styled(scene_folder, "stopped", name="whole", save_every=0.0)
+    options = styled(scene_folder, "stopped", name="whole")
     seen = 0
 
     class Stopping(RunLog):
@@ -118,6 +117,7 @@ def test_a_run_with_edits_on_the_way_is_the_same_again_and_after_a_stop(
 
     with monkeypatch.context() as patched:
         patched.setattr("trainer.pipeline.run.RunLog", Stopping)
+        patched.setattr("trainer.store.state.SAVE_EVERY", 0.0)
         with pytest.raises(KeyboardInterrupt):
             train(options, quiet=True)
     result = train(replace(options, resume=True), quiet=True)
@@ -131,10 +131,13 @@ def test_a_run_with_edits_on_the_way_is_the_same_again_and_after_a_stop(
     [
         ("night", {"reedit_every": 10}),
         ("folder:x", {"reedit_every": 10}),
-        ("night", {"guidance": 7.5}),
+        ("night", {"guidance": "7.5"}),
         ("style:14", {"model": "timbrooks/instruct-pix2pix"}),
         ("night", {"edit_size": 512}),
-        ("instruct:x", {"guidance": 0.5}),
+        ("instruct:x", {"guidance": "0.5"}),
+        ("instruct:x", {"guidance": "7.5,0.5"}),
+        ("instruct:x", {"guidance": "7.5,1.5,1"}),
+        ("instruct:x", {"guidance": "much"}),
         ("instruct:x", {"edit_steps": 0}),
         ("style:14", {"edit_size": 8}),
         ("style:14", {"reedit_every": -1}),

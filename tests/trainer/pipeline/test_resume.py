@@ -19,8 +19,9 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
+from tests.helpers.trained import train
 from trainer.pipeline.resume import find_run
-from trainer.pipeline.run import train
+from trainer.plan import make_plan
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -43,7 +44,7 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
     [
         {"save_every": 0.2},
         {"save_every": 0, "kind": "geometry", "group_steps": 12},
-        {"save_every": 0, "field": "neural", "fit": "joint", "size": "tiny", "quick": True},
+        {"save_every": 0, "field": "neural", "preset": "paper", "quick": True},
     ],
     ids=["color", "parts", "joint"],
 )
@@ -68,7 +69,8 @@ def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     at_step(monkeypatch, 9, lambda: os.kill(os.getpid(), number))
-    assert main(words(bear_folder, f"--save-every={NEVER}")) == 130
+    monkeypatch.setattr("trainer.store.state.SAVE_EVERY", NEVER)
+    assert main(words(bear_folder)) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("progdf: interrupted; ")
     assert last.endswith("give the same command with --resume to go on")
@@ -191,10 +193,10 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
 def test_what_is_found_in_a_folder_depends_on_the_options(
     bear_folder: Path, uninterrupted: Path, interrupted: Path
 ) -> None:
-    assert find_run(small_run(bear_folder)) == "nothing"
+    assert find_run(OUT, make_plan(small_run(bear_folder))) == "nothing"
     shutil.copytree(interrupted, OUT)
-    assert find_run(small_run(bear_folder)) == "stopped"
-    assert find_run(small_run(bear_folder, seed=1)) == "nothing"
+    assert find_run(OUT, make_plan(small_run(bear_folder))) == "stopped"
+    assert find_run(OUT, make_plan(small_run(bear_folder, seed=1))) == "nothing"
     shutil.rmtree(OUT)
     shutil.copytree(uninterrupted, OUT)
-    assert find_run(small_run(bear_folder)) == "finished"
+    assert find_run(OUT, make_plan(small_run(bear_folder))) == "finished"

@@ -21,12 +21,13 @@ from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
-from tests.helpers.trained import quick_options, write_bear
+from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
-from trainer.option_checks import resolve_options
+from trainer.option_checks import check_options
 from trainer.options import FitOptions
 from trainer.pipeline.refit import refit
-from trainer.pipeline.run import RunResult, train
+from trainer.pipeline.run import RunResult
+from trainer.plan import make_plan
 from trainer.report.plots import LINES, draw_plot
 
 
@@ -187,7 +188,7 @@ def test_the_same_seed_gives_the_same_file(folder: Path) -> None:
 )
 def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: float, message: str) -> None:
     with pytest.raises(ProgdfError, match=message):
-        resolve_options(quick_options(folder, "budget", field=field, bytes_budget=budget))
+        check_options(quick_options(folder, "budget", field=field, bytes_budget=budget))
 
 
 def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
@@ -196,7 +197,7 @@ def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
     assert "fits into 1 bytes" in result.report["choice"]["why"]
     least = result.report["field"]["bytes_per_gaussian"]
     again = refit(FitOptions(result.folder.root, bytes_budget=least + 3, threads=1), quiet=True)
-    assert again.report["options"]["bytes_budget"] == least + 3
+    assert again.report["plan"]["field"]["bytes_budget"] == least + 3
     assert again.report["field"]["target_met"]
     assert least < again.report["field"]["bytes_per_gaussian"] <= least + 3
     assert again.report["field"]["psnr_worst"] > result.report["field"]["psnr_worst"]
@@ -290,9 +291,9 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
-    options = resolve_options(parse_options(trainer.options.TrainOptions, words, "progdf train"))
-    assert (options.seed, options.slider, options.name) == (7, "even", "r")
-    assert (options.steps, options.views) == (240, 12)
+    plan = make_plan(parse_options(trainer.options.TrainOptions, words, "progdf train"))
+    assert (plan.optimization.seed, plan.slider, plan.name) == (7, "even", "r")
+    assert (plan.optimization.steps, plan.views.views) == (240, 12)
 
 
 def test_one_member_in_one_view_is_enough(folder: Path) -> None:

@@ -18,7 +18,7 @@ from progdf.io.tensors import read_tensors, write_tensors
 from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
-from trainer.pipeline.run import train
+from tests.helpers.trained import train
 from trainer.store.run_folder import RunFolder, lock_folder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -42,10 +42,14 @@ def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_
 
 @pytest.mark.usefixtures("stopped")
 def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
-    bear_folder: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+    bear_folder: Path,
+    uninterrupted: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
     with files_up_to(40_000):  # the pictures fit in, the optimizer's state does not
-        assert main(words(bear_folder, "--resume", "--save-every=0")) == 2
+        assert main(words(bear_folder, "--resume")) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "progdf: the disk of run is full; free some space, then continue with --resume"
     assert saved_step() == 10
@@ -74,8 +78,9 @@ def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
 
     with monkeypatch.context() as patch:
         patch.setattr(trainer.optimize.pgs, "total_loss", poisoned)
+        patch.setattr("trainer.store.state.SAVE_EVERY", NEVER)
         with pytest.raises(ProgdfError, match="the loss is nan at step 12; the state before it is kept"):
-            train(small_run(bear_folder, save_every=NEVER), quiet=True)
+            train(small_run(bear_folder), quiet=True)
     assert saved_step() == 12
     gone_on(bear_folder, uninterrupted)
 
@@ -83,9 +88,10 @@ def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
 def test_a_run_folder_that_is_removed_while_training_is_one_line(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
     at_step(monkeypatch, 5, lambda: shutil.rmtree(OUT))
     with pytest.raises(ProgdfError, match="run/state was removed during the run; train again"):
-        train(small_run(bear_folder, save_every=0.0), quiet=True)
+        train(small_run(bear_folder), quiet=True)
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(

@@ -19,8 +19,8 @@ from progdf.gdf.file import load_gdf
 from progdf.region import Region
 from progdf.scene.bounds import near_plane
 from tests.helpers.demo_scenes import bear
+from tests.helpers.trained import train
 from trainer.options import TrainOptions
-from trainer.pipeline.run import train
 from trainer.views.view import region_rig, render_view, with_near_plane
 
 FACTORS = (1e-3, 1e4)

@@ -24,9 +24,8 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
-from tests.helpers.trained import label_mask, quick_options, write_bear
+from tests.helpers.trained import label_mask, quick_options, train, write_bear
 from trainer import segmenters
-from trainer.pipeline.run import train
 from trainer.regions.from_pictures import RegionSettings, region_kinds
 from trainer.segmenters import SEGMENTERS, SegmenterSettings
 from trainer.segmenters.folder import read_masks

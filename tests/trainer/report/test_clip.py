@@ -19,13 +19,12 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField
 from progdf.io.images import to_picture
 from tests.helpers.tiny_clip import tiny_clip
-from tests.helpers.trained import WHITE, quick_options, small, write_bear
+from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.fit.evaluate import make_evaluator
 from trainer.options import FitOptions, TrainOptions
 from trainer.pipeline.refit import refit
-from trainer.pipeline.run import train
-from trainer.plan import Texts, make_plan
-from trainer.report.clip import Clip, direction, load_clip, square_picture
+from trainer.plan import make_plan
+from trainer.report.clip import Clip, Texts, direction, load_clip, square_picture
 from trainer.report.measures import clip_curve
 
 pytest.importorskip("transformers")
@@ -132,12 +131,11 @@ def test_an_instruction_is_what_one_sees_after_unless_something_else_is_said() -
 
 
 def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_words(
-    tmp_path: Path, saved: Path
+    tmp_path: Path, saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("trainer.report.measures.CLIP_MODEL", str(saved))
     write_bear(tmp_path)
-    options = quick_options(
-        tmp_path, steps=24, stages=2, views=5, text_before="a bear", text_after="blue", clip_model=str(saved)
-    )
+    options = quick_options(tmp_path, steps=24, stages=2, views=5, text_before="a bear", text_after="blue")
     result = train(options, quiet=True)
     edit, course = result.report["edit"], result.report["curves"]["clip_direction"]
     assert course["s"][0] == 0.0
@@ -151,17 +149,18 @@ def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_w
     assert again.report["edit"]["clip_direction"] != edit["clip_direction"]
 
 
-def test_why_nothing_is_measured_is_told(saved: Path) -> None:
+def test_why_nothing_is_measured_is_told(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bear = small(count=3)
     unedited = {1.0: [view.image for view in bear.views]}
     evaluator = make_evaluator(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
 
     def reason(before: str, after: str, model: str = str(saved)) -> str:
+        monkeypatch.setattr("trainer.report.measures.CLIP_MODEL", model)
         found = clip_curve(
             evaluator,
             bear.views,
             BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14),
-            Texts(before, after, model),
+            Texts(before, after),
         )
         assert not found.s
         return found.reason

@@ -13,22 +13,22 @@ from progdf.camera import Camera
 from progdf.region import Region
 from tests.helpers.demo_scenes import bear
 from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
-from trainer.setup.resolution import SIZES, choose_resolution
+from trainer.plan import make_plan
+from trainer.setup.resolution import SIZES, ViewSettings, choose_resolution
 from trainer.views.view import region_rig
-
-OPTIONS = TrainOptions(scene=Path("s.ply"), out=Path("o"), region="all", editor="recolor:#3060d0")
 
 
 def choice(count: int, cameras: int | None = None, **said: object) -> tuple[int, int]:
     """Pixels and views for so many of the bear's Gaussians, with that many cameras given."""
     scene = bear(max(400, count)).gaussians[:count]
     region = Region("all", torch.arange(count), torch.ones(count))
-    options = replace(OPTIONS, cameras=None if cameras is None else Path("c.json"), **said)  # type: ignore[arg-type]
+    settings = ViewSettings(None if cameras is None else Path("c.json"))
+    settings = replace(settings, **said)  # type: ignore[arg-type]
 
     def cameras_of(image_size: int, views: int) -> Sequence[Camera]:
         return region_rig(scene, region, cameras or views, image_size)
 
-    found, views, _ = choose_resolution(options, scene, region, cameras_of)
+    found, views, _ = choose_resolution(settings, scene, region, cameras_of)
     return found[0].width, views
 
 
@@ -57,5 +57,9 @@ def test_what_was_typed_is_kept() -> None:
 
 
 def test_what_is_painted_view_by_view_and_a_draft_stay_small() -> None:
-    assert choice(6000, quick=True) == (25, VIEWS)
-    assert choice(6000, editor="style:14") == (25, VIEWS)
+    assert choice(6000, dense=False) == (25, VIEWS)
+    words = {"scene": Path("s.ply"), "out": Path("o"), "region": "all", "editor": "recolor:#3060d0"}
+    plans = [
+        make_plan(TrainOptions(**words | more)) for more in ({}, {"quick": True}, {"editor": "style:14"})
+    ]
+    assert [plan.views.dense for plan in plans] == [True, False, False]

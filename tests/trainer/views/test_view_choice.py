@@ -20,7 +20,7 @@ from progdf.region import from_mask
 from tests.helpers.demo_scenes import room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
-from trainer.options import TrainOptions
+from trainer.setup.resolution import ViewSettings
 from trainer.setup.training_setup import make_training_setup
 from trainer.views.choose import ViewChoice, choose_views, in_frame, sample_members, split_views
 
@@ -154,13 +154,13 @@ def test_views_from_within_show_every_wall() -> None:
 def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     demo = room(1500)
     save_ply(tmp_path / "room.ply", demo.gaussians)
-    options = TrainOptions(tmp_path / "room.ply", tmp_path / "run", "all", "night", views=6, image_size=48)
+    settings = ViewSettings(views=6, image_size=48)
     region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
     with pytest.raises(ProgdfError, match="--cameras") as told:
-        make_training_setup(options, demo.gaussians, region)
+        make_training_setup(settings, demo.gaussians, region)
     assert "\n" not in str(told.value)
     save_cameras(tmp_path / "c.json", [replace(c, lens=Lens(k1=0.1)) for c in demo.cameras])
-    setup = make_training_setup(replace(options, cameras=tmp_path / "c.json"), demo.gaussians, region)
+    setup = make_training_setup(replace(settings, cameras=tmp_path / "c.json"), demo.gaussians, region)
     assert len(setup.train) + len(setup.held_out) == 6
     assert "6 of 32 cameras" in setup.notes[1]
     assert "photographs:EDITED,ORIGINALS" in setup.notes[2]
