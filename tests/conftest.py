@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from PIL import Image
 
 from tests.helpers.kernels import run_all_kernels
 from tests.helpers.paths import SHARED_DATA
+
+if TYPE_CHECKING:
+    import moderngl
 
 pytest.register_assert_rewrite(
     "tests.helpers.ply_files", "tests.helpers.refused", "tests.helpers.stopped_runs"
@@ -128,3 +132,13 @@ def _write_difference(name: str, expected: np.ndarray, found: np.ndarray) -> Non
     folder = SCREENSHOTS / "diff"
     folder.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(padded, axis=1)).save(folder / f"{name}.png")
+
+
+@pytest.fixture(scope="module")
+def ctx() -> Iterator[moderngl.Context]:
+    """An OpenGL context without a window."""
+    from viewer.render.headless import headless_context
+
+    context = headless_context()
+    yield context
+    context.release()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +23,6 @@ from trainer.views.crops import crop_scene
 from trainer.views.view import make_view
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 WHITE = torch.ones(3)
@@ -35,13 +33,6 @@ SIZE = (96, 72)
 def stack() -> Stack:
     made = bear_stack(1500)
     return replace(made, demo=replace(made.demo, gaussians=replace(made.scene, antialiased=True)))
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 def with_comment(path: Path, comment: bytes) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -24,7 +23,6 @@ from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, bounds_of, first_camera, to_camera
 from viewer.files.document import Document
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
 from viewer.render.renderers import Image
 from viewer.state import workspace
 from viewer.state.actions import perform
@@ -35,13 +33,6 @@ SIZE = (64, 48)
 DRAWS = pytest.mark.parametrize("draw", ["gl", "cpu"])
 UP = torch.tensor([0.0, 1.0, 0.0])
 BACKGROUND: Vec3 = (1.0, 1.0, 1.0)
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 @cache

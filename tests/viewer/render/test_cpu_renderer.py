@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import moderngl
@@ -20,28 +19,15 @@ from progdf.gdf.file import Gdf, fingerprint
 from progdf.rasterize import activate, render
 from progdf.rasterize.pixel_cells import CELL, mark_cells, no_cells
 from progdf.region import Region
-from tests.helpers.stacks import Stack, bear_stack
+from tests.helpers.stacks import Stack
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.gl.screen import read_rgb
 from viewer.render import cpu_renderer as cpu_renderer
 from viewer.render.dirty_rectangles import MOST_RECTANGLES, area, dirty_rectangles
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (160, 120)
-
-
-@pytest.fixture(scope="module")
-def stack() -> Stack:
-    return bear_stack(1500)
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 @pytest.fixture(autouse=True)

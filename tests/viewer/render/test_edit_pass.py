@@ -27,19 +27,11 @@ from viewer.gl.edit_spans import spans_of
 from viewer.gl.layout import PLACES, SHOWN_SH, SPLATS_PER_ROW
 from viewer.gl.scene_textures import SplatTextures
 from viewer.render.edit_sample import EditSample, difference
-from viewer.render.headless import headless_context
 
 pytestmark = pytest.mark.gl
 COUNT = 2 * SPLATS_PER_ROW + 100
 FEW_ULPS = 1e-6  # a driver may fuse or reorder a handful of float32 products; llvmpipe gives the CPU's bits
 Stack = Sequence[tuple[int, Layer]]
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 class Edited:

@@ -20,14 +20,14 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 from tests.helpers.count import Count
-from tests.helpers.stacks import EARS, SCARF, Stack, bear_stack, view_of
+from tests.helpers.stacks import EARS, SCARF, Stack, view_of
 from viewer.camera.view_camera import to_camera
 from viewer.gl import edit_pass
 from viewer.gl.screen import read_rgb
 from viewer.render import attribute_updates
 from viewer.render import engine as engine_module
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context, is_software
+from viewer.render.headless import is_software
 from viewer.render.timings import FrameTimings
 from viewer.state.paint import encode
 from viewer.state.view_state import LayerState, ViewState
@@ -36,30 +36,10 @@ SIZE = (96, 72)
 Compare = Callable[[str, np.ndarray], None]
 
 
-@pytest.fixture(scope="module")
-def stack() -> Stack:
-    return bear_stack(1500)
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
-
-
 @pytest.fixture(params=["gl", "cpu", "gl, edited by the GPU"])
 def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
     draw, comma, _ = request.param.partition(",")
     made = ViewEngine(ctx, stack.scene, stack.gdfs, draw, edit_pass="gpu" if comma else "cpu")
-    yield made
-    made.release()
-
-
-@pytest.fixture(params=["cpu", "gpu"])
-def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
-    """OpenGL, with what edits."""
-    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
     yield made
     made.release()
 

@@ -25,20 +25,12 @@ from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.scene_textures import row_runs
 from viewer.gl.splats import SplatRenderer
 from viewer.render.depth_sort import back_to_front
-from viewer.render.headless import headless_context
 
 pytestmark = pytest.mark.gl
 WHITE = (1.0, 1.0, 1.0)
 CASES = hard_cases()
 Image = np.ndarray
 Draw = Callable[..., Image]
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 @pytest.fixture(scope="module")

@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import moderngl
 import numpy as np
 import pytest
 
-from tests.helpers.stacks import Stack, bear_stack, view_of
+from tests.helpers.stacks import Stack, view_of
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context, is_software
+from viewer.render.headless import is_software
 
 Compare = Callable[[str, np.ndarray], None]
-
-
-@pytest.fixture(scope="module")
-def stack() -> Stack:
-    return bear_stack(1500)
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
-
-
-@pytest.fixture(params=["cpu", "gpu"])
-def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
-    """OpenGL, with what edits."""
-    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
-    yield made
-    made.release()
 
 
 @pytest.fixture(scope="module")

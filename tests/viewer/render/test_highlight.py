@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import moderngl
@@ -16,20 +15,12 @@ from tests.helpers.stacks import Stack
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.render import highlight
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
 from viewer.render.highlight import Highlight
 from viewer.state import paint
 from viewer.state.view_state import Brush, Comparison, ViewState
 
 SIZE = (160, 120)
 SCARF = 0
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 def half_painted() -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from importlib import resources
 
 import moderngl
@@ -27,7 +26,6 @@ from viewer.gl.layout import (
 )
 from viewer.gl.programs import ShaderError, load_program, load_source
 from viewer.gl.splats import vertex_format
-from viewer.render.headless import headless_context
 
 STAGES = (
     "project.vert",
@@ -41,13 +39,6 @@ STAGES = (
     "edit_sh.frag",
 )
 COMPONENTS = {"float": 1, "vec2": 2, "vec3": 3, "vec4": 4}
-
-
-@pytest.fixture(scope="module")
-def ctx() -> Iterator[moderngl.Context]:
-    context = headless_context()
-    yield context
-    context.release()
 
 
 def text_of(name: str) -> str:
