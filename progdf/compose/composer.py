@@ -21,9 +21,8 @@ from progdf.interpolation import find_segment
 from progdf.rasterize.cpu.parallel import run_chunks, threads
 
 from .arrays import GAINS
-from .effects import Effects, changed_edits, changed_gains, effects_of
 from .kernel import compose_rows
-from .layers import KINDS, Layer, check_numbers
+from .layers import KINDS, Effects, Layer, changed_edits, changed_gains, check_numbers, effects_of
 from .plan import FlatWeights, RowPlan, flatten_edits, flatten_scene, plan_rows
 
 WORTH_A_THREAD = 16_384

@@ -8,7 +8,8 @@ from .choose import FieldChoice, choose_field
 from .evaluate import Candidate, FieldEvaluator
 from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
-from .neural_fit import NeuralSettings, fit_neural
+from .neural_fit import NeuralSettings
+from .neural_training import fit_neural
 from .separable import fit_separable
 
 __all__ = [

@@ -28,8 +28,7 @@ from .neural import (
     encode,
     offsets_of_answer,
 )
-from .rendered import Render
-from .separable import LEVELS, channel_weights, check_trajectory, moving_attributes
+from .separable import LEVELS, channel_weights
 
 PictureLoss = Callable[[Tensor, Tensor], Tensor]
 """Packed offsets of the field, packed offsets recorded at the same strength -> loss. [M,C], [M,C] -> []"""
@@ -294,78 +293,3 @@ def _initial_weights(shape: NeuralShape, draws: torch.Generator) -> dict[str, Te
         else:
             weights[name] = torch.zeros(size)
     return weights
-
-
-def rendered_importance(offsets: Tensor, render: Render, seed: int = 0) -> dict[str, float]:
-    """How much an error of one spread in each attribute shows in pictures, half way; these add up to 1.
-
-    Args:
-        offsets: [T,M,C]
-        render: pixels of some views
-    """
-    draws = torch.Generator().manual_seed(seed)
-    middle = offsets[len(offsets) // 2].float()
-    found = {}
-    with torch.no_grad():
-        expected = render(middle)
-        for name, columns in moving_attributes(offsets).items():
-            spread = float(offsets[1:, :, columns].float().square().mean().sqrt())
-            moved = middle.clone()
-            moved[:, columns] += 0.1 * spread * torch.randn(moved[:, columns].shape, generator=draws)
-            found[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
-    total = sum(found.values())
-    return {name: value / total if total > 0 else 1.0 / len(found) for name, value in found.items()}
-
-
-def fit_neural(
-    strengths: Tensor,
-    offsets: Tensor,
-    rows: Tensor,
-    settings: NeuralSettings | None = None,
-    visibility: Tensor | None = None,
-    render: Render | None = None,
-    pictures: PictureLoss | None = None,
-    recorded: tuple[float, ...] | None = None,
-    on_step: Callable[[int, float], None] | None = None,
-) -> NeuralField:
-    """Train a neural field on a finished trajectory.
-
-    Args:
-        strengths: of the snapshots, ascending from 0 to 1. [T]
-        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
-        rows: raw values of the members before the edit, packed. [M,≥14]
-        settings: see NeuralSettings
-        visibility: how much each member shows. [M]; None is evenly
-        render: of a few views; tells how much each attribute shows. None weighs all numbers alike
-        pictures: the paper's L_pred, for the last steps; None does without
-        recorded: strengths for the slider's ticks; `strengths` when None
-        on_step: progress: steps done, loss
-
-    Raises:
-        ValueError: no trajectory, or one that moves nothing.
-    """
-    check_trajectory(strengths, offsets)
-    attributes = tuple(moving_attributes(offsets))
-    if not attributes:
-        raise ValueError("nothing moves, so there is nothing for a network to learn")
-    fit = NeuralFit(rows, offsets.shape[2], attributes, settings or NeuralSettings(), visibility)
-    fit.scale_to(offsets, rendered_importance(offsets, render) if render is not None else None)
-    train_network(fit, strengths, offsets, fit.settings.steps, pictures, on_step)
-    return fit.field(tuple(strengths.tolist()) if recorded is None else recorded)
-
-
-def train_network(
-    fit: NeuralFit,
-    strengths: Tensor,
-    offsets: Tensor,
-    steps: int,
-    pictures: PictureLoss | None = None,
-    on_step: Callable[[int, float], None] | None = None,
-) -> None:
-    """Take `steps` steps with a rate that falls to 0 along half a cosine; the last ones look at pictures."""
-    looking = round(fit.settings.picture_share * steps) if pictures is not None else 0
-    for done in range(steps):
-        factor = 0.5 * (1.0 + math.cos(math.pi * done / steps))
-        loss = fit.step(strengths, offsets, factor, pictures if done >= steps - looking else None)
-        if on_step is not None:
-            on_step(done + 1, loss)

@@ -145,3 +145,24 @@ def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:
 
 def _stride(pixels: Tensor) -> int:
     return max(1, -(-len(pixels) // MOST_PIXELS))
+
+
+def rendered_importance(offsets: Tensor, render: Render, seed: int = 0) -> dict[str, float]:
+    """How much an error of one spread in each attribute shows in pictures, half way; these add up to 1.
+
+    Args:
+        offsets: [T,M,C]
+        render: pixels of some views
+    """
+    draws = torch.Generator().manual_seed(seed)
+    middle = offsets[len(offsets) // 2].float()
+    found = {}
+    with torch.no_grad():
+        expected = render(middle)
+        for name, columns in moving_attributes(offsets).items():
+            spread = float(offsets[1:, :, columns].float().square().mean().sqrt())
+            moved = middle.clone()
+            moved[:, columns] += 0.1 * spread * torch.randn(moved[:, columns].shape, generator=draws)
+            found[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
+    total = sum(found.values())
+    return {name: value / total if total > 0 else 1.0 / len(found) for name, value in found.items()}

@@ -1,8 +1,8 @@
 // A stack of edits, for one Gaussian: Σ or "over" of share · gain · (factor₀ · full + Σ factor_k · basis_k), as
 // progdf/compose/reference.py states it.
 //
-// Reads the textures below, lists of texels in rows of TEXELS_PER_ROW, filled from viewer/gl/edit_bases.py (once) and
-//         viewer/gl/edit_stack.py (with every new strength); a test compares the layout with viewer/gl/layout.py.
+// Reads the textures below, lists of texels in rows of TEXELS_PER_ROW, filled by viewer/gl/edit_packing.py, edits
+//         once, the stack with every new strength; a test compares the layout with viewer/gl/layout.py.
 // Gives `part_of(layer, slot)`: what a layer has to do with a Gaussian; `add(...)`: its offsets, laid on those of the
 //         layers below; `finished(...)`: the sum on top of the original.
 //

@@ -19,9 +19,8 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 
-from .edit_bases import pack_edits
+from .edit_packing import pack_edits, pack_stack
 from .edit_spans import spans_of
-from .edit_stack import pack_stack
 from .layout import PLACES, SPLAT_TEXTURES, SPLATS_PER_ROW, TARGETS
 from .programs import load_program
 from .scene_textures import SplatTextures
@@ -102,7 +101,7 @@ class EditPass:
         Args:
             stack: active layers with the indices of their edits, the lowest first
             blend: one of `BLENDS`
-            changed: see `progdf.compose.effects.changed_edits`
+            changed: see `progdf.compose.layers.changed_edits`
 
         Returns:
             Sorted indices of the Gaussians that were written. [M]

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.compose.composer import Composer
-from progdf.compose.effects import Effects, changed_edits, effects_of
-from progdf.compose.layers import Layer
+from progdf.compose.layers import Effects, Layer, changed_edits, effects_of
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 

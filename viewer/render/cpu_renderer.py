@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, Crop, render
-from progdf.rasterize.pixel_cells import mark_cells, no_cells
+from progdf.rasterize.pixel_cells import area, dirty_rectangles, mark_cells, no_cells
 from progdf.sh import C0
 from viewer.camera.up_axis import Vec3
 from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.present import Presenter
 from viewer.gl.scene_textures import row_runs
-
-from .dirty_rectangles import area, dirty_rectangles
 
 Image = NDArray[np.float32]
 

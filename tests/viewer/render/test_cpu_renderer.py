@@ -17,13 +17,12 @@ from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.rasterize import activate, render
-from progdf.rasterize.pixel_cells import CELL, mark_cells, no_cells
+from progdf.rasterize.pixel_cells import CELL, MOST_RECTANGLES, area, dirty_rectangles, mark_cells, no_cells
 from progdf.region import Region
 from tests.helpers.stacks import Stack
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.gl.screen import read_rgb
 from viewer.render import cpu_renderer as cpu_renderer
-from viewer.render.dirty_rectangles import MOST_RECTANGLES, area, dirty_rectangles
 from viewer.render.engine import ViewEngine
 from viewer.state.view_state import LayerState, ViewState
 
