@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from dataclasses import field as default
 from typing import Any
 
+import msgspec
 import safetensors
 import safetensors.torch
 import torch
@@ -171,10 +172,10 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ) from error
 
 
-def file_metadata(header: str, tensors: Mapping[str, Tensor]) -> dict[str, str]:
+def file_metadata(header: str, tensors: Mapping[str, Tensor]) -> dict[str, str | msgspec.Raw]:
     """The metadata of a .gdf file with this JSON header and these tensors: the header, and both checksums."""
     return {
-        "progdf": header,
+        "header": msgspec.Raw(header.encode()),
         "header_sha256": head_checksum(header, table_of(tensors)),
         "sha256": _checksum(header, tensors),
     }

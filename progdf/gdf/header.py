@@ -20,6 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.field.neural import NeuralShape
 from progdf.io.atomic import check_regular, open_error
 from progdf.io.json_values import convert_json, decode_json
+from progdf.io.tensors import METADATA
 
 FORMAT = 1
 """The version of the file format."""
@@ -83,6 +84,14 @@ class _Header(msgspec.Struct, frozen=True):
     options: dict[str, Any]
     report: dict[str, Any]
     members: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class _Signed(msgspec.Struct, frozen=True):
+    """The metadata: the JSON header as it is in the file, and the checksums."""
+
+    header: msgspec.Raw
+    header_sha256: str
+    sha256: str
 
 
 class _Tensor(msgspec.Struct, frozen=True):
@@ -199,17 +208,18 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
             convert_json(outer.pop("__metadata__", {}), dict[str, str]) if isinstance(outer, dict) else {}
         )
         table = convert_json(outer, dict[str, _Tensor])
-        text = metadata.get("progdf")
     except ValueError:
         raise damage_error(name) from None
-    if text is None:
+    if METADATA not in metadata:
         raise ProgdfError(
             f"{name} is a safetensors file, but not a .gdf; give one that progdf train has written"
         )
     try:
+        signed = msgspec.json.decode(metadata[METADATA], type=_Signed)
+        text = bytes(signed.header).decode()
         content = decode_json(text)
         version = convert_json(content["format"], int)
-    except (ValueError, KeyError, TypeError):
+    except (msgspec.MsgspecError, ValueError, KeyError, TypeError):
         raise damage_error(name) from None
     if version > FORMAT:
         raise ProgdfError(f"{name} has format {version}, this progdf reads format {FORMAT}; update progdf")
@@ -219,7 +229,7 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
             f"{name} is truncated: it has {length} of {needed} bytes; copy it again or make it again"
         )
     tensors = {key: (tuple(tensor.shape), tensor.dtype) for key, tensor in table.items()}
-    if version < FORMAT or metadata.get("header_sha256") != head_checksum(text, tensors):
+    if version < FORMAT or signed.header_sha256 != head_checksum(text, tensors):
         raise damage_error(name)
     try:
         found = convert_json(content, _Header)
@@ -234,7 +244,7 @@ def _head(path: Path, length: int, header: bytes) -> GdfHead:
         path=path,
         size=length,
         text=text,
-        sha256=metadata.get("sha256", ""),
+        sha256=signed.sha256,
         tensors=tensors,
         name=found.name,
         region=found.region,

@@ -1,20 +1,23 @@
 """Safetensors files whose bytes depend on what is in them and on nothing else.
 
-The safetensors library writes the metadata in an order that differs from run to run, so the same training
-would give a file with another hash each time. Reading is left to the library, which knows nothing of damaged
-numbers: a checksum of everything may be in the metadata.
+The library writes several metadata in an order that differs from run to run, so all of them are one JSON text
+in one key. It knows nothing of damaged numbers: a checksum of everything may be among the metadata.
 """
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+import msgspec
 import torch
 from safetensors import safe_open
+from safetensors.numpy import save
 from torch import Tensor
+
+METADATA = "progdf"
+"""The one key of a file's metadata."""
 
 _CHECKSUM = "crc32"
 _TYPES = {
@@ -40,36 +43,32 @@ def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], 
 
 
 def write_tensors(
-    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str], checksum: bool = False
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    metadata: Mapping[str, str | msgspec.Raw],
+    checksum: bool = False,
 ) -> None:
-    """Write a safetensors file: header size (8 bytes, little endian), JSON header, the tensors' bytes.
+    """Write a safetensors file.
 
     Args:
         path: where to; see `files.atomic_write` for a file that is whole or absent
         tensors: by name, of the types in the table above; on the CPU
-        metadata: texts by name
+        metadata: texts, or JSON as it is, by name
         checksum: add one of everything, which `read_tensors` compares
 
     Raises:
         KeyError: a tensor of another type.
         OSError: the place cannot be written.
     """
-    # the widest types first, so that everything is aligned
-    ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))
     if checksum:
         metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
-    header: dict[str, object] = {"__metadata__": dict(sorted(metadata.items()))}
-    end = 0
-    for name, tensor in ordered:
-        start, end = end, end + tensor.numel() * tensor.element_size()
-        shape = list(tensor.shape)
-        header[name] = {"dtype": _TYPES[tensor.dtype], "shape": shape, "data_offsets": [start, end]}
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 8)
-    with path.open("wb") as file:
-        file.write(len(text).to_bytes(8, "little") + text)
-        for _, tensor in ordered:
-            file.write(_bytes(tensor))
+    arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
+    path.write_bytes(save(arrays, pack_metadata(metadata)))
+
+
+def pack_metadata(metadata: Mapping[str, str | msgspec.Raw]) -> dict[str, str]:
+    """Texts, or JSON as it is, by name, as the one text that a file's metadata have."""
+    return {METADATA: msgspec.json.encode(dict(sorted(metadata.items()))).decode()}
 
 
 def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -81,10 +80,12 @@ def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Ten
     """
     try:
         with safe_open(path, framework="pt") as opened:
-            metadata = dict(opened.metadata() or {})
+            metadata = msgspec.json.decode((opened.metadata() or {})[METADATA], type=dict[str, str])
             tensors = {name: opened.get_tensor(name) for name in names or opened.keys()}
     except OSError:
         raise
+    except KeyError:
+        raise ValueError("it was not written by progdf") from None
     except Exception as error:  # the library's own, and torch's where a shape overflows
         raise ValueError(" ".join(str(error).split())) from None
     sum_ = metadata.pop(_CHECKSUM, None)
@@ -93,13 +94,10 @@ def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Ten
     return tensors, metadata
 
 
-def _checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+def _checksum(metadata: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
     sum_ = zlib.crc32(repr((sorted(metadata.items()), sorted(table_of(tensors).items()))).encode())
     for name in sorted(tensors):
-        sum_ = zlib.crc32(_bytes(tensors[name]), sum_)
+        sum_ = zlib.crc32(
+            tensors[name].detach().contiguous().reshape(-1).view(torch.uint8).numpy().data, sum_
+        )
     return f"{sum_:08x}"
-
-
-def _bytes(tensor: Tensor) -> memoryview:
-    content: memoryview = tensor.detach().contiguous().reshape(-1).view(torch.uint8).numpy().data
-    return content

@@ -13,7 +13,7 @@ import safetensors.torch
 import torch
 
 from progdf.gdf.file import file_metadata
-from progdf.io.tensors import write_tensors
+from progdf.io.tensors import pack_metadata, write_tensors
 from tests.helpers.hostile import JSON_TEXTS
 
 VALUES: list[Any] = [
@@ -142,14 +142,14 @@ def changed_tensors(rng: random.Random, tensors: dict[str, torch.Tensor]) -> dic
 def changed_gdf(content: bytes) -> Change:
     """An edit with another header or other tensors, signed as if progdf had written it."""
     size = int.from_bytes(content[:8], "little")
-    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
+    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])["header"]
     tensors = safetensors.torch.load(content)
 
     def change(rng: random.Random, path: Path) -> None:
         text = json.dumps(changed_value(rng, header) if rng.random() < 0.7 else header)
         found = changed_tensors(rng, tensors) if rng.random() < 0.5 else tensors
         found = {name: tensor.contiguous() for name, tensor in found.items()}
-        metadata = file_metadata(text, found)
+        metadata = pack_metadata(file_metadata(text, found))
         path.write_bytes(safetensors.torch.save(found, metadata))
 
     return change
@@ -158,7 +158,7 @@ def changed_gdf(content: bytes) -> Change:
 def changed_parts(content: bytes, key: str) -> Change:
     """A tensor file with another JSON text among its metadata, or other tensors, its checksum made to fit."""
     size = int.from_bytes(content[:8], "little")
-    metadata = json.loads(content[8 : 8 + size])["__metadata__"]
+    metadata = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
     metadata.pop("crc32", None)
     tensors = safetensors.torch.load(content)
 

@@ -28,6 +28,7 @@ from progdf.gdf.file import (
     verify,
 )
 from progdf.gdf.header import FORMAT, read_head
+from progdf.io.tensors import pack_metadata
 from progdf.region import Region
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import random_gaussians
@@ -227,7 +228,7 @@ def rewritten(saved: Path, tmp_path: Path, **changes: object) -> Path:
     """The file with other values in its header, its checksum made to fit: a wrong writer's."""
     content = saved.read_bytes()
     size = int.from_bytes(content[:8], "little")
-    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
+    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])["header"]
     tensors = safetensors.torch.load(content)
     for key, value in changes.items():
         if key in header:
@@ -237,7 +238,7 @@ def rewritten(saved: Path, tmp_path: Path, **changes: object) -> Path:
         else:
             tensors[key.replace("__", ".")] = value
     text = json.dumps(header)
-    return written(tmp_path, safetensors.torch.save(tensors, file_metadata(text, tensors)))
+    return written(tmp_path, safetensors.torch.save(tensors, pack_metadata(file_metadata(text, tensors))))
 
 
 def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Path) -> None:
@@ -357,7 +358,7 @@ def resigned(path: Path, tmp_path: Path, header: object) -> Path:
     content = path.read_bytes()
     text = json.dumps(header)
     tensors = safetensors.torch.load(content)
-    return written(tmp_path, safetensors.torch.save(tensors, file_metadata(text, tensors)))
+    return written(tmp_path, safetensors.torch.save(tensors, pack_metadata(file_metadata(text, tensors))))
 
 
 def places(value: object, at: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
@@ -372,7 +373,7 @@ def test_info_of_any_header_is_told_or_refused_in_one_line(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = saved.read_bytes()
-    header = json.loads(json.loads(content[8 : header_size(saved)])["__metadata__"]["progdf"])
+    header = json.loads(json.loads(content[8 : header_size(saved)])["__metadata__"]["progdf"])["header"]
     assert main(["info", str(resigned(saved, tmp_path, header))]) == 0
     others: list[object] = [None, [], {}, "", "means", -1, 0, 1e300, 2**70, True, [[]], {"a": []}]
     for place in list(places(header)):

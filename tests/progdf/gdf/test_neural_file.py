@@ -19,6 +19,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import Gdf, file_metadata, load_gdf, save_gdf
 from progdf.gdf.header import read_head
+from progdf.io.tensors import pack_metadata
 from tests.helpers.edits import edit_of
 from tests.helpers.networks import FORMS, MEMBERS, baked, members, rows, scene
 
@@ -90,7 +91,9 @@ def test_a_network_that_sees_places_alone_does_not_mind_other_colors(tmp_path: P
 def _header(path: Path) -> dict[str, object]:
     content = path.read_bytes()
     size = int.from_bytes(content[:8], "little")
-    header: dict[str, object] = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
+    header: dict[str, object] = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])[
+        "header"
+    ]
     return header
 
 
@@ -110,7 +113,7 @@ def rewritten(
             kept[name] = tensor
     text = json.dumps(header)
     path = tmp_path / "shirt.gdf"
-    path.write_bytes(safetensors.torch.save(kept, file_metadata(text, kept)))
+    path.write_bytes(safetensors.torch.save(kept, pack_metadata(file_metadata(text, kept))))
     return path
 
 
