@@ -135,7 +135,7 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
         "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
         "time": {"views", "edit", "optimize", "fit", "total"},
         "memory_by_stage_mb": {"views", "edit", "optimize", "fit", "report"},
-        "options": {"scene", "editor", "seed"},
+        "plan": {"scene", "editor", "optimization", "field"},
     }
     for part, keys in expected.items():
         assert keys <= set(report[part]), part
@@ -239,7 +239,7 @@ def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
     folder: Path, done: RunResult, tmp_path: Path
 ) -> None:
     (tmp_path / "thesis.txt").write_text("important")
-    with pytest.raises(ProgdfError, match="not empty"):
+    with pytest.raises(ProgdfError, match="neither empty nor a run"):
         train(replace(quick_options(folder), out=tmp_path), quiet=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
     kept = done.gdf.read_bytes()
