@@ -98,7 +98,7 @@ def test_a_dense_scene_agrees_to_120_db_but_for_the_early_stop(draw: Draw) -> No
 
 
 def test_the_bear_looks_the_same_as_on_the_cpu(draw: Draw) -> None:
-    demo = bear()
+    demo = bear(24_000)
     for camera in demo.cameras[::16]:
         small = camera.resize(320, 320)
         # the early stop at 1e-4 leaves at most 0.01 of a color in a pixel: 76 dB and more
