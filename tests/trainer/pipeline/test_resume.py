@@ -125,7 +125,7 @@ def test_resuming_a_finished_run_says_so_and_leaves_it(
     assert main(words(bear_folder, "--resume")) == 0
     assert "there is nothing left to do" in capsys.readouterr().err
     assert bits(OUT) == bits(uninterrupted)
-    with pytest.raises(ProgdfError, match="--seed 0, not 1; leave --resume away"):
+    with pytest.raises(ProgdfError, match="--seed 0, not 1; leave out --resume"):
         train(replace(small_run(bear_folder), resume=True, seed=1), quiet=True)
 
 
