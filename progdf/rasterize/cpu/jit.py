@@ -42,10 +42,11 @@ _ready: set[str] = set()  # stages whose marker was seen
 
 
 def _source_version() -> str:
-    """Of all files of the rasterizer: numba's cache notices neither changed constants nor changed imported
-    functions."""
+    """Of all files that kernels are made of: numba's cache notices neither changed constants nor changed
+    imported functions."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+    package = Path(__file__).parents[2]
+    for path in sorted([*package.glob("rasterize/**/*.py"), *package.glob("compose/*.py")]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
