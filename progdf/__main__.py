@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "region": ("trainer.cli:region", "show or keep which Gaussians a region selects"),
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
+    "evaluate": ("trainer.cli:evaluate", "measure a run as papers do, or sliders against known courses"),
     "view": ("viewer.commands.cli:view", "open the window: splats, layers, sliders"),
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
@@ -40,7 +41,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 def _usage() -> str:
     lines = ["usage: progdf COMMAND …   (progdf COMMAND --help lists its options)", ""]
-    lines += [f"  {name:<8}{what}" for name, (_, what) in COMMANDS.items()]
+    lines += [f"  {name:<9}{what}" for name, (_, what) in COMMANDS.items()]
     return "\n".join(lines)
 
 

@@ -29,7 +29,7 @@ ORDER = {
     "progdf": """gaussians lens sh terminal errors region camera interpolation color metrics demo_scenes io
         rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
-        optimize fit report plan pipeline cli""",
+        optimize fit report plan pipeline evaluate cli""",
     "viewer": "__init__ camera gl state render files pictures ui panel app commands",
     "benchmarks": """__init__ courses joint_svd table position_floor ablation field_forms rasterizer
         recorded_runs viewer field_network field_plot field __main__""",

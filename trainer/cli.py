@@ -1,10 +1,11 @@
-"""`progdf train`, `fit`, `region` and `views`: the command lines, made from the options' dataclasses."""
+"""The command lines of `progdf train`, `fit`, `evaluate`, `region` and `views`, made from dataclasses."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
+from trainer.evaluate.options import EvaluateOptions
 from trainer.regions.options import RegionOptions, ViewsOptions, join_negative_values
 
 from .options import FitOptions, TrainOptions
@@ -27,6 +28,15 @@ def fit(argv: Sequence[str]) -> int:
     from trainer.pipeline.refit import refit
 
     refit(options)
+    return 0
+
+
+def evaluate(argv: Sequence[str]) -> int:
+    """Run `progdf evaluate`; 0 when all is measured. Raises ProgdfError for what the user can mend."""
+    options = parse_options(EvaluateOptions, argv, "progdf evaluate")
+    from trainer.evaluate.command import evaluate as run
+
+    run(options)
     return 0
 
 

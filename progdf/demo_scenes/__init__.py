@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from .assemble import DemoScene
 from .bear import SMALLEST, bear
-from .edits import AnalyticEdit, bear_edits, darken_edit, recolor_edit, scale_edit, stripes_edit, swing_edit
+from .edits import (
+    AnalyticEdit,
+    bear_edits,
+    bend_edit,
+    darken_edit,
+    deform_edit,
+    recolor_edit,
+    scale_edit,
+    stretch_edit,
+    stripes_edit,
+    swing_edit,
+)
 from .room import SMALLEST_ROOM, room
 
 __all__ = [
@@ -14,10 +25,13 @@ __all__ = [
     "DemoScene",
     "bear",
     "bear_edits",
+    "bend_edit",
     "darken_edit",
+    "deform_edit",
     "recolor_edit",
     "room",
     "scale_edit",
+    "stretch_edit",
     "stripes_edit",
     "swing_edit",
 ]

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from progdf.color import edits as color
@@ -128,6 +129,65 @@ def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
     return AnalyticEdit("swing", change)
 
 
+def deform_edit(name: str, move: Callable[[Tensor, Tensor], Tensor]) -> AnalyticEdit:
+    """A bent space: centres move, and each Gaussian is turned and stretched by the map's own derivative.
+
+    Args:
+        name: what it does
+        move: one place [3] and the strength [] -> where it goes [3], differentiable
+    """
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        means, s = part.means.double(), torch.tensor(strength, dtype=torch.float64)
+        derivative = torch.func.vmap(torch.func.jacrev(move), (0, None))(means, s)
+        axes = Rotation.from_quat(part.unit_quats.double().numpy(), scalar_first=True).as_matrix()
+        shape = derivative @ (torch.from_numpy(axes) * part.scales.double()[:, None, :])
+        # the covariance is shape · shapeᵀ, whose axes are the left singular vectors
+        turned, scales, _ = torch.linalg.svd(shape)
+        turned = turned * torch.where(torch.linalg.det(turned) < 0, -1.0, 1.0)[:, None, None]
+        quats = Rotation.from_matrix(turned.numpy()).as_quat(scalar_first=True)
+        return replace(
+            part,
+            means=torch.func.vmap(move, (0, None))(means, s).to(part.means),
+            quats=torch.from_numpy(quats).to(part.quats),
+            log_scales=scales.log().to(part.log_scales),
+        )
+
+    return AnalyticEdit(name, change)
+
+
+def stretch_edit(factor: float, axis: Tensor, pivot: Tensor) -> AnalyticEdit:
+    """Longer by `factor` along `axis` [3], all beyond the plane through `pivot` [3] moving away from it."""
+    unit, root = (axis / axis.norm()).double(), pivot.double()
+
+    def move(place: Tensor, s: Tensor) -> Tensor:
+        moved: Tensor = place + s * (factor - 1) * ((place - root) @ unit) * unit
+        return moved
+
+    return deform_edit("stretch", move)
+
+
+def bend_edit(degrees: float, axis: Tensor, along: Tensor, pivot: Tensor, length: float) -> AnalyticEdit:
+    """Turned about `axis` [3] through `pivot` [3], the more the further out along `along` [3].
+
+    Args:
+        degrees: at strength 1, `length` world units out
+        axis, along, pivot: see above; what lies on the other side of the pivot stays
+        length: world units
+    """
+    turn, out, root = (axis / axis.norm()).double(), (along / along.norm()).double(), pivot.double()
+
+    def move(place: Tensor, s: Tensor) -> Tensor:
+        arm = place - root
+        angle = s * math.radians(degrees) * ((arm @ out) / length).clamp_min(0)
+        across = torch.linalg.cross(turn, arm)
+        kept = turn * (turn @ arm) * (1 - angle.cos())
+        moved: Tensor = root + arm * angle.cos() + across * angle.sin() + kept
+        return moved
+
+    return deform_edit("bend", move)
+
+
 def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
     """One edit of each kind for `bear()`, with its members: name -> (edit, members)."""
     ears = scene.members("ears")
@@ -144,6 +204,8 @@ def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
         ),
         "big ears": (scale_edit(1.7, roots), ears),
         "tilted ears": (swing_edit(35.0, torch.tensor([1.0, 0.0, 0.0]), roots), ears),
+        "long ears": (stretch_edit(1.8, scene.up, roots[0]), ears),
+        "bent ears": (bend_edit(60.0, torch.tensor([1.0, 0.0, 0.0]), scene.up, roots[0], 0.3), ears),
         "night": (darken_edit(), torch.arange(len(scene.gaussians))),
     }
 

@@ -163,7 +163,10 @@ def test_samples_are_even_by_area() -> None:
     assert float(distance.min()) > 0.6 * float(at.spacing.mean())
 
 
-@pytest.mark.parametrize("name", ["gold", "blue scarf", "stripes", "big ears", "tilted ears", "night"])
+EDITS = ("gold", "blue scarf", "stripes", "big ears", "tilted ears", "long ears", "bent ears", "night")
+
+
+@pytest.mark.parametrize("name", EDITS)
 def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
     bear: scenes.DemoScene, name: str
 ) -> None:
@@ -202,6 +205,44 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     quarter[:2, :2] = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
     same = render(turned, replace(camera, viewmat=camera.viewmat @ quarter)).image
     assert (same - render(plain, camera).image).abs().max() < 1e-2
+
+
+def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.DemoScene) -> None:
+    ears, pivot, camera = bear.members("ears"), torch.tensor([0.0, 1.0, 0.0]), bear.cameras[3].resize(96, 96)
+    axis = torch.tensor([1.0, 0.0, 0.0])
+
+    def turned(place: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
+        x, y, z = place - pivot.double()
+        c, d = (s * math.radians(30)).cos(), (s * math.radians(30)).sin()
+        return pivot.double() + torch.stack([x, c * y - d * z, d * y + c * z])
+
+    def larger(place: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
+        return pivot + (1 + 0.5 * s) * (place - pivot.double())
+
+    for move, plain in (
+        (turned, scenes.swing_edit(30.0, axis, pivot[None])),
+        (larger, scenes.scale_edit(1.5, pivot[None])),
+    ):
+        pictures = [
+            render(edit.apply(bear.gaussians, ears, 0.6), camera).image
+            for edit in (scenes.deform_edit("same", move), plain)
+        ]
+        assert float((pictures[0] - pictures[1]).abs().max()) < 1e-3
+
+
+def test_stretching_keeps_what_lies_across_and_bending_keeps_distances_from_the_pivot(
+    bear: scenes.DemoScene,
+) -> None:
+    ears, pivot = bear.members("ears"), torch.tensor([0.0, 1.0, 0.0])
+    up, side = torch.tensor([0.0, 2.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
+    before = bear.gaussians.means[ears]
+    long = scenes.stretch_edit(3.0, up, pivot).apply(bear.gaussians, ears, 0.5).means[ears]
+    assert torch.allclose(long[:, [0, 2]], before[:, [0, 2]], atol=1e-6)
+    assert torch.allclose(long[:, 1] - 1, 2 * (before[:, 1] - 1), atol=1e-5)
+    bent = scenes.bend_edit(45.0, side, up, pivot, length=0.5).apply(bear.gaussians, ears, 1.0).means[ears]
+    assert torch.allclose((bent - pivot).norm(dim=1), (before - pivot).norm(dim=1), atol=1e-5)
+    angle = torch.atan2(*(bent - pivot)[:, [2, 1]].T) - torch.atan2(*(before - pivot)[:, [2, 1]].T)
+    assert torch.allclose(angle, math.radians(45) * (before[:, 1] - 1) / 0.5, atol=1e-4)
 
 
 def test_recoloring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:

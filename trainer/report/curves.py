@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from progdf.field import BakedField
+from progdf.metrics.slider import Pictures
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Perceptual
 
@@ -33,23 +32,39 @@ def error_curves(
     evaluator: Evaluator,
     fields: Mapping[str, BakedField],
     strengths: Sequence[float],
-    truth: Callable[[float], Sequence[Tensor]],
+    truth: Pictures,
     perceptual: Perceptual,
 ) -> dict[str, ErrorCurve]:
-    """Each field's errors on held-out views, over the slider.
+    """Each field's errors on held-out views, over the slider; see `picture_courses`."""
+
+    def shown(field: BakedField) -> Pictures:
+        return lambda s: evaluator.pictures(field.offsets(s))
+
+    pictures = {name: shown(field) for name, field in fields.items()}
+    return picture_courses(evaluator, pictures, strengths, truth, perceptual)
+
+
+def picture_courses(
+    evaluator: Evaluator,
+    pictures: Mapping[str, Pictures],
+    strengths: Sequence[float],
+    truth: Pictures,
+    perceptual: Perceptual,
+) -> dict[str, ErrorCurve]:
+    """The errors of whatever shows the held-out views, over the slider.
 
     Args:
         evaluator: the views
-        fields: by name
+        pictures: by name: what is shown at a slider value. -> [h,w,3] each
         strengths: slider values, ascending
         truth: what the pictures should be at one of them. -> [h,w,3] each
         perceptual: LPIPS, or its stand-in
     """
-    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in fields}
+    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in pictures}
     for s in strengths:
         expected = truth(s)
-        for name, field in fields.items():
-            found = evaluator.pictures(field.offsets(s))
+        for name, shown in pictures.items():
+            found = shown(s)
             rows[name].append(
                 (
                     evaluator.psnr(found, expected),

@@ -59,7 +59,7 @@ def report_picture(evaluator: Evaluator, measured: Measured, losses: Losses, tit
     if len(evaluator.edited) > 1:
         rows.append(_against_editor(measured))
     rows.append(_uniformity_plots(measured, losses))
-    return _stack_plots(sheet, rows)
+    return stack_plots(sheet, rows)
 
 
 def best_view(evaluator: Evaluator) -> int:
@@ -213,8 +213,8 @@ def _even(count: int) -> list[float]:
     return [i / max(1, count - 1) for i in range(count)]
 
 
-def _stack_plots(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:
-    """The sheet with rows of plots below it."""
+def stack_plots(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:
+    """The sheet with rows of plots below it. -> [H,W,3]"""
     page = Image.new("RGB", (sheet.width, sheet.height + len(rows) * _PLOT_HEIGHT), PAPER)
     page.paste(sheet, (0, 0))
     for i, plots in enumerate(rows):

@@ -1,0 +1,126 @@
+"""`progdf evaluate` on a finished run: its table, its files, what it says where something is missing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from progdf.__main__ import main
+from tests.helpers.tiny_clip import tiny_clip
+from tests.helpers.trained import quick_options, train, write_bear
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of a small bear."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    write_bear(folder)
+    train(quick_options(folder, steps=40, stages=2, views=12, threads=1), quiet=True)
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def rows(run: Path) -> dict[str, Any]:
+    """evaluation.json's rows."""
+    assert main(["evaluate", str(run), "--threads", "1"]) == 0
+    found: dict[str, Any] = json.loads((run / "evaluation.json").read_text())["rows"]
+    return found
+
+
+def test_figures_that_the_report_has_too_are_the_reports(run: Path, rows: dict[str, Any]) -> None:
+    report = json.loads((run / "report.json").read_text())
+    edit, slider = report["edit"], report["slider"]
+    assert rows["psnr_end"]["slider"] == pytest.approx(edit["psnr_to_views"], abs=0.01)
+    assert rows["ssim_end"]["slider"] == pytest.approx(edit["ssim_to_views"], abs=1e-4)
+    assert rows["lpips_end"]["slider"] == pytest.approx(edit["lpips_to_views"], abs=1e-4)
+    assert rows["evenness"]["slider"] == pytest.approx(slider["uniformity"], abs=1e-3)
+    between = [figures["psnr"] for figures in report["between"].values()]
+    assert rows["psnr_between"]["slider"] == pytest.approx(sum(between) / len(between), abs=0.01)
+    assert rows["seconds"]["slider"] == pytest.approx(report["time"]["total"], abs=0.01)
+
+
+def test_all_that_is_compared_ends_at_the_same_picture(rows: dict[str, Any]) -> None:
+    for measure in ("psnr_end", "ssim_end", "lpips_end"):
+        assert len(set(rows[measure].values())) == 1
+        assert set(rows[measure]) == {"slider", "2 keyframes", "cross-fade"}
+
+
+def test_a_cross_fade_is_even_and_the_path_of_no_slider_is_shorter_than_straight(
+    rows: dict[str, Any],
+) -> None:
+    assert rows["evenness"]["cross-fade"] == pytest.approx(1.0, abs=1e-3)
+    assert rows["monotone"]["cross-fade"] == 1.0
+    # LPIPS has weights; its stand-in is an L1, of which roots add up to more
+    assert all(value >= 1.0 for value in rows["triangle_excess"].values())
+
+
+def test_views_are_compared_with_the_unedited_scene_and_what_lies_outside_hardly_changes(
+    rows: dict[str, Any],
+) -> None:
+    assert set(rows["warped_lpips"]) == {"slider", "the editor", "unedited"}
+    assert all(10 < value < 60 for value in rows["warped_psnr"].values())
+    assert rows["outside"]["slider"] < 1.0
+
+
+def test_the_table_is_printed_and_the_picture_written(
+    run: Path, capsys: pytest.CaptureFixture[str], rows: dict[str, Any]
+) -> None:
+    assert main(["evaluate", str(run), "--threads", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "| slider | 2 keyframes | cross-fade | the editor | unedited |" in printed
+    assert "CLIP direction similarity at 1: not measured, --text-before was not given" in printed
+    assert (run / "evaluation.png").stat().st_size > 10_000
+    assert "missing" in rows["clip_direction"]
+
+
+def test_clip_is_asked_where_its_weights_are_there(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("transformers")
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    clip = str(tiny_clip(tmp_path / "clip"))
+    for module in ("trainer.report.measures", "trainer.evaluate.camera_path"):
+        monkeypatch.setattr(f"{module}.CLIP_MODEL", clip)
+    words = ["--text-before", "a bear", "--text-after", "a blue bear"]
+    assert main(["evaluate", str(copy), "--threads", "1", *words]) == 0
+    rows = json.loads((copy / "evaluation.json").read_text())["rows"]
+    for name in ("clip_direction", "clip_consistency"):
+        assert -1.0 <= rows[name]["slider"] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["{tmp}"], "holds no trajectory.safetensors"),
+        (["{tmp}/nothing"], "holds no trajectory.safetensors"),
+        ([], "evaluate"),
+        (["{tmp}", "--suite", "speed"], "suite"),
+        (["{tmp}", "--suite", "sliders", "--text-after", "gold"], "--text-after is for a run"),
+        (["{tmp}/file", "--suite", "sliders"], "file"),
+        (["{tmp}", "--threads", "-1"], "--threads must be between 0 and 1024"),
+    ],
+)
+def test_what_cannot_be_measured_is_one_line(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["evaluate", *(argument.format(tmp=tmp_path) for argument in arguments)]) == 2
+    printed = capsys.readouterr().err
+    assert words in printed
+    assert printed.count("\n") == 1
+
+
+@pytest.mark.parametrize("file", ["report.json", "run.gdf", "views/edited/"])
+def test_a_run_of_which_a_file_is_gone_is_one_line(
+    file: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    (shutil.rmtree if file.endswith("/") else Path.unlink)(copy / file)  # type: ignore[operator]
+    assert main(["evaluate", str(copy), "--threads", "1"]) == 2
+    assert file.strip("/") in capsys.readouterr().err

@@ -1,0 +1,158 @@
+"""Consistency between held-out views, and what changed beside the region, of a finished edit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import Gaussians
+from progdf.metrics.image import psnr
+from trainer.fit.evaluate import Evaluator
+from trainer.optimize.losses import Perceptual
+from trainer.views.view import crop, make_view, render_view
+
+from .opened import OpenedRun, held_out_pictures
+from .warp import SeenDepth, see_depth, warp_view
+
+EDITED, EDITOR, UNEDITED = "slider", "the editor", "unedited"
+"""Whose pictures are warped: the finished edit's, the editor's own, the original's, which is the floor."""
+
+_LEAST_SHARED = 0.1  # of a view's counted pixels that another must see, or the two are not compared
+_SHOWS = 0.05  # a pixel shows the region where the members' weight is above this
+
+
+@dataclass(frozen=True)
+class WarpedPair:
+    """One held-out view warped onto another.
+
+    Args:
+        source, target: the views' names
+        shared: share of the target's counted pixels that the source sees too, 0..1
+        pictures: whose -> target's box, and the source warped onto it where both see. [h,w,3] each
+        both: the pixels that are compared. [h,w] bool
+        depth: of the edited scene in the target's box, world units; 0 where it is not opaque. [h,w]
+    """
+
+    source: str
+    target: str
+    shared: float
+    pictures: dict[str, tuple[Tensor, Tensor]]
+    both: Tensor
+    depth: Tensor
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How alike views of the same thing are.
+
+    Args:
+        lpips, psnr: whose -> mean over the pairs, LPIPS in the targets' boxes, PSNR over what both see, dB
+        pairs: what was compared; none where no two held-out views see enough of the same
+    """
+
+    lpips: dict[str, float]
+    psnr: dict[str, float]
+    pairs: tuple[WarpedPair, ...]
+
+
+def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
+    """Each held-out view beside the other one that sees most of the same, warped onto it.
+
+    Compared are the pixels that count (see `Evaluator`) and whose surface both views see, before the edit and
+    after it; the others are taken from the target, so that they differ in nothing.
+    """
+    scene, views, background = opened.run.scene, opened.setup.held_out, opened.setup.background
+    edited = finished_scene(opened)
+    whole = {
+        EDITED: [render_view(edited, view.camera, background).clamp(0, 1) for view in views],
+        EDITOR: held_out_pictures(opened, "edited"),
+        UNEDITED: [view.image for view in views],
+    }
+    seen = {
+        EDITED: [see_depth(edited, view.camera) for view in views],
+        UNEDITED: [see_depth(scene, view.camera) for view in views],
+    }
+    seen[EDITOR] = seen[EDITED]  # what it shows has no depth of its own
+    pairs = []
+    for target in range(len(views)):
+        best = None
+        for source in range(len(views)):
+            if source == target:
+                continue
+            pair = _warp(opened.evaluator, whole, seen, source, target)
+            best = pair if best is None or pair.shared > best.shared else best
+        if best is not None and best.shared >= _LEAST_SHARED:
+            pairs.append(best)
+    lpips, decibels = {}, {}
+    for whose in whole:
+        compared = [pair.pictures[whose] for pair in pairs]
+        with torch.no_grad():
+            distances = [float(perceptual(warped, shown)) for shown, warped in compared]
+        errors = [psnr(w, s, p.both) for (s, w), p in zip(compared, pairs, strict=True)]
+        if pairs:
+            lpips[whose] = sum(distances) / len(distances)
+            decibels[whose] = sum(min(99.0, e) for e in errors) / len(errors)
+    return Consistency(lpips, decibels, tuple(pairs))
+
+
+def outside_change(opened: OpenedRun) -> dict[str, float]:
+    """Mean absolute change of the pixels in the held-out boxes that show the region neither before the edit
+    nor after it, 0..1: of the finished edit, and of what the editor made."""
+    views, evaluator = opened.setup.held_out, opened.evaluator
+    edited = finished_scene(opened)
+    after = [make_view(edited, opened.run.region, view.camera, opened.setup.background) for view in views]
+    boxes = [scene.box for scene in evaluator.crops]
+    outside = [
+        crop((a.mask <= _SHOWS) & (b.mask <= _SHOWS), box)
+        for a, b, box in zip(views, after, boxes, strict=True)
+    ]
+    original = [crop(view.image, box) for view, box in zip(views, boxes, strict=True)]
+    shown = evaluator.pictures(opened.gdf.field.offsets(1.0))
+    return {
+        EDITED: _mean_change(original, shown, outside),
+        EDITOR: _mean_change(original, evaluator.edited[1.0], outside),
+    }
+
+
+def finished_scene(opened: OpenedRun) -> Gaussians:
+    """The edited scene at strength 1."""
+    end = opened.gdf.field.offsets(1.0)
+    members = opened.run.region.members
+    if not len(end):
+        return opened.run.scene
+    return opened.run.scene.replace_rows(members, opened.evaluator.original[:, : end.shape[1]] + end)
+
+
+def _warp(
+    evaluator: Evaluator,
+    whole: dict[str, Sequence[Tensor]],
+    seen: dict[str, list[SeenDepth]],
+    source: int,
+    target: int,
+) -> WarpedPair:
+    box, counted = evaluator.crops[target].box, evaluator.pixels[target]
+    warped = {w: warp_view(whole[w][source], seen[w][source], seen[w][target]) for w in whole}
+    both = counted.clone()
+    for _, visible in warped.values():
+        both &= crop(visible, box)
+    pictures = {}
+    for whose, (picture, _) in warped.items():
+        shown = crop(whole[whose][target], box)
+        pictures[whose] = (shown, torch.where(both[..., None], crop(picture, box), shown))
+    depth, alpha = (crop(plane, box) for plane in seen[EDITED][target].depth)
+    names = evaluator.names
+    shared = float(both.sum()) / max(1, int(counted.sum()))
+    return WarpedPair(
+        names[source], names[target], shared, pictures, both, torch.where(alpha > 0.5, depth, 0.0)
+    )
+
+
+def _mean_change(before: Sequence[Tensor], after: Sequence[Tensor], where: Sequence[Tensor]) -> float:
+    total = count = 0.0
+    for a, b, pixels in zip(before, after, where, strict=True):
+        total += float((a - b).abs().mean(dim=2)[pixels].double().sum())
+        count += int(pixels.sum())
+    return total / count if count else 0.0

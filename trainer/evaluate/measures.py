@@ -1,0 +1,161 @@
+"""Everything that `progdf evaluate` tells of a run; what each line means is in docs/benchmarks.md."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from trainer.optimize.losses import Perceptual
+from trainer.report.clip import Texts
+from trainer.report.curves import ErrorCurve, picture_courses
+from trainer.report.measures import clip_curve
+
+from .camera_path import clip_consistency
+from .consistency import Consistency, outside_change, view_consistency
+from .opened import KEYFRAMES, SLIDER, OpenedRun
+from .slider import SliderPath, slider_path
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Args:
+        name: in evaluation.json
+        text: in the table, with the unit
+        cells: by column: figures, None where one is not defined
+        digits: behind the point
+        missing: why nothing was measured, "" where it was
+    """
+
+    name: str
+    text: str
+    cells: Mapping[str, float | None]
+    digits: int = 3
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What was measured.
+
+    Args:
+        rows: the table
+        curves: against the editor's own pictures at the slider values that it was asked for, by what is shown
+        paths: the slider in equal steps, by what is shown
+        consistency: between held-out views
+        perceptual: name of the perceptual distance
+    """
+
+    rows: tuple[Row, ...]
+    curves: Mapping[str, ErrorCurve]
+    paths: Mapping[str, SliderPath]
+    consistency: Consistency
+    perceptual: str
+
+
+def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: Texts) -> Evaluation:
+    """Measure a finished run on its held-out views.
+
+    Args:
+        opened: see `open_run`
+        perceptual: LPIPS, or its stand-in
+        texts: what CLIP is asked
+    """
+    evaluator, contenders = opened.evaluator, opened.contenders()
+    strength = dict(opened.trajectory.asked)
+    curves = picture_courses(
+        evaluator, contenders, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
+    )
+    paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}
+    consistency = view_consistency(opened, perceptual)
+    lpips = "LPIPS" if perceptual.name.startswith("lpips") else perceptual.name
+    rows = (
+        *_edited_rows(curves, lpips),
+        *_path_rows(paths, lpips),
+        *_consistency_rows(consistency, lpips),
+        Row("outside", "outside the region, mean change, of 255", _scaled(outside_change(opened), 255)),
+        *_clip_rows(opened, texts),
+        *_cost_rows(opened),
+    )
+    return Evaluation(rows, curves, paths, consistency, perceptual.name)
+
+
+def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str) -> list[Row]:
+    def ends(values: Mapping[str, tuple[float, ...]]) -> dict[str, float | None]:
+        return {name: found[-1] for name, found in values.items()}
+
+    def between(values: Mapping[str, tuple[float, ...]]) -> dict[str, float | None]:
+        return {name: sum(found[:-1]) / len(found[:-1]) for name, found in values.items()}
+
+    measures: tuple[tuple[str, str, dict[str, tuple[float, ...]], int], ...] = (
+        ("psnr", "PSNR, dB", {name: curve.psnr for name, curve in curves.items()}, 1),
+        ("ssim", "SSIM", {name: curve.ssim for name, curve in curves.items()}, 4),
+        ("lpips", lpips, {name: curve.lpips for name, curve in curves.items()}, 4),
+    )
+    inner = len(next(iter(curves.values())).s) - 1
+    rows = [
+        Row(f"{name}_end", f"to the edited views at 1, {text}", ends(values), digits)
+        for name, text, values, digits in measures
+    ]
+    if not inner:
+        return rows
+    places = "value" if inner == 1 else "values"
+    return rows + [
+        Row(f"{name}_between", f"at {inner} {places} between, {text}", between(values), digits)
+        for name, text, values, digits in measures
+    ]
+
+
+def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[Row]:
+    def of(value: str) -> dict[str, float | None]:
+        found = {name: float(getattr(path, value)) for name, path in paths.items()}
+        return {name: None if math.isnan(number) else number for name, number in found.items()}
+
+    return [
+        Row("evenness", "20 equal steps: evenness, least over largest change", of("evenness"), 2),
+        Row("monotone", "steps that lead away from the original, share", of("monotone"), 2),
+        Row("neighbors_mean", f"{lpips} of neighbors, mean", of("mean"), 4),
+        Row("neighbors_largest", f"{lpips} of neighbors, largest", of("largest"), 4),
+        Row("sum_over_ends", f"Σ {lpips} of neighbors / {lpips} of the ends", of("sum_over_ends")),
+        Row("triangle_excess", "the same of their roots (1: straight)", of("triangle_excess"), 2),
+    ]
+
+
+def _consistency_rows(found: Consistency, lpips: str) -> list[Row]:
+    missing = "" if found.pairs else "no two held-out views see enough of the same"
+    return [
+        Row("warped_lpips", f"one view warped onto another, {lpips}", dict(found.lpips), 3, missing),
+        Row("warped_psnr", "one view warped onto another, PSNR, dB", dict(found.psnr), 1, missing),
+    ]
+
+
+def _clip_rows(opened: OpenedRun, texts: Texts) -> list[Row]:
+    course = clip_curve(opened.evaluator, opened.setup.held_out, opened.gdf.field, texts)
+    along, missing = clip_consistency(opened)
+    direction = course.similarity[-1] if course.similarity else None
+    return [
+        Row("clip_direction", "CLIP direction similarity at 1", {SLIDER: direction}, 3, course.reason),
+        Row("clip_consistency", "CLIP direction consistency along a path", {SLIDER: along}, 3, missing),
+    ]
+
+
+def _cost_rows(opened: OpenedRun) -> list[Row]:
+    time, memory = opened.report.get("time", {}), opened.report.get("memory_mb")
+    gdf, seconds = opened.gdf, time.get("total")
+    sizes: dict[str, float | None] = {
+        SLIDER: gdf.field.bytes_per_member,
+        KEYFRAMES: opened.keyframes.bytes_per_member,
+    }
+    return [
+        Row("bytes_per_member", f"bytes for each of {len(gdf.region)} members", sizes, 0),
+        Row("seconds", "run, s", {SLIDER: seconds}, 0, "" if seconds else "report.json does not say"),
+        Row(
+            "memory_mb", "peak memory, MB", {SLIDER: memory}, 0, "" if memory else "report.json does not say"
+        ),
+    ]
+
+
+def _scaled(values: Mapping[str, float], factor: float) -> dict[str, float | None]:
+    return {name: factor * value for name, value in values.items()}

@@ -1,0 +1,114 @@
+"""A finished run, opened to be measured: its shipped field, its held-out views, what is compared with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field import BakedField, fit_keyframes
+from progdf.field.trajectory import Trajectory
+from progdf.gdf.file import Gdf, load_gdf
+from progdf.io.json_values import convert_json, decode_json
+from progdf.metrics.slider import Pictures
+from trainer.fit.evaluate import Evaluator
+from trainer.fit.slider_uniformity import equalize_slider
+from trainer.pipeline.fit_and_report import load_evaluator
+from trainer.pipeline.reopen import FinishedRun, render_run_views, reopen_run
+from trainer.setup.training_setup import TrainingSetup, widen_views
+from trainer.store.run_folder import read_views
+
+SLIDER, KEYFRAMES, FADE = "slider", "2 keyframes", "cross-fade"
+"""What is compared: the shipped field; the original and the end with a straight line between, its slider made
+even as ours; the pictures of both ends, blended in sRGB."""
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """What is measured.
+
+    Args:
+        run: see `FinishedRun`
+        report: its report.json
+        setup: its views; the boxes of the training views hold what the edit changes
+        evaluator: its held-out views, beside what the editor made of them
+        gdf: the edit as it is shipped
+        trajectory: what was recorded, on the shipped slider
+        keyframes: the end alone, see `KEYFRAMES`
+    """
+
+    run: FinishedRun
+    report: Mapping[str, Any]
+    setup: TrainingSetup
+    evaluator: Evaluator
+    gdf: Gdf
+    trajectory: Trajectory
+    keyframes: BakedField
+
+    @property
+    def fields(self) -> dict[str, BakedField]:
+        """The shipped field and two keyframes, by name."""
+        return {SLIDER: self.gdf.field, KEYFRAMES: self.keyframes}
+
+    def contenders(self) -> dict[str, Pictures]:
+        """Slider value -> the held-out views' boxes, of everything that is compared."""
+        field, keyframes = self.gdf.field, self.keyframes
+        first, last = (self.evaluator.pictures(field.offsets(s)) for s in (0.0, 1.0))
+
+        def fade(s: float) -> list[Tensor]:
+            return [torch.lerp(a, b, s) for a, b in zip(first, last, strict=True)]
+
+        return {
+            SLIDER: lambda s: self.evaluator.pictures(field.offsets(s)),
+            KEYFRAMES: lambda s: self.evaluator.pictures(keyframes.offsets(s)),
+            FADE: fade,
+        }
+
+
+def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
+    """Open a run folder to measure it.
+
+    Args:
+        root: the folder
+        scene: where the scene is now, if it has moved
+
+    Raises:
+        ProgdfError: the folder is no finished run, a file of it is gone or damaged, or the scene is.
+    """
+    run = reopen_run(root, scene)
+    try:
+        report = convert_json(decode_json(run.folder.report.read_bytes()), dict[str, Any])
+    except FileNotFoundError:
+        raise ProgdfError(f"{root} holds no report.json; give a folder that progdf train finished") from None
+    except ValueError as error:
+        raise ProgdfError(f"{run.folder.report} is damaged ({error}); run progdf fit {root}") from error
+    gdf = load_gdf(run.folder.gdf(run.record.plan.name), run.scene)
+    setup = render_run_views(run)
+    if not setup.held_out:
+        raise ProgdfError(f"{root} has no held-out views to measure with; train it again")
+    names = [view.camera.name for view in setup.train]
+    edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
+    setup = widen_views(setup, edited)
+    shown_at = torch.tensor(gdf.field.recorded, dtype=torch.float32)
+    if shown_at.shape != run.trajectory.s.shape:
+        raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")
+    trajectory = replace(run.trajectory, s=shown_at)
+    evaluator = load_evaluator(run.folder, setup, setup.held_out, run.trajectory)
+    return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(run, setup, report))
+
+
+def _two_keyframes(run: FinishedRun, setup: TrainingSetup, report: Mapping[str, Any]) -> BakedField:
+    end = run.trajectory.end
+    field = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
+    even = report.get("trajectory", {}).get("slider") == "even"
+    return equalize_slider(field, setup)[0] if even else field
+
+
+def held_out_pictures(opened: OpenedRun, kind: str) -> Sequence[Tensor]:
+    """The held-out views' whole pictures of the run folder: "edited", "final". [H,W,3] each"""
+    return read_views(opened.run.folder, kind, [view.camera.name for view in opened.setup.held_out])
