@@ -116,7 +116,7 @@ def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
     with pytest.raises(ProgdfError, match="does not hold a complete CLIP model"):
         load_clip(str(tmp_path))
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
-    with pytest.raises(ProgdfError, match="bert model, no CLIP"):
+    with pytest.raises(ProgdfError, match="bert model, not CLIP"):
         load_clip(str(tmp_path))
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[clip\]"):
