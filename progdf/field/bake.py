@@ -136,7 +136,7 @@ def bake_nodes(bins: int, hard: bool, per_bin: int = _PER_BIN) -> Tensor:
     """Strengths to bake at: `per_bin` to a smooth bin; both sides of every edge of hard ones. [S] float32"""
     if not hard:
         return torch.linspace(0, 1, per_bin * bins + 1)
-    edges = torch.arange(1, bins) / bins
+    edges = torch.arange(2, bins) / bins  # see `neural.hard_bin`; the last edge is the end itself
     inner = torch.stack([edges - _JUMP, edges], dim=1).flatten()
     return torch.cat([torch.tensor([0.0, _JUMP]), inner, torch.tensor([1.0 - _JUMP, 1.0])])
 

@@ -49,8 +49,8 @@ class NeuralShape:
             has the network describe only how the way there bends
         code: numbers in each Gaussian's learned code
         bins: how many the slider has (paper: k = 10)
-        hard: the paper's bins, in which H(s) is constant; else it is linear between bins + 1 nodes, node 0
-            being 0
+        hard: the paper's bins, in which H(s) is constant, see `hard_bin`; else it is linear between bins + 1
+            nodes, node 0 being 0
         frequencies: of the positional encoding, doubling from a period of twice the box
     """
 
@@ -242,12 +242,20 @@ def appearance(rows: Tensor, end: Tensor) -> Tensor:
 
 def control_signal(shape: NeuralShape, nodes: Tensor, s: Tensor) -> Tensor:
     """The control signal H(s) of each strength. [bins,CONTROL], [B] -> [B,CONTROL]"""
+    if shape.hard:
+        return nodes[hard_bin(s, shape.bins)]
     position = s.clamp(0.0, 1.0) * shape.bins
     left = position.floor().clamp(max=shape.bins - 1).long()
-    if shape.hard:
-        return nodes[left]
     full = torch.cat([torch.zeros_like(nodes[:1]), nodes])
     return torch.lerp(full[left], full[left + 1], (position - left)[:, None])
+
+
+def hard_bin(s: Tensor, bins: int = 10) -> Tensor:
+    """The paper's bin of each strength, as GraCo (CVPR 2024) takes it: ⌊clamp(k·s − 1, 0, k − 1)⌋. [B] -> [B] int64
+
+    So the first holds all s < 2/k, and the last s = 1 alone.
+    """
+    return (s * bins - 1.0).clamp(0.0, bins - 1.0).long()
 
 
 def apply_later_layers(shape: NeuralShape, weights: Mapping[str, Tensor], hidden: Tensor) -> Tensor:

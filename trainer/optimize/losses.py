@@ -16,6 +16,8 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Features, Lpips, Net
 
+Norm = Literal["squares", "absolutes"]
+
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
@@ -104,24 +106,37 @@ def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
 def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
     """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
 
-    The paper penalizes every parameter's step with α·β^(t/s) (eq. 5), which freezes the edit at its weights;
-    what helps is that early steps are short (docs/method.md 3).
+    Early steps are short, which is what the paper's constraint is for (eq. 5, `progressive_change`), at no loss.
     """
     return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
 
 
 def progressive_change(
-    moved: Tensor, previous: Tensor, step: int, grows: bool, alpha: float = 0.05, beta: float = 1.1
+    moved: Tensor,
+    previous: Tensor,
+    step: int,
+    grows: bool,
+    norm: Norm = "squares",
+    alpha: float = 0.05,
+    beta: float = 1.1,
 ) -> Tensor:
-    """The paper's progressive constraint as it is printed: L_prog = α·β^(±t/50)·Σ|ΔΘ|, without its λ2. []
+    """The paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖, without its λ2. []
 
-    ΔΘ is what the last step changed, summed over all raw parameters of all members. "growth" is the printed
-    exponent +t/50, which allows ever shorter steps; "decay" is −t/50, which lets go of them.
+    ΔΘ is what the last step changed, summed over all raw parameters of all members. The paper names no norm:
+    "squares" sums Δ², "absolutes" |Δ|, which freezes the edit (docs/experiments.md).
+
+    Args:
+        moved: offsets of the members. [M,C]
+        previous: one step earlier. [M,C]
+        step: t
+        grows: the printed exponent +t/50, which allows ever shorter steps; else −t/50, which lets go of them
+        norm: see above
+        alpha, beta: of the paper
     """
     period = 50.0
     factor: float = alpha * beta ** ((step if grows else -step) / period)
-    change = (moved - previous.detach()).abs().sum()
-    return factor * change
+    change = moved - previous.detach()
+    return factor * (change.square() if norm == "squares" else change.abs()).sum()
 
 
 def sharpness(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from trainer.options import Progressive
 
-from .losses import Perceptual, l1, progressive_change, sharpness
+from .losses import Norm, Perceptual, l1, progressive_change, sharpness
 
 Sharpness = Literal["hinge", "paper", "off"]
 Losses = Mapping[str, Sequence[float | None]]
@@ -37,6 +37,7 @@ class LossWeights:
         progressive_weight: λ2
         sharpness: "hinge" or "paper", see `losses.sharpness`
         sharpness_weight: λ3
+        progressive_norm: how a step's length is measured
     """
 
     perceptual: float = 0.1
@@ -45,6 +46,7 @@ class LossWeights:
     progressive_weight: float = 5.0
     sharpness: Sharpness = "off"
     sharpness_weight: float = 1.0
+    progressive_norm: Norm = "squares"
 
     def description(self, perceptual: str) -> str:
         """One line for log and report. `perceptual`: the name of the distance that is really used."""
@@ -53,7 +55,7 @@ class LossWeights:
             often = f" every {self.perceptual_every} steps" if self.perceptual_every > 1 else ""
             terms.append(f"{self.perceptual:g} {perceptual}{often}")
         if self.progressive in ("decay", "growth"):
-            terms.append(f"{self.progressive_weight:g} progressive ({self.progressive})")
+            terms.append(f"{self.progressive_weight:g} progressive ({self.progressive}, {self.progressive_norm})")
         if self.sharpness != "off":
             terms.append(f"{self.sharpness_weight:g} sharpness ({self.sharpness})")
         return " + ".join(terms)
@@ -114,7 +116,11 @@ class Objective:
             terms["perceptual"] = weights.perceptual * distance
         if weights.progressive in ("decay", "growth"):
             change = progressive_change(
-                moment.moved, moment.previous, moment.step, grows=weights.progressive == "growth"
+                moment.moved,
+                moment.previous,
+                moment.step,
+                weights.progressive == "growth",
+                weights.progressive_norm,
             )
             terms["progressive"] = weights.progressive_weight * change
         if weights.sharpness != "off":

@@ -168,9 +168,12 @@ def _lift(
     scaled = [_scale_mask(mask, camera) for camera, mask in given]
     region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold, settings.say)
     if not len(region):
+        way = "lower --lift-threshold"
+        if settings.rule == "paper":
+            way = "far below the printed .8: give --lift-rule share, or lower --lift-threshold"
         raise ProgdfError(
             f"{name} selects no Gaussian by the rule {settings.rule}; its highest score is "
-            f"{float(region.score.max()):.2g}, lower --lift-threshold"
+            f"{float(region.score.max()):.2g}, {way}"
         )
     return region
 

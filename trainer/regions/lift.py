@@ -40,6 +40,7 @@ class Evidence:
         clearness: mean transmittance in front of it in the view that shows it best, 0 hidden .. 1 bare. [N]
         views: how many views show it: clearer than `HIDDEN`. [N]
         views_inside: in how many of these more than half of its contribution falls inside the mask. [N]
+        opacities: σ. [N]
     """
 
     inside: Tensor
@@ -49,6 +50,7 @@ class Evidence:
     clearness: Tensor
     views: Tensor
     views_inside: Tensor
+    opacities: Tensor
 
 
 def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Evidence:
@@ -75,18 +77,21 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
         views_inside += shown & (found[:, 0] > 0.5 * found[:, 2])
     clearness = (mean_weight / bare).clamp(0.0, 1.0)
     inside, pixels_inside, weight, pixels = sums.float().unbind(1)
-    return Evidence(inside, pixels_inside, weight, pixels, clearness, views, views_inside)
+    return Evidence(
+        inside, pixels_inside, weight, pixels, clearness, views, views_inside, scene.opacities
+    )
 
 
 def score(evidence: Evidence, rule: LiftRule = "share") -> Tensor:
     """How surely the masks mean each Gaussian. [N] 0..1; 0 where no view shows it.
 
     share: Σ w·m / Σ w, the part of its visible contribution that falls inside the masks. count: Σ m / n.
-    paper: Σ w·m / n as printed, which is at most the mean of αT, far below the printed threshold of .8.
+    paper: Σ σ·α·T·m / n as printed. α has σ in it already, and the sum is at most σ times the mean of αT, far
+    below the printed threshold of .8.
     """
     if rule == "share":
         return evidence.inside / evidence.weight.clamp_min(1e-12)
-    above = evidence.pixels_inside if rule == "count" else evidence.inside
+    above = evidence.pixels_inside if rule == "count" else evidence.opacities * evidence.inside
     return above / evidence.pixels.clamp_min(1.0)
 
 
@@ -114,13 +119,16 @@ def lift_masks(
         The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
         is the rule's for Gaussians that the views decide; for the others it tells how much of the surface
         around them belongs to the members (see `surface.surface_vote`), half of it being the threshold.
-        Where the views decide on no member there is none.
+        Where the views decide on no member there is none. Under the rule `paper` the score alone decides, as
+        printed: there is no surface, and no cleaning.
 
     How the rules and thresholds do against exact labels is in docs/experiments.md, Regions from masks.
     """
     least = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)
     scores = score(evidence, rule)
+    if rule == "paper":
+        return Region(name, (scores >= least).nonzero()[:, 0], scores)
     rows = undecided_rows(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
     few = 2 <= len(masks) <= FEW
