@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 
 from progdf.errors import ProgdfError
@@ -49,6 +50,12 @@ def check_options(options: TrainOptions) -> None:
     weight = options.perceptual_weight
     if weight is not None and not 0 <= weight < math.inf:
         raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
+    lifts = options.lift_rule == "paper" and re.search(r"(masks|text):", options.region)
+    if lifts and (options.lift_threshold is None or options.lift_threshold >= 0.8):
+        raise ProgdfError(
+            "--lift-rule paper selects nothing at the printed .8, as a splat's mean weight in its pixels is a "
+            "fifth at most; give --lift-rule share, or --lift-threshold .01"
+        )
     _check_editor_options(options)
     check_network_options(options, PRESETS[options.preset])
 
@@ -133,5 +140,3 @@ def check_network_options(
             raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
         if not 1 <= options.bytes_budget < math.inf:
             raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")
-    if not 0 <= options.picture_loss < math.inf:
-        raise ProgdfError(f"--picture-loss must be 0 or more, got {options.picture_loss}")

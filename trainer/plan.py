@@ -32,6 +32,7 @@ from .options import (
     Bands,
     FieldKind,
     LiftRule,
+    Norm,
     Progressive,
     Rates,
     Slider,
@@ -115,9 +116,9 @@ class OptimizationPlan:
         group_steps: steps per strength in which parts move as wholes first; None: a trial finds
         sh: whether the SH bands beyond DC are trained; auto: where they show
         perceptual_weight: None: by kind
-        progressive: the progressive constraint
+        progressive, progressive_norm: the progressive constraint
         reedit_every: steps between two edits of the current renders; 0: none
-        rates, perceptual_every, sharpness, raw, joint: see `Constants`
+        rates, perceptual_every, sharpness, raw, whole, prunes, propagates, joint: see `Constants`
         seed: order of the views
     """
 
@@ -128,11 +129,15 @@ class OptimizationPlan:
     sh: Bands
     perceptual_weight: float | None
     progressive: Progressive
+    progressive_norm: Norm
     reedit_every: int
     rates: Rates
     perceptual_every: int
     sharpness: Literal["kind"] | Sharpness
     raw: bool
+    whole: bool
+    prunes: bool
+    propagates: bool
     joint: bool
     seed: int
 
@@ -234,11 +239,15 @@ def make_plan(options: TrainOptions) -> Plan:
             options.sh,
             options.perceptual_weight,
             options.progressive,
+            options.progressive_norm,
             options.reedit_every,
             constants.rates,
             constants.perceptual_every,
             constants.sharpness,
             constants.raw,
+            constants.whole,
+            constants.prunes,
+            constants.propagates,
             joint,
             options.seed,
         ),
@@ -252,7 +261,7 @@ def make_plan(options: TrainOptions) -> Plan:
                 constants.inputs,
                 constants.bins,
                 constants.code,
-                options.picture_loss,
+                options.field_loss,
                 quick,
                 options.seed,
             ),
@@ -283,6 +292,7 @@ def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int)
         PROGRESSIVE_WEIGHT,
         sharpness,
         SHARPNESS_WEIGHT[sharpness],
+        asked.progressive_norm,
     )
     most = STAGES[kind]
     return Optimization(
@@ -290,11 +300,13 @@ def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int)
         asked.steps,
         asked.stages or min(most, QUICK_STAGES if asked.steps < STAGE_STEPS * most else most),
         group_steps if kind == "geometry" else 0,
-        # only an edit of colors may leave the bands alone; the paper's trainer leaves nothing
+        # only an edit of colors may leave the bands alone
         "on" if asked.sh == "auto" and (kind != "color" or asked.rates == "3dgs") else asked.sh,
         weights,
         asked.rates,
         asked.raw,
+        asked.prunes,
+        asked.propagates,
         # colors alone change, and nothing is asked for that only a descent view by view has
         solves_colors=kind == "color"
         and asked.rates == "kind"

@@ -35,6 +35,7 @@ from trainer.pipeline.training import optimize_members, retime_trajectory
 from trainer.plan import Plan, plan_optimization
 from trainer.report.curves import against_editor
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
+from trainer.setup.training_setup import whole_views
 from trainer.store.images import read_picture
 from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
@@ -155,10 +156,11 @@ def _record(
     if state.identity() != begun:
         state.begin(begun)
     edited = shared.edited if plan.optimization.stages != 1 else {1.0: shared.edited[1.0]}
+    setup = whole_views(shared.setup) if plan.optimization.whole else shared.setup
     with log.stage("optimize"):
-        trajectory, _ = optimize_members(optimization, shared.setup, edited, perceptual, state, log)
-    trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator)
-    return retime_trajectory(trajectory, shared.setup, plan.slider, optimization.raw, log)
+        trajectory, _ = optimize_members(optimization, setup, edited, perceptual, state, log)
+    trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator, optimization.prunes)
+    return retime_trajectory(trajectory, setup, plan.slider, optimization.raw, log)
 
 
 def _fit(

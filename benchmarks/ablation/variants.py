@@ -63,8 +63,15 @@ VARIANTS = (
     Variant("one-target", "no stages: towards the finished edit alone", {"stages": 1}),
     Variant("progressive-off", "no progressive constraint", {"progressive": "off"}),
     Variant("progressive-warmup", "the constraint as a warm-up", {"progressive": "warmup"}),
-    Variant("progressive-decay", "the printed constraint, letting go", {"progressive": "decay"}),
-    Variant("progressive-growth", "the printed constraint, tightening", {"progressive": "growth"}),
+    *(
+        Variant(
+            f"progressive-{way}-{norm}",
+            f"the constraint on {norm} of steps, {does}",
+            {"progressive": way, "progressive_norm": norm},
+        )
+        for way, does in (("growth", "tightening, as printed"), ("decay", "letting go"))
+        for norm in ("squares", "absolutes")
+    ),
     Variant("sharpness-off", "no sharpness term", {"sharpness": "off"}),
     Variant("sharpness-hinge", "as sharp as the target", {"sharpness": "hinge"}),
     Variant("sharpness-paper", "the printed sharpness", {"sharpness": "paper"}),

@@ -251,9 +251,9 @@ def control_signal(shape: NeuralShape, nodes: Tensor, s: Tensor) -> Tensor:
 
 
 def hard_bin(s: Tensor, bins: int = 10) -> Tensor:
-    """The paper's bin of each strength, as GraCo (CVPR 2024) takes it: ⌊clamp(k·s − 1, 0, k − 1)⌋. [B] -> [B] int64
+    """The paper's bin of each strength, as GraCo (CVPR 2024) takes it: ⌊clamp(k·s − 1, 0, k − 1)⌋.
 
-    So the first holds all s < 2/k, and the last s = 1 alone.
+    So the first holds all s < 2/k, and the last s = 1 alone. [B] -> [B] int64
     """
     return (s * bins - 1.0).clamp(0.0, bins - 1.0).long()
 

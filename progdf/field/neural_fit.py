@@ -1,15 +1,16 @@
-"""Fitting a neural field to a trajectory: Adam on offsets drawn from its snapshots (ProGDF, AAAI 2025).
+"""Fitting a neural field to a trajectory: Adam on what is drawn from its snapshots (ProGDF, AAAI 2025).
 
 The direct loss compares offsets, in spreads of their attribute, weighted by how visible the Gaussian is and
-by how much the attribute shows in pictures; it needs no rendering. The paper's L_pred, which compares
-pictures, can finish the work. Weighting by what shows is worth 3.5 dB (robot recolored, 33 after 29).
+by how much the attribute shows in pictures; it needs no rendering. The paper's loss compares pictures, of a
+snapshot drawn at random. Weighting by what shows is worth 3.5 dB (robot recolored, 33 after 29).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -30,8 +31,19 @@ from .neural import (
 )
 from .separable import LEVELS, channel_weights
 
-PictureLoss = Callable[[Tensor, Tensor], Tensor]
-"""Packed offsets of the field, packed offsets recorded at the same strength -> loss. [M,C], [M,C] -> []"""
+
+class PictureLoss(Protocol):
+    """How far pictures of the field are from those of the recording."""
+
+    @property
+    def views(self) -> int:
+        """In how many views."""
+        ...
+
+    def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
+        """Packed offsets of the field and those recorded at the same strength. [M,C], [M,C] -> []"""
+        ...
+
 
 EFFORT: Mapping[Size, tuple[int, int, float]] = {
     "tiny": (6000, 2048, 5e-3),
@@ -55,7 +67,6 @@ class NeuralSettings:
         steps: 0 is what the size needs
         batch: members drawn in each step; 0 is what the size needs
         rate: largest learning rate; 0 is what the size needs
-        picture_share: share of the steps, at the end, that also compare pictures, where these are given
         seed: of the first weights and of what is drawn
     """
 
@@ -66,7 +77,6 @@ class NeuralSettings:
     steps: int = 0
     batch: int = 0
     rate: float = 0.0
-    picture_share: float = 0.02
     seed: int = 0
 
     def resolve(self) -> NeuralSettings:
@@ -157,7 +167,6 @@ class NeuralFit:
         offsets: Tensor,
         factor: float = 1.0,
         pictures: PictureLoss | None = None,
-        weight: float = 1.0,
     ) -> float:
         """One step of Adam on what is drawn from the snapshots; `scale_to` comes first.
 
@@ -165,8 +174,8 @@ class NeuralFit:
             strengths: of the snapshots, ascending from 0. [T]
             offsets: [T,M,C], any floating type
             factor: of the learning rate
-            pictures: also compare pictures, of all members at one drawn strength
-            weight: of that comparison
+            pictures: compare pictures instead of offsets: of one snapshot (not between two) in one view,
+                both drawn at random
 
         Returns:
             The loss.
@@ -175,27 +184,12 @@ class NeuralFit:
             FloatingPointError: it is no longer finite.
         """
         self.steps += 1
-        members = len(self._rows)
-        if not members:
+        if not len(self._rows):
             return 0.0
-        columns = self.shape.columns
         if pictures is None:
-            rows = torch.randint(members, (self.settings.batch,), generator=self._draws)
-            right = torch.randint(1, len(strengths), rows.shape, generator=self._draws)
-            share = torch.rand(rows.shape, generator=self._draws)
-        else:  # one place on the slider, every member
-            rows = torch.arange(members)
-            right = torch.randint(1, len(strengths), (1,), generator=self._draws).expand(members)
-            share = torch.rand(1, generator=self._draws).expand(members)
-        s = torch.lerp(strengths[right - 1], strengths[right], share)
-        low, high = offsets[right - 1, rows].float(), offsets[right, rows].float()
-        recorded = torch.lerp(low, high, share[:, None])
-        found = self._answer(rows, s)
-        errors = (found - recorded[:, columns]) / self._frame["spread"]
-        loss = (self._shown[rows, None] * self._importance * errors.square()).sum(dim=1).mean()
-        if pictures is not None:
-            moved = torch.zeros_like(recorded).index_copy(1, columns, found)
-            loss = loss + weight * pictures(moved, recorded)
+            loss = self._offset_loss(strengths, offsets)
+        else:
+            loss = self._picture_loss(strengths, offsets, pictures)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise FloatingPointError(f"the field's loss is {value} at step {self.steps}")
@@ -205,6 +199,27 @@ class NeuralFit:
         loss.backward()  # type: ignore[no-untyped-call]
         self._adam.step()
         return value
+
+    def _offset_loss(self, strengths: Tensor, offsets: Tensor) -> Tensor:
+        """Of some members, each anywhere on the slider. []"""
+        rows = torch.randint(len(self._rows), (self.settings.batch,), generator=self._draws)
+        right = torch.randint(1, len(strengths), rows.shape, generator=self._draws)
+        share = torch.rand(rows.shape, generator=self._draws)
+        s = torch.lerp(strengths[right - 1], strengths[right], share)
+        low, high = offsets[right - 1, rows].float(), offsets[right, rows].float()
+        recorded = torch.lerp(low, high, share[:, None])
+        errors = (self._answer(rows, s) - recorded[:, self.shape.columns]) / self._frame["spread"]
+        return (self._shown[rows, None] * self._importance * errors.square()).sum(dim=1).mean()
+
+    def _picture_loss(self, strengths: Tensor, offsets: Tensor, pictures: PictureLoss) -> Tensor:
+        """Of all members, at one snapshot but the original, in one view. []"""
+        snapshot = int(torch.randint(1, len(strengths), (1,), generator=self._draws))
+        view = int(torch.randint(pictures.views, (1,), generator=self._draws))
+        rows = torch.arange(len(self._rows))
+        found = self._answer(rows, strengths[snapshot].expand(len(rows)))
+        recorded = offsets[snapshot].float()
+        moved = torch.zeros_like(recorded).index_copy(1, self.shape.columns, found)
+        return pictures(moved, recorded, view)
 
     def _answer(self, rows: Tensor, s: Tensor) -> Tensor:
         """The field's offsets for drawn members and strengths. [B], [B] -> [B,c]"""

@@ -33,7 +33,7 @@ def fit_neural(
         settings: see NeuralSettings
         visibility: how much each member shows. [M]; None is evenly
         render: of a few views; tells how much each attribute shows. None weighs all numbers alike
-        pictures: the paper's L_pred, for the last steps; None does without
+        pictures: the loss is of these instead of offsets
         recorded: strengths for the slider's ticks; `strengths` when None
         on_step: progress: steps done, loss
 
@@ -58,10 +58,9 @@ def train_network(
     pictures: PictureLoss | None = None,
     on_step: Callable[[int, float], None] | None = None,
 ) -> None:
-    """Take `steps` steps with a rate that falls to 0 along half a cosine; the last ones look at pictures."""
-    looking = round(fit.settings.picture_share * steps) if pictures is not None else 0
+    """Take `steps` steps with a rate that falls to 0 along half a cosine."""
     for done in range(steps):
         factor = 0.5 * (1.0 + math.cos(math.pi * done / steps))
-        loss = fit.step(strengths, offsets, factor, pictures if done >= steps - looking else None)
+        loss = fit.step(strengths, offsets, factor, pictures)
         if on_step is not None:
             on_step(done + 1, loss)

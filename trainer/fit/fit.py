@@ -158,9 +158,16 @@ def visibility(
     return total / total.mean().clamp_min(1e-12) + 1e-3
 
 
-def drop_idle_attributes(trajectory: Trajectory, evaluator: Evaluator) -> tuple[Trajectory, dict[str, float]]:
+def drop_idle_attributes(
+    trajectory: Trajectory, evaluator: Evaluator, prunes: bool = True
+) -> tuple[Trajectory, dict[str, float]]:
     """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views,
     all that are taken out together.
+
+    Args:
+        trajectory: as recorded
+        evaluator: held-out views
+        prunes: whether anything is taken out that moves at all
 
     Returns:
         The trajectory (without the higher SH bands' columns if these go), and what leaving out each attribute
@@ -178,7 +185,7 @@ def drop_idle_attributes(trajectory: Trajectory, evaluator: Evaluator) -> tuple[
         tried[:, slices[name]] = 0.0
         then = evaluator.psnr(evaluator.pictures(tried), target)
         costs[name] = round(now - then, 3)
-        if whole - then < _PAYS:
+        if prunes and whole - then < _PAYS:
             now = then
             offsets = offsets.clone()
             offsets[:, :, slices[name]] = 0.0

@@ -2,9 +2,10 @@
 
 ProGDF trains its field jointly with PGS: after each of its steps one of the field's, on a snapshot drawn from
 those recorded so far. The slider values are not known before the whole way is, so a snapshot goes by its
-stage's strength and its step until then; when the optimization is done, the network is finished on the
-trajectory as it was re-timed. Its end is not known either: until then a network sees positions (and its
-codes) alone. Separable and keyframe fields have closed forms: they are solved once the trajectory is whole.
+stage's strength and its step until then; where these are not what the slider means in the end, the network is
+finished on the trajectory as it was re-timed. The end of the way is not known either: until then a network
+sees positions (and its codes) alone. Separable and keyframe fields have closed forms: they are solved once
+the trajectory is whole.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
-from progdf.field.neural_fit import NeuralFit
+from progdf.field.neural_fit import NeuralFit, PictureLoss
 from progdf.field.rendered import Render, rendered_importance
 from progdf.field.separable import moving_attributes
 from progdf.interpolation import interpolate_at
@@ -72,16 +73,23 @@ class JointTraining:
         channels: of the recordings
         strengths, steps: of the stages, in order
         render: of a few small views, tells how much each attribute shows
+        pictures: the loss is of these instead of offsets
     """
 
     def __init__(
-        self, fit: NeuralFit, channels: int, strengths: Sequence[float], steps: Sequence[int], render: Render
+        self,
+        fit: NeuralFit,
+        channels: int,
+        strengths: Sequence[float],
+        steps: Sequence[int],
+        render: Render,
+        pictures: PictureLoss | None = None,
     ) -> None:
         self.fit = fit
         self._channels = channels
         self._at = torch.tensor([0.0, *strengths], dtype=torch.float64)
         self._after = torch.tensor([0, *accumulate(steps)], dtype=torch.float64)
-        self._render = render
+        self._render, self._pictures = render, pictures
         self.bank = MemoryBank(fit.members, channels)
         self._strengths, self._offsets = self.bank.strengths, self.bank.offsets
 
@@ -93,7 +101,9 @@ class JointTraining:
         """A recording of PGS. [M,C]"""
         self._keep(step, offsets)
         if moving_attributes(self._offsets):
-            self.fit.scale_to(self._offsets, rendered_importance(self._offsets, self._render))
+            pictures = self._pictures is not None  # which weigh the attributes themselves
+            importance = None if pictures else rendered_importance(self._offsets, self._render)
+            self.fit.scale_to(self._offsets, importance)
 
     def step(self) -> None:
         """One step of the field after one of PGS; none before the first recording.
@@ -102,7 +112,7 @@ class JointTraining:
             FloatingPointError: the field's loss is no longer finite.
         """
         if len(self.bank) > 1:
-            self.fit.step(self._strengths, self._offsets)
+            self.fit.step(self._strengths, self._offsets, pictures=self._pictures)
 
     def capture_state(self) -> Saved:
         """The fit; the bank is made again from the recordings."""

@@ -1,4 +1,4 @@
-"""A run's neural field: begun while PGS runs or after it, finished on the recorded trajectory, baked.
+"""A run's neural field: trained while PGS runs, on the recorded trajectory, or both, and baked.
 
 `--field auto` does not try it: at the default target it does not arrive (docs/experiments.md, Networks).
 """
@@ -16,29 +16,34 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
 from progdf.field.evaluate import FieldEvaluator
 from progdf.field.neural import Bins, Inputs, NeuralShape, Size
-from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss
+from progdf.field.neural_fit import EFFORT, NeuralFit
 from progdf.field.neural_training import train_network
 from progdf.field.rendered import rendered_importance
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
-from trainer.optimize.losses import Perceptual, l1
+from trainer.optimize.losses import Perceptual
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.settings import resolve_slider
-from trainer.options import Slider
+from trainer.options import FieldLoss, Slider
 from trainer.setup.training_setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import Saved, StateFolder
-from trainer.views.crops import crop_scene, render_all
+from trainer.views.crops import CropScene, crop_scene, render_all
 
 from .evaluate import Evaluator
 from .fit import visibility
 from .memory_bank import JointTraining
+from .picture_loss import RenderedLoss
 
 PART = "network"
 """Of the saved state: a network that was trained jointly, once the trajectory is recorded."""
 
-_FINISHING = 0.5  # of the steps that a network takes which was not trained jointly
+_FINISHING = 0.5
+"""Of the steps of a network that was not trained jointly: to follow the re-timed trajectory. One that was
+trained on pictures is left as it is, as in the paper."""
+PICTURE_STEPS = 1500
+"""Of a network that is trained on pictures after the recording: as many as the paper's take beside it."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class NetworkPlan:
     """The network of a neural field.
 
     Args:
-        size, picture_loss: see `TrainOptions`
+        size, loss: see `TrainOptions.size`, `TrainOptions.field_loss`
         inputs, bins, code: see `trainer.presets.Constants`
         draft: a third of the steps
         seed: of its weights and draws
@@ -56,7 +61,7 @@ class NetworkPlan:
     inputs: Inputs
     bins: Bins
     code: int
-    picture_loss: float
+    loss: FieldLoss
     draft: bool
     seed: int
 
@@ -86,7 +91,8 @@ class NetworkFit:
 
 def network_settings(plan: NetworkPlan) -> NeuralSettings:
     """What the plan says of the network, as it is trained."""
-    steps = EFFORT[plan.size][0] // 3 if plan.draft else 0
+    steps = PICTURE_STEPS if plan.loss == "pictures" else EFFORT[plan.size][0]
+    steps = steps // 3 if plan.draft else steps
     return NeuralSettings(plan.size, plan.inputs, plan.code, plan.bins, steps, seed=plan.seed)
 
 
@@ -96,6 +102,8 @@ def begin_joint_training(
     setup: TrainingSetup,
     rates: Tensor,
     stages: Sequence[TargetStage],
+    crops: Sequence[CropScene],
+    perceptual: Perceptual,
 ) -> JointTraining:
     """The network that is trained jointly with PGS.
 
@@ -105,6 +113,8 @@ def begin_joint_training(
         setup: scene, region, views
         rates: learning rates of PGS; what has none does not move. [C]
         stages: of PGS
+        crops: the training views, for a loss of pictures
+        perceptual: for the same
     """
     channels = len(rates)
     slices = attribute_slices(channels)
@@ -122,9 +132,9 @@ def begin_joint_training(
     strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
     if resolve_slider(slider, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
-    return JointTraining(
-        NeuralFit(rows, channels, attributes, settings, seen), channels, strengths, steps, render
-    )
+    fit = NeuralFit(rows, channels, attributes, settings, seen)
+    pictures = RenderedLoss(crops, rows, attributes, perceptual) if network.loss == "pictures" else None
+    return JointTraining(fit, channels, strengths, steps, render, pictures)
 
 
 def save_network(joint: JointTraining, folder: StateFolder) -> None:
@@ -143,7 +153,7 @@ def fit_network(
     log: RunLog,
     begun: Saved | None = None,
 ) -> NetworkFit:
-    """Train a network on a trajectory, or finish one that was trained jointly, and bake it.
+    """Train a network on a trajectory, or finish one that was trained jointly on offsets, and bake it.
 
     Args:
         trajectory: what was recorded
@@ -170,10 +180,9 @@ def fit_network(
     if begun is not None:
         layout = begun.values["shape"]
         fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
-        steps = round(_FINISHING * steps)
+        steps = 0 if plan.loss == "pictures" else round(_FINISHING * steps)
     fit.scale_to(offsets, rendered_importance(offsets, seen.counted_pixels))
-    weight = plan.picture_loss
-    pictures = _picture_loss(setup, trajectory, perceptual, weight, settings.seed) if weight > 0 else None
+    pictures = _rendered_loss(setup, trajectory, perceptual) if plan.loss == "pictures" and steps else None
     try:
         with log.steps("field", steps) as advance:
             train_network(
@@ -189,21 +198,9 @@ def fit_network(
     )
 
 
-def _picture_loss(
-    setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual, weight: float, seed: int
-) -> PictureLoss:
-    """L_pred of ProGDF: L1 + LPIPS between the field's and the recording's picture of a random view."""
+def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual) -> RenderedLoss:
+    """The loss of pictures in all training views."""
     members = setup.region.members
     crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background) for v in setup.train]
     rows = pack(setup.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
-    moving = tuple(moving_attributes(trajectory.end[None]))
-    draws = torch.Generator().manual_seed(seed)
-
-    def loss(found: Tensor, recorded: Tensor) -> Tensor:
-        view = crops[int(torch.randint(len(crops), (1,), generator=draws))]
-        with torch.no_grad():
-            expected, _ = view.render(rows + recorded, moving)
-        image, _ = view.render(rows + found, moving)
-        return weight * (l1(image, expected) + perceptual(image, expected))
-
-    return loss
+    return RenderedLoss(crops, rows, tuple(moving_attributes(trajectory.end[None])), perceptual)

@@ -15,8 +15,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Features, Lpips, Net
-
-Norm = Literal["squares", "absolutes"]
+from trainer.options import Norm
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
@@ -106,7 +105,7 @@ def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
 def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
     """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
 
-    Early steps are short, which is what the paper's constraint is for (eq. 5, `progressive_change`), at no loss.
+    Early steps are short, which is what the paper's constraint is for (eq. 5, `progressive_change`).
     """
     return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
 
@@ -123,7 +122,8 @@ def progressive_change(
     """The paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖, without its λ2. []
 
     ΔΘ is what the last step changed, summed over all raw parameters of all members. The paper names no norm:
-    "squares" sums Δ², "absolutes" |Δ|, which freezes the edit (docs/experiments.md).
+    "squares" sums Δ², "absolutes" |Δ|, which freezes the edit (docs/experiments.md, The progressive
+    constraint).
 
     Args:
         moved: offsets of the members. [M,C]

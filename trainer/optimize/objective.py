@@ -16,9 +16,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from trainer.options import Progressive
+from trainer.options import Norm, Progressive
 
-from .losses import Norm, Perceptual, l1, progressive_change, sharpness
+from .losses import Perceptual, l1, progressive_change, sharpness
 
 Sharpness = Literal["hinge", "paper", "off"]
 Losses = Mapping[str, Sequence[float | None]]
@@ -55,7 +55,9 @@ class LossWeights:
             often = f" every {self.perceptual_every} steps" if self.perceptual_every > 1 else ""
             terms.append(f"{self.perceptual:g} {perceptual}{often}")
         if self.progressive in ("decay", "growth"):
-            terms.append(f"{self.progressive_weight:g} progressive ({self.progressive}, {self.progressive_norm})")
+            terms.append(
+                f"{self.progressive_weight:g} progressive ({self.progressive}, {self.progressive_norm})"
+            )
         if self.sharpness != "off":
             terms.append(f"{self.sharpness_weight:g} sharpness ({self.sharpness})")
         return " + ".join(terms)

@@ -29,7 +29,7 @@ class Optimization:
         group_steps: of the group stage per strength; 0 leaves it out
         sh: whether the SH bands beyond DC are trained; auto: where the region's colors change with the view
         weights: of the loss terms
-        rates, raw: see `trainer.presets.Constants`
+        rates, raw, prunes, propagates: see `trainer.presets.Constants`
         solves_colors: the edit is solved for, all views at once (`color_solver`)
         seed: order of the views
     """
@@ -42,6 +42,8 @@ class Optimization:
     weights: LossWeights
     rates: Rates
     raw: bool
+    prunes: bool
+    propagates: bool
     solves_colors: bool
     seed: int
 
@@ -76,7 +78,8 @@ def pgs_settings(
     if not bands:
         rates[BASE_CHANNELS:] = 0.0
     warmup = optimization.weights.progressive == "warmup"
-    smoothing, every = (0.0, max(1, optimization.steps // 32)) if optimization.raw else (0.9, 0)
+    # a run too short for the paper's snapshots still has four
+    smoothing, every = (0.0, min(100, max(1, optimization.steps // 4))) if optimization.raw else (0.9, 0)
     if optimization.rates == "3dgs":  # a plain descent: the target at once, the same steps throughout
         return PgsSettings(
             rates,

@@ -12,7 +12,7 @@ from trainer.pipeline.reopen import render_run_views, reopen_run
 from trainer.pipeline.threads import use_threads
 from trainer.plan import FieldPlan
 from trainer.report.clip import Texts
-from trainer.setup.training_setup import widen_views
+from trainer.setup.training_setup import whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import read_views
 
@@ -33,12 +33,13 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
             names = [view.camera.name for view in setup.train]
             edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
             # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
-            setup = widen_views(setup, edited)
+            whole = run.record.plan.optimization.whole
+            setup = whole_views(setup) if whole else widen_views(setup, edited)
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
         own = run.record.plan
-        network = replace(own.field.network, size=options.size, picture_loss=options.picture_loss)
+        network = replace(own.field.network, size=options.size, loss=options.field_loss)
         texts = Texts(
             options.text_before or own.texts.before,
             options.text_after or own.texts.after,

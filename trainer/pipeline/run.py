@@ -40,6 +40,7 @@ from trainer.setup.training_setup import (
     editor_strengths,
     make_training_setup,
     quantize_image,
+    whole_views,
     widen_views,
 )
 from trainer.store.interrupts import interrupt_on_signals
@@ -125,7 +126,7 @@ def _run_training(plan: Plan, scene: Gaussians, region: Region, folder: RunFolde
     with log.stage("edit"):
         edited, approach, trial = _edit_views(plan, setup, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
-        setup = widen_views(setup, train_edits)
+        setup = whole_views(setup) if plan.optimization.whole else widen_views(setup, train_edits)
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
@@ -225,7 +226,7 @@ def _record(
         log.say(f"--group-steps: without effect on this {kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         renewal = reedit(plan.editor, plan.optimization.reedit_every, setup, kind, folder, log)
-        unseen_members = unseen_members_of(setup, kind)
+        unseen_members = unseen_members_of(setup, kind) if optimization.propagates else None
         trajectory, losses = optimize_members(
             optimization,
             setup,
@@ -245,7 +246,7 @@ def _record(
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
             evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
-            trajectory, costs = drop_idle_attributes(trajectory, evaluator)
+            trajectory, costs = drop_idle_attributes(trajectory, evaluator, optimization.prunes)
         recorded = len(trajectory)
         way = ""
         if not optimization.raw and plan.field.field != "neural" and len(edited) == 1:
@@ -273,7 +274,7 @@ def _record(
         losses,
         costs,
         agreement.figures() if agreement is not None else None,
-        len(unseen_members.places),
+        len(unseen_members.places) if unseen_members is not None else 0,
         setup.up.to_json() if setup.up is not None else None,
     )
     extra = {"members": region.members, "score": region.score}

@@ -119,7 +119,9 @@ def optimize_members(
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     joint = None
     if network is not None:
-        joint = begin_joint_training(network.network, network.slider, setup, settings.rates, stages)
+        joint = begin_joint_training(
+            network.network, network.slider, setup, settings.rates, stages, crops, perceptual
+        )
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
     kept = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}))
     if kept.restore():

@@ -77,9 +77,7 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
         views_inside += shown & (found[:, 0] > 0.5 * found[:, 2])
     clearness = (mean_weight / bare).clamp(0.0, 1.0)
     inside, pixels_inside, weight, pixels = sums.float().unbind(1)
-    return Evidence(
-        inside, pixels_inside, weight, pixels, clearness, views, views_inside, scene.opacities
-    )
+    return Evidence(inside, pixels_inside, weight, pixels, clearness, views, views_inside, scene.opacities)
 
 
 def score(evidence: Evidence, rule: LiftRule = "share") -> Tensor:

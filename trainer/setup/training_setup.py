@@ -142,6 +142,13 @@ def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
     return replace(setup, train=views)
 
 
+def whole_views(setup: TrainingSetup) -> TrainingSetup:
+    """The training views with the whole picture as their boxes."""
+    return replace(
+        setup, train=[replace(v, box=(0, 0, v.camera.width, v.camera.height)) for v in setup.train]
+    )
+
+
 def probe_views(setup: TrainingSetup, count: int = _PROBES, still: bool = False) -> list[CropScene]:
     """A few training views at half size, in which movement is measured. `still`: see `crop_scene`"""
     chosen = setup.train[:: max(1, len(setup.train) // count)][:count]

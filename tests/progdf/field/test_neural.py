@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from progdf.field.neural import NeuralShape, offsets_of_answer
+from progdf.field.neural import NeuralShape, hard_bin, offsets_of_answer
 from progdf.gaussians import attribute_slices
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import FORMS, MEMBERS, network, rows
@@ -37,8 +37,15 @@ def test_interpolated_bins_leave_no_jump(form: str) -> None:
 def test_hard_bins_stand_still_and_jump() -> None:
     field = network("position, hard bins").bind(rows())
     assert torch.equal(field.offsets(0.31), field.offsets(0.39))
-    assert torch.equal(field.offsets(1e-6), field.offsets(0.099))  # the paper's s = 0 and s = 0.1 are one
+    assert torch.equal(field.offsets(1e-6), field.offsets(0.199))  # the paper's s = 0 and s = 0.1 are one
     assert float((field.offsets(0.401) - field.offsets(0.399)).abs().max()) > 1e-3
+
+
+def test_hard_bins_are_gracos_clamp() -> None:
+    tenths = torch.arange(11) / 10
+    assert hard_bin(tenths).tolist() == [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert hard_bin(tenths + 0.05).tolist() == [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert hard_bin(torch.tensor([-1.0, 0.999999, 2.0])).tolist() == [0, 8, 9], "the last is s = 1 alone"
 
 
 def test_a_network_that_keeps_the_end_meets_it_by_itself() -> None:

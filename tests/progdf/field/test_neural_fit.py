@@ -72,16 +72,40 @@ def test_importance_is_what_pictures_show() -> None:
     assert sum(found.values()) == pytest.approx(1.0)
 
 
-def test_the_loss_of_pictures_is_paid_in_the_last_steps() -> None:
-    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
-    seen: list[tuple[int, ...]] = []
+class Watched:
+    """A loss of pictures that is none, and keeps what it is asked."""
 
-    def pictures(found: Tensor, recorded: Tensor) -> Tensor:
-        seen.append((*found.shape, *recorded.shape))
+    views = 3
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Tensor, Tensor, int]] = []
+
+    def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
+        self.asked.append((found, recorded, view))
         return (found - recorded).abs().mean()
 
-    fit_neural(strengths, offsets, rows(), replace(SHORT, picture_share=0.1), pictures=pictures)
-    assert seen == [(MEMBERS, 14, MEMBERS, 14)] * 4
+
+def test_pictures_are_compared_at_a_snapshot_drawn_at_random_never_between_two() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+    pictures = Watched()
+    fit_neural(strengths, offsets, rows(), replace(SHORT, steps=60), pictures=pictures)
+    assert len(pictures.asked) == 60, "in every step"
+    drawn = {
+        next(i for i, made in enumerate(offsets) if torch.equal(made, recorded))
+        for _, recorded, _ in pictures.asked
+    }
+    assert drawn == set(range(1, len(offsets))), "each of them, but not the original"
+    assert {view for *_, view in pictures.asked} == {0, 1, 2}
+    assert all(found.shape == (MEMBERS, 14) for found, *_ in pictures.asked), "of all members"
+
+
+def test_a_loss_of_pictures_takes_the_place_of_the_one_of_offsets() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+    fit, pictures = NeuralFit(rows(), 14, ("sh0",), SHORT), Watched()
+    fit.scale_to(offsets)
+    loss = fit.step(strengths, offsets, pictures=pictures)
+    found, recorded, _ = pictures.asked[0]
+    assert loss == pytest.approx(float((found - recorded).detach().abs().mean()))
 
 
 def test_what_moves_nothing_cannot_be_learned() -> None:

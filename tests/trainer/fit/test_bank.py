@@ -35,6 +35,7 @@ def short_fits() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(neural_fit, "EFFORT", {"tiny": (200, 256, 5e-3)})
         patch.setattr("trainer.fit.network.EFFORT", neural_fit.EFFORT)
+        patch.setattr("trainer.fit.network.PICTURE_STEPS", 20)
         yield
     torch.set_num_threads(threads)
 
@@ -181,7 +182,9 @@ def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
 def test_a_refit_trains_a_network_on_what_was_recorded(folder: Path, alongside: RunResult) -> None:
     before = alongside.folder.trajectory.read_bytes()
     kept = alongside.gdf.read_bytes()
-    found = refit(FitOptions(alongside.folder.root, field="neural", picture_loss=0.5, threads=1), quiet=True)
+    found = refit(
+        FitOptions(alongside.folder.root, field="neural", field_loss="pictures", threads=1), quiet=True
+    )
     assert alongside.folder.trajectory.read_bytes() == before
     origin = load_gdf(found.gdf, load_ply(folder / "scene.ply")).field.origin
     assert origin is not None
@@ -199,8 +202,10 @@ def _end(result: RunResult, folder: Path) -> Tensor:
     ("changed", "message"),
     [
         ({"size": "small"}, "--size does not apply to --field auto; add --field neural"),
-        ({"picture_loss": 1.0, "field": "separable"}, "--picture-loss does not apply to --field separable"),
-        ({"field": "neural", "picture_loss": -1.0}, "--picture-loss must be 0 or more"),
+        (
+            {"field_loss": "pictures", "field": "separable"},
+            "--field-loss does not apply to --field separable",
+        ),
     ],
 )
 def test_network_options_that_mean_nothing_are_told(

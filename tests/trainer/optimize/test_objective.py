@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from trainer.editors import make_editor
 from trainer.optimize.losses import GradientL1, LpipsLoss, erode, l1, progressive_change, sharpness
 from trainer.optimize.objective import LossWeights, Moment, Objective, TermMeans, loss_table, total_loss
 from trainer.optimize.pgs import ParameterSnapshot, PgsSettings, TargetStage, learning_rates, optimize
+from trainer.options import Norm, Progressive
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop
 
@@ -58,9 +60,10 @@ def test_sharpness_has_the_gradient_of_finite_differences(form: str) -> None:
 
 
 @pytest.mark.parametrize("grows", [False, True])
-def test_the_progressive_change_has_the_gradient_of_finite_differences(grows: bool) -> None:
+@pytest.mark.parametrize("norm", get_args(Norm))
+def test_the_progressive_change_has_the_gradient_of_finite_differences(grows: bool, norm: Norm) -> None:
     moved, previous = noise(5, 14).requires_grad_(), noise(5, 14, seed=1)
-    assert torch.autograd.gradcheck(lambda x: progressive_change(x, previous, 70, grows), moved)
+    assert torch.autograd.gradcheck(lambda x: progressive_change(x, previous, 70, grows, norm), moved)
 
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
@@ -130,7 +133,7 @@ def test_a_new_stage_forgets_the_targets_of_the_last() -> None:
 def test_the_line_for_the_log_names_what_is_really_used() -> None:
     assert LossWeights().description("gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
     assert ALL_TERMS.description("lpips-vgg") == (
-        "L1 + 0.3 lpips-vgg + 5 progressive (decay) + 0.5 sharpness (hinge)"
+        "L1 + 0.3 lpips-vgg + 5 progressive (decay, squares) + 0.5 sharpness (hinge)"
     )
 
 
@@ -139,11 +142,15 @@ def test_the_line_for_the_log_names_what_is_really_used() -> None:
 
 def test_the_progressive_change_is_the_printed_sum() -> None:
     moved, previous = noise(5, 14), noise(5, 14, seed=1)
-    length = float((moved - previous).abs().sum())
-    for step in (0, 50, 600):
-        grown, decayed = (float(progressive_change(moved, previous, step, grows)) for grows in (True, False))
-        assert grown == pytest.approx(0.05 * 1.1 ** (step / 50) * length)
-        assert decayed == pytest.approx(0.05 * 1.1 ** (-step / 50) * length)
+    step_taken = moved - previous
+    lengths: dict[Norm, Tensor] = {"squares": step_taken.square().sum(), "absolutes": step_taken.abs().sum()}
+    for norm, length in lengths.items():
+        for step in (0, 50, 600):
+            grown, decayed = (
+                progressive_change(moved, previous, step, grows, norm) for grows in (True, False)
+            )
+            assert float(grown) == pytest.approx(0.05 * 1.1 ** (step / 50) * float(length))
+            assert float(decayed) == pytest.approx(0.05 * 1.1 ** (-step / 50) * float(length))
 
 
 def recolored(weights: LossWeights, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
@@ -163,17 +170,27 @@ def distance_traveled(weights: LossWeights) -> float:
     return float(recolored(weights)[-1].offsets.abs().mean())
 
 
-def test_the_printed_constraint_freezes_the_edit_and_a_small_weight_of_it_does_not() -> None:
-    free = distance_traveled(LossWeights())
-    for progressive in ("decay", "growth"):
-        weights = LossWeights(progressive=progressive)  # type: ignore[arg-type]
-        assert distance_traveled(weights) < 0.2 * free, progressive
-    slight = LossWeights(progressive="decay", progressive_weight=1e-6)
-    assert distance_traveled(slight) > 0.8 * free
+@pytest.mark.parametrize("progressive", ["decay", "growth"])
+def test_absolutes_of_steps_freeze_the_edit_and_squares_slow_it_down(progressive: Progressive) -> None:
+    def ways(norm: Norm) -> tuple[float, float]:
+        """Mean offset after 30 steps and after 90."""
+        held = LossWeights(progressive=progressive, progressive_norm=norm)
+        found = recolored(held, 90, every=30, smoothing=0.0)
+        return float(found[0].offsets.abs().mean()), float(found[-1].offsets.abs().mean())
+
+    early, late = ways("absolutes")
+    assert late < 1.2 * early, "it trembles where it is"
+    early, late = ways("squares")
+    assert late > 2.0 * early, "it goes on"
+
+
+def test_a_small_weight_of_the_constraint_does_not_hold_the_edit() -> None:
+    slight = LossWeights(progressive="decay", progressive_weight=1e-6, progressive_norm="absolutes")
+    assert distance_traveled(slight) > 0.8 * distance_traveled(LossWeights())
 
 
 def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps() -> None:
-    frozen = LossWeights(progressive="growth")
+    frozen = LossWeights(progressive="growth", progressive_norm="absolutes")
     assert [found.step for found in recolored(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
     assert len(recolored(frozen)) < 4 < len(recolored(LossWeights())), "else by what is seen"
 

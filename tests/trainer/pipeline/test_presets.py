@@ -14,7 +14,6 @@ from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, plain
 from trainer.cli import train_options
 from trainer.editors.base import EditKind
-from trainer.optimize.objective import LossWeights
 from trainer.optimize.settings import Optimization, pgs_settings
 from trainer.options import Preset, TrainOptions
 from trainer.plan import Plan, make_plan, plan_difference, plan_optimization
@@ -58,26 +57,11 @@ def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() 
     after = asked("--preset", "paper", "--steps", "300")
     assert before == after
     assert before.steps == 300
-    assert before.progressive == "decay"
+    assert before.progressive == "growth"
 
 
 def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too() -> None:
     assert asked("--preset", "paper", "--stages", "0").stages == asked().stages == 0
-
-
-def test_the_papers_trainer_is_as_printed() -> None:
-    plan, found = make_plan(asked("--preset", "paper")), planned("color", "--preset", "paper")
-    assert found.weights == LossWeights(1.0, 1, "decay", 5.0, "paper", 1.0)
-    assert planned("geometry", "--preset", "paper").weights == found.weights, "whatever the edit"
-    settings = pgs_settings(found, found.sh != "off", 23, 1.0, 1)
-    assert bool((settings.rates > 0).all()), "all attributes are free"
-    assert (settings.damped, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
-    assert (settings.smoothing, settings.every) == (0.0, found.steps // 32)
-    assert 1500 <= found.steps <= 2000
-    assert (found.stages, plan.views.views, plan.slider) == (1, 96, "time")
-    network = plan.field.network
-    assert (network.size, network.inputs, network.bins, network.code) == ("paper", "position", "hard", 0)
-    assert plan.optimization.joint
 
 
 def test_the_papers_trainer_can_leave_out_its_network() -> None:
@@ -86,8 +70,8 @@ def test_the_papers_trainer_can_leave_out_its_network() -> None:
     assert plan.field.field == "auto"
 
 
-def test_the_paper_can_tighten_instead_of_letting_go() -> None:
-    assert planned("style", "--preset", "paper", "--progressive", "growth").weights.progressive == "growth"
+def test_the_paper_can_let_go_instead_of_tightening() -> None:
+    assert planned("style", "--preset", "paper", "--progressive", "decay").weights.progressive == "decay"
 
 
 def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
@@ -143,7 +127,8 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
 
 def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
     assert planned("color").sh == "auto"
-    assert planned("style").sh == planned("color", "--preset", "paper").sh == "on"
+    assert planned("style").sh == "on"
+    assert planned("color", "--preset", "paper").sh == planned("style", "--sh", "off").sh == "off"
     assert planned("style", "--sh", "off").sh == "off"
 
 
@@ -159,7 +144,7 @@ def test_two_plans_differ_by_the_first_option_that_does() -> None:
     assert plan_difference(plan, make_plan(asked("--steps", "40", "--stages", "2"))) == "--steps 800, not 40"
     assert plan_difference(plan, make_plan(asked("--views", "9"))) == "--views by default, not 9"
     paper = make_plan(asked("--preset", "paper", "--views", "9"))
-    assert plan_difference(make_plan(asked("--views", "9")), paper) == "--steps 800, not 1500"
+    assert plan_difference(make_plan(asked("--views", "9")), paper) == "--lift-rule share, not paper"
     here = make_plan(replace(asked(), scene=Path.cwd() / "scene.ply"))
     assert plan_difference(plan, here) == "", "the same file"
 

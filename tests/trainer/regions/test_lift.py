@@ -93,10 +93,12 @@ def test_masks_over_everything_select_everything_and_over_nothing_nothing(
 
 def test_the_rules_are_the_printed_sums() -> None:
     sums = torch.tensor([[3.0, 6.0, 4.0, 10.0], [0.0, 0.0, 0.0, 0.0]])
-    evidence = Evidence(*sums.unbind(1), torch.ones(2), torch.ones(2), torch.ones(2))
+    evidence = Evidence(
+        *sums.unbind(1), torch.ones(2), torch.ones(2), torch.ones(2), opacities=torch.tensor([0.5, 0.9])
+    )
     assert score(evidence, "share").tolist() == pytest.approx([3 / 4, 0.0])
     assert score(evidence, "count").tolist() == pytest.approx([6 / 10, 0.0])
-    assert score(evidence, "paper").tolist() == pytest.approx([3 / 10, 0.0])
+    assert score(evidence, "paper").tolist() == pytest.approx([0.5 * 3 / 10, 0.0])
 
 
 def test_a_gaussian_is_a_member_from_the_threshold_on() -> None:
@@ -129,6 +131,10 @@ def test_the_papers_rule_selects_nothing_at_the_papers_threshold(
     region = lift_masks(demo.gaussians, cameras[:4], white, rule="paper")
     assert len(region) == 0
     assert len(lift_masks(demo.gaussians, cameras[:4], white, rule="count")) > 0
+    lower = lift_masks(demo.gaussians, cameras[:4], white, rule="paper", threshold=0.01)
+    by_rule = score(gather(demo.gaussians, cameras[:4], white), "paper")
+    assert torch.equal(lower.score, by_rule)
+    assert lower.members.tolist() == (by_rule >= 0.01).nonzero()[:, 0].tolist(), "and nothing else has a say"
 
 
 def test_gray_masks_count_in_part() -> None:
@@ -217,6 +223,7 @@ def test_the_undecided_are_the_hidden_and_the_half_hidden_of_mixed_share() -> No
         torch.ones(6),
         torch.ones(6),
         torch.tensor([0.01, 0.2, 0.9, 0.2, 0.01, 0.2]),
+        torch.ones(6),
         torch.ones(6),
         torch.ones(6),
     )

@@ -1,0 +1,141 @@
+"""`--preset paper`, line by line as docs/method.md, The paper to the letter, has it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import load_trajectory
+from progdf.formats.ply import load_ply
+from progdf.gaussians import ATTRIBUTES, pack
+from progdf.gdf.file import load_gdf
+from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
+from trainer.cli import train_options
+from trainer.fit.picture_loss import RenderedLoss
+from trainer.optimize.losses import GradientL1, l1
+from trainer.optimize.objective import LossWeights
+from trainer.optimize.settings import pgs_settings
+from trainer.pipeline.run import RunResult
+from trainer.plan import Plan, make_plan, plan_optimization
+from trainer.presets import apply_preset
+from trainer.views.crops import crop_scene, moving_attributes
+
+
+def plan(*more: str, region: str = "all") -> Plan:
+    words = ("scene.ply", "--out", "run", "--region", region, "--editor", "night", "--preset", "paper")
+    return make_plan(train_options([*words, *more]))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made
+
+
+@pytest.fixture(scope="module")
+def finishing() -> list[int]:
+    """How many steps networks are trained once all is recorded."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, finishing: list[int]) -> Iterator[RunResult]:
+    """A short run of the preset, with a small network."""
+    options = apply_preset(quick_options(folder, "paper", part="scarf"), "paper")
+    short = {"steps": 40, "views": 5, "image_size": 56, "size": "tiny"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trainer.fit.network.train_network", lambda *given: finishing.append(given[3]))
+        yield train(type(options)(**{**vars(options), **short}))
+
+
+def test_pgs_pays_what_is_printed_whatever_the_edit() -> None:
+    """λ = 1, 5, 1: L1 + LPIPS, α·β^(t/s)·Σ‖ΔΘ‖², −∇²R; one target, 1500 to 2000 steps."""
+    for kind in ("color", "style", "geometry"):
+        found = plan_optimization(plan().optimization, kind, 0)
+        assert found.weights == LossWeights(1.0, 1, "growth", 5.0, "paper", 1.0, "squares")
+        assert not found.solves_colors
+        assert found.stages == 1
+        assert 1500 <= found.steps <= 2000
+
+
+def test_pgs_is_the_plain_optimizer_of_3dgs_and_records_its_iterates_every_100_steps() -> None:
+    found = plan_optimization(plan().optimization, "color", 0)
+    settings = pgs_settings(found, found.sh != "off", 23, 1.0, 1)
+    assert bool((settings.rates[:14] > 0).all()), "all attributes are free"
+    assert not bool(settings.rates[14:].any()), "three color channels only"
+    assert (settings.damped, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
+    assert (settings.smoothing, settings.every) == (0.0, 100)
+
+
+def test_at_most_96_views_and_the_slider_is_time() -> None:
+    assert (plan().views.views, plan().slider) == (96, "time")
+
+
+def test_the_field_is_a_network_of_positions_and_hard_bins_trained_beside_pgs_on_pictures() -> None:
+    network = plan().field.network
+    assert (network.size, network.inputs, network.bins, network.code) == ("paper", "position", "hard", 0)
+    assert network.loss == "pictures"
+    assert plan().optimization.joint
+
+
+def test_masks_are_refused_before_any_work_as_the_printed_lifting_selects_nothing() -> None:
+    for region in ("masks:here", "photomasks:here", 'text:"the shirt"'):
+        with pytest.raises(ProgdfError, match=r"selects nothing at the printed \.8.*--lift-rule share"):
+            plan(region=region)
+    assert plan("--lift-rule", "share", region="masks:here").region.lift_rule == "share"
+    assert plan("--lift-threshold", ".01", region="masks:here").region.lift_rule == "paper"
+    assert plan(region="labels:l.npy:2").region.lift_rule == "paper", "which is not lifted"
+
+
+def test_the_loss_of_the_field_is_the_printed_sum() -> None:
+    """L_GDF = L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot, −∇²R of the former."""
+    case = small("body")
+    rows = pack(case.scene[case.region.members])
+    height, width = case.views[0].camera.height, case.views[0].camera.width
+    crops = [
+        crop_scene(case.scene, case.region.members, view.camera, (0, 0, width, height), WHITE)
+        for view in case.views[:2]
+    ]
+    found, recorded = 0.1 * torch.rand_like(rows), 0.1 * torch.rand_like(rows)
+    loss = RenderedLoss(crops, rows, ATTRIBUTES, GradientL1())
+    assert loss.views == 2
+    image, expected = (crops[1].render(rows + offsets)[0] for offsets in (found, recorded))
+    gray = image.mean(dim=2)
+    laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * gray[1:-1, 1:-1]
+    printed = l1(image, expected) + GradientL1()(image, expected) - laplacian.mean()
+    assert float(loss(found, recorded, 1)) == pytest.approx(float(printed), rel=1e-6)
+
+
+def test_losses_are_of_whole_pictures(folder: Path, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert plan().optimization.whole
+    assert not make_plan(quick_options(folder)).optimization.whole
+    assert run.report["objective"] == (
+        f"L1 + 1 {run.report['edit']['perceptual']} + 5 progressive (growth, squares) + 1 sharpness (paper)"
+    )
+
+
+def test_every_attribute_is_kept_and_nobody_follows(run: RunResult) -> None:
+    trajectory, _, _ = load_trajectory(run.folder.trajectory)
+    assert trajectory.end.shape[1] == 14
+    assert set(moving_attributes(trajectory.end)) == set(ATTRIBUTES) - {"shN"}
+    assert run.report["followed"] == 0
+
+
+def test_snapshots_lie_where_they_were_taken_and_the_last_one_is_the_end(run: RunResult) -> None:
+    trajectory, _, _ = load_trajectory(run.folder.trajectory)
+    assert trajectory.steps.tolist() == [0, 10, 20, 30, 40], "a short run has four"
+    assert torch.allclose(trajectory.s, torch.linspace(0, 1, 5))
+
+
+def test_nothing_is_trained_once_all_is_recorded(folder: Path, run: RunResult, finishing: list[int]) -> None:
+    assert finishing == [0]
+    origin = load_gdf(run.gdf, load_ply(folder / "scene.ply")).field.origin
+    assert origin is not None
+    shape = origin.network.shape
+    assert (shape.hard, shape.inputs, shape.code) == (True, "position", 0)
+    assert bool(origin.network.tensors["heads.weight"].any()), "but beside PGS"
