@@ -53,8 +53,8 @@ def check_options(options: TrainOptions) -> None:
     lifts = options.lift_rule == "paper" and re.search(r"(masks|text):", options.region)
     if lifts and (options.lift_threshold is None or options.lift_threshold >= 0.8):
         raise ProgdfError(
-            "--lift-rule paper selects nothing at the printed .8, as a splat's mean weight in its pixels is a "
-            "fifth at most; give --lift-rule share, or --lift-threshold .01"
+            "--lift-rule paper selects nothing at the printed .8: the mean weight of a splat in its pixels "
+            "is a fifth at most; give --lift-rule share, or --lift-threshold .01"
         )
     _check_editor_options(options)
     check_network_options(options, PRESETS[options.preset])
