@@ -6,7 +6,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
+import msgspec
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -26,13 +28,16 @@ KINDS = {
 """Attribute name -> the gain that scales its change."""
 
 
+_Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
 @dataclass(frozen=True)
 class Gains:
     """How much of each kind of change a layer lets through; 1 is the edit as trained, 0 none."""
 
-    geometry: float = 1.0
-    opacity: float = 1.0
-    color: float = 1.0
+    geometry: _Share = 1.0
+    opacity: _Share = 1.0
+    color: _Share = 1.0
 
 
 @dataclass(frozen=True)

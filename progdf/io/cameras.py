@@ -12,8 +12,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import torch
 from torch import Tensor
 
@@ -23,14 +24,13 @@ from progdf.lens import Lens
 
 from .atomic import atomic_write, check_regular, open_error
 from .colmap import find_model, load_model
-from .json_values import angle_at, decode_json, matrix_at, number_at, pixels_at, table_at
+from .json_values import convert_json, decode_json
 
+_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 _FORMAT = "progdf cameras 1"
 _NOT_A_ROTATION = 1e-2
-_LENS = ("k1", "k2", "p1", "p2", "k3")
-_STRANGE_LENS = ("k4", "k5", "k6")  # a polynomial to some programs, a quotient to others: not guessed
 _PINHOLES = (
     "",
     "PINHOLE",
@@ -46,6 +46,56 @@ _PINHOLES = (
 _FILES = ("cameras.json", "transforms.json")
 _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+
+
+_Number = Annotated[float, msgspec.Meta(gt=-3e38, lt=3e38)]  # finite in float32
+_Pixels = Annotated[float, msgspec.Meta(ge=1, le=1_000_000, multiple_of=1)]
+_Angle = Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]
+_Row3 = tuple[_Number, _Number, _Number]
+_Row4 = tuple[_Number, _Number, _Number, _Number]
+_Matrix3 = tuple[_Row3, _Row3, _Row3]
+
+
+class _Own(msgspec.Struct):
+    """A camera that `save_cameras` wrote."""
+
+    viewmat: tuple[_Row4, _Row4, _Row4, _Row4]
+    K: _Matrix3
+    width: _Pixels
+    height: _Pixels
+    name: Any = ""
+    lens: Lens = Lens()
+
+
+class _Inria(msgspec.Struct):
+    """A camera of Inria's cameras.json."""
+
+    rotation: _Matrix3
+    position: _Row3
+    fx: _Number
+    fy: _Number
+    width: _Pixels
+    height: _Pixels
+    img_name: Any = ""
+
+
+class _Frame(msgspec.Struct):
+    """A frame of nerfstudio's transforms.json, with what it has of the file."""
+
+    transform_matrix: Annotated[list[_Row4], msgspec.Meta(min_length=3, max_length=4)]
+    w: _Pixels | None = None
+    h: _Pixels | None = None
+    fl_x: _Number | None = None
+    fl_y: _Number | None = None
+    cx: _Number | None = None
+    cy: _Number | None = None
+    camera_angle_x: _Angle | None = None
+    camera_angle_y: _Angle | None = None
+    k4: _Number = 0.0  # k4, k5 and k6: a polynomial to some programs, a quotient to others, so not guessed
+    k5: _Number = 0.0
+    k6: _Number = 0.0
+    camera_model: Any = ""
+    file_path: Any = ""
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
@@ -170,85 +220,72 @@ def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> Non
         )
 
 
+def _read(where: str, entry: object, kind: type[_T]) -> _T:
+    try:
+        return convert_json(entry, kind)
+    except ValueError as error:
+        raise ProgdfError(f"{where} cannot be used: {error}; export the cameras again") from None
+
+
 def _own(file: str, index: int, entry: object) -> Camera:
     where = f"camera {index} of {file}"
-    table = table_at(where, entry)
-    return _camera(
-        where,
-        _rigid(where, matrix_at(where, table, "viewmat", (4,), 4)),
-        matrix_at(where, table, "K", (3,), 3),
-        pixels_at(where, table, "width"),
-        pixels_at(where, table, "height"),
-        str(table.get("name", "")),
-        _lens(where, table_at(where, table.get("lens", {}))),
-    )
+    found = _read(where, entry, _Own)
+    viewmat = _rigid(where, torch.tensor(found.viewmat, dtype=torch.float64))
+    K = torch.tensor(found.K, dtype=torch.float64)
+    return _camera(where, viewmat, K, found.width, found.height, found.name, found.lens or None)
 
 
 def _inria(file: str, index: int, entry: object) -> Camera:
     """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the center."""
     where = f"camera {index} of {file}"
-    table = table_at(where, entry)
+    found = _read(where, entry, _Inria)
     c2w = torch.eye(4, dtype=torch.float64)
-    c2w[:3, :3] = matrix_at(where, table, "rotation", (3,), 3)
-    position = table.get("position")
-    c2w[:3, 3] = matrix_at(where, {"position": [position]}, "position", (1,), 3)[0]
-    width, height = pixels_at(where, table, "width"), pixels_at(where, table, "height")
-    K = _intrinsics(number_at(where, table, "fx"), number_at(where, table, "fy"), 0.5 * width, 0.5 * height)
-    return _camera(where, _world_to_camera(where, c2w), K, width, height, str(table.get("img_name", "")))
+    c2w[:3, :3] = torch.tensor(found.rotation, dtype=torch.float64)
+    c2w[:3, 3] = torch.tensor(found.position, dtype=torch.float64)
+    width, height = found.width, found.height
+    K = _intrinsics(found.fx, found.fy, 0.5 * width, 0.5 * height)
+    return _camera(where, _world_to_camera(where, c2w), K, width, height, found.img_name)
 
 
-def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], frame: object, path: Path) -> Camera:
+def _nerfstudio(file: str, index: int, shared: Mapping[str, Any], entry: object, path: Path) -> Camera:
     """Intrinsics of the frame go before those of the file; axes are OpenGL's (y up, z backwards)."""
     where = f"frame {index} of {file}"
-    table = {**shared, **table_at(where, frame)}
-    model = str(table.get("camera_model", "")).upper()
+    table = {**shared, **entry} if isinstance(entry, dict) else entry
+    frame, lens = _read(where, table, _Frame), _read(where, table, Lens)
+    model = str(frame.camera_model).upper()
     if model not in _PINHOLES:
         raise ProgdfError(
             f"{where} has the camera model {model}; only pinhole cameras can be used: undistort first"
         )
-    width, height = _image_size(where, table, path)
-    if "fl_x" in table or "fl_y" in table:
-        focal_x = number_at(where, table, "fl_x" if "fl_x" in table else "fl_y")
-        focal_y = number_at(where, table, "fl_y" if "fl_y" in table else "fl_x")
-    else:
-        angles = [
-            0.5 * side / math.tan(0.5 * angle_at(where, table, key))
-            for key, side in (("camera_angle_x", width), ("camera_angle_y", height))
-            if key in table
-        ]
-        if not angles:
-            raise ProgdfError(f"{where} has no focal length; expected fl_x, fl_y or camera_angle_x")
-        focal_x, focal_y = angles[0], angles[-1]
-    cx = number_at(where, table, "cx") if "cx" in table else 0.5 * width
-    cy = number_at(where, table, "cy") if "cy" in table else 0.5 * height
-    c2w = matrix_at(where, table, "transform_matrix", (3, 4), 4)
-    c2w = torch.cat([c2w[:3], torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)])
-    c2w[:, 1:3] *= -1  # OpenGL -> OpenCV
-    K = _intrinsics(focal_x, focal_y, cx, cy)
-    viewmat, name = _world_to_camera(where, c2w), str(table.get("file_path", ""))
-    return _camera(where, viewmat, K, width, height, name, _lens(where, table))
-
-
-def _lens(where: str, table: Mapping[str, Any]) -> Lens | None:
-    """The lens, if it bends anything."""
-    strange = [key for key in _STRANGE_LENS if key in table and number_at(where, table, key) != 0]
-    if strange:
+    if frame.k4 or frame.k5 or frame.k6:
         raise ProgdfError(
-            f"{where} has lens distortion with {', '.join(strange)}, which programs read in different ways; "
+            f"{where} has lens distortion with k4, k5 or k6, which programs read in different ways; "
             "undistort the images and give the new file"
         )
-    lens = Lens(**{key: number_at(where, table, key) for key in _LENS if key in table})
-    return lens or None
+    width, height = _image_size(where, frame, path)
+    focal = [length for length in (frame.fl_x, frame.fl_y) if length is not None] or [
+        0.5 * side / math.tan(0.5 * angle)
+        for angle, side in ((frame.camera_angle_x, width), (frame.camera_angle_y, height))
+        if angle is not None
+    ]
+    if not focal:
+        raise ProgdfError(f"{where} has no focal length; expected fl_x, fl_y or camera_angle_x")
+    cx = 0.5 * width if frame.cx is None else frame.cx
+    cy = 0.5 * height if frame.cy is None else frame.cy
+    c2w = torch.tensor([*frame.transform_matrix[:3], (0.0, 0.0, 0.0, 1.0)], dtype=torch.float64)
+    c2w[:, 1:3] *= -1  # OpenGL -> OpenCV
+    K = _intrinsics(focal[0], focal[-1], cx, cy)
+    return _camera(where, _world_to_camera(where, c2w), K, width, height, frame.file_path, lens or None)
 
 
-def _image_size(where: str, table: Mapping[str, Any], path: Path) -> tuple[int, int]:
+def _image_size(where: str, frame: _Frame, path: Path) -> tuple[float, float]:
     """From the file, else from the picture it names (synthetic NeRF scenes have no w and h)."""
-    if "w" in table and "h" in table:
-        return pixels_at(where, table, "w"), pixels_at(where, table, "h")
+    if frame.w is not None and frame.h is not None:
+        return frame.w, frame.h
     from .images import picture_size  # Pillow, which files with sizes do without
 
     for suffix in _IMAGE_SUFFIXES:
-        picture = path.parent / (str(table.get("file_path", "")) + suffix)
+        picture = path.parent / (str(frame.file_path) + suffix)
         if os.path.isfile(picture):  # pathlib's raises where a name is too long
             try:
                 return picture_size(picture)
@@ -277,10 +314,16 @@ def _rigid(where: str, matrix: Tensor) -> Tensor:
 
 
 def _camera(
-    where: str, viewmat: Tensor, K: Tensor, width: int, height: int, name: str, lens: Lens | None = None
+    where: str,
+    viewmat: Tensor,
+    K: Tensor,
+    width: float,
+    height: float,
+    name: object,
+    lens: Lens | None = None,
 ) -> Camera:
     try:
-        return Camera(viewmat.float(), K.float(), width, height, name, lens)
+        return Camera(viewmat.float(), K.float(), int(width), int(height), str(name), lens)
     except ValueError as error:
         raise ProgdfError(f"{where} is broken: {error}") from None
 

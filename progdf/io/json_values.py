@@ -1,21 +1,15 @@
-"""JSON from files, checked: an error is reported with its place, its name and what it is.
-
-`where` is how a message begins: "camera 3 of cameras.json".
-"""
+"""JSON from files, checked by the types and ranges that dataclasses and Structs declare."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-import torch
-from torch import Tensor
-
-from progdf.errors import ProgdfError
 
 DEEPEST = 64
 """Lists and tables in one another that a file may have: what walks through them never runs out of stack."""
@@ -45,16 +39,29 @@ def decode_json(content: bytes | str) -> Any:
     return value
 
 
-def convert_json(value: object, kind: type[_T]) -> _T:
-    """A JSON value as a dataclass, a `msgspec.Struct`, or what else declares its types.
+def convert_json(value: object, kind: type[_T], closed: bool = False) -> _T:
+    """A JSON value as a dataclass, a `msgspec.Struct`, or what else declares its types and ranges.
+
+    Args:
+        value: JSON values
+        kind: what it is to be
+        closed: refuse keys that `kind` does not have
 
     Raises:
-        ValueError: it is of another type; the message says where.
+        ValueError: it is something else; the message says where, what was found and what was expected.
     """
     try:
-        return msgspec.convert(value, kind, dec_hook=_path)
+        found = msgspec.convert(value, kind, dec_hook=_path)
     except msgspec.ValidationError as error:
-        raise ValueError(str(error)) from None
+        raise ValueError(_explain(str(error), value)) from None
+    if closed:
+        _refuse_unknown(value, plain(found), "")
+    return found
+
+
+def one_of(names: Sequence[str]) -> msgspec.Meta:
+    """What the type of a text declares that is one of a few names."""
+    return msgspec.Meta(pattern=rf"^({'|'.join(names)})\Z")
 
 
 def plain(value: object) -> Any:
@@ -96,56 +103,23 @@ def _check(value: object, depth: int) -> None:
             _check(entry, depth + 1)
 
 
-def table_at(where: str, entry: object) -> Mapping[str, Any]:
-    """The entry, which must be a JSON object."""
-    if not isinstance(entry, dict):
-        raise ProgdfError(f"{where} is not a JSON object; export the cameras again")
-    return entry
+def _explain(text: str, value: Any) -> str:
+    """An error of msgspec's that begins with the place's name and what is there."""
+    text, _, place = text.replace("`", "").partition(" - at $")
+    for name, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", place.partition("[...")[0]):
+        value = value[name or int(index)]
+    text = re.sub(r"str matching regex '\^(\(.*\)).*'", r"one of \1", text[0].lower() + text[1:])
+    text = text.replace("float that's a multiple of 1.0", "a whole number")
+    at = place.removeprefix(".") or "it"
+    return f"{at} is {value!r:.40}, {text}" if text.startswith("expected") else f"{at}: {text}"
 
 
-def number_at(where: str, table: Mapping[str, Any], key: str) -> float:
-    """A number that is finite in float32."""
-    value = table.get(key)
-    if not _is_number(value):
-        raise ProgdfError(f"{where} has {key} = {_short_text(value)}; expected a number")
-    return float(table[key])
-
-
-def angle_at(where: str, table: Mapping[str, Any], key: str) -> float:
-    """A field of view in radians, between 0 and pi."""
-    angle = number_at(where, table, key)
-    if not 0 < angle < math.pi:
-        raise ProgdfError(f"{where} has {key} = {angle:g}; expected an angle between 0 and pi")
-    return angle
-
-
-def pixels_at(where: str, table: Mapping[str, Any], key: str) -> int:
-    """A whole number of pixels, from 1 to a million."""
-    number = number_at(where, table, key)
-    if number != round(number) or not 1 <= number <= 1_000_000:
-        raise ProgdfError(f"{where} has {key} = {number:g}; expected a whole number of pixels")
-    return int(number)
-
-
-def matrix_at(where: str, table: Mapping[str, Any], key: str, rows: tuple[int, ...], columns: int) -> Tensor:
-    """Rows of numbers, as many as one of `rows`, each of so many columns. [R,C] float64"""
-    value = table.get(key)
-    good = (
-        isinstance(value, list)
-        and len(value) in rows
-        and all(isinstance(row, list) and len(row) == columns for row in value)
-        and all(_is_number(x) for row in value for x in row)
-    )
-    if not good:
-        shape = " or ".join(f"{count}x{columns}" for count in rows)
-        raise ProgdfError(f"{where} has no usable {key}; {shape} finite numbers expected")
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def _is_number(value: object) -> bool:
-    """Finite, and within what float32 can hold (JSON has integers of any length)."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 3e38
-
-
-def _short_text(value: object) -> str:
-    return "nothing" if value is None else repr(value)[:40]
+def _refuse_unknown(value: Any, known: Any, at: str) -> None:
+    if isinstance(value, dict):
+        for key, part in value.items():
+            if key not in known:
+                raise ValueError(f"{at}{key} is unknown")
+            _refuse_unknown(part, known[key], f"{at}{key}.")
+    elif isinstance(value, list):
+        for i, (part, own) in enumerate(zip(value, known, strict=True)):
+            _refuse_unknown(part, own, f"{at[:-1]}[{i}].")

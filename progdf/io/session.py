@@ -19,8 +19,6 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -30,7 +28,7 @@ import msgspec
 from progdf.errors import ProgdfError
 
 from .atomic import atomic_write, check_regular, open_error
-from .json_values import convert_json, decode_json
+from .json_values import convert_json, decode_json, plain
 
 VERSION = 1
 MARK = "progdf_session"
@@ -59,8 +57,7 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Path(os.path.normpath(folder / self.file))
 
 
-@dataclass(frozen=True)
-class SessionFile:
+class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a session file holds, its state as plain JSON values.
 
     Args:
@@ -72,17 +69,8 @@ class SessionFile:
 
     scene: FileRef
     edits: tuple[FileRef, ...] = ()
-    view: Mapping[str, Any] = field(default_factory=dict)
-    snapshots: Sequence[Mapping[str, Any]] = ()
-
-
-class _Table(msgspec.Struct, forbid_unknown_fields=True):
-    """The file without its version."""
-
-    scene: FileRef
-    edits: list[FileRef] = []
     view: dict[str, Any] = {}
-    snapshots: list[dict[str, Any]] = []
+    snapshots: tuple[dict[str, Any], ...] = ()
 
 
 def reference(path: Path, folder: Path) -> FileRef:
@@ -109,14 +97,7 @@ def write_session(path: Path, session: SessionFile) -> None:
     Raises:
         ProgdfError: the folder does not exist.
     """
-    table = {
-        MARK: VERSION,
-        "scene": msgspec.structs.asdict(session.scene),
-        "edits": [msgspec.structs.asdict(edit) for edit in session.edits],
-        "view": session.view,
-        "snapshots": list(session.snapshots),
-    }
-    text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps({MARK: VERSION} | plain(session), indent=2, ensure_ascii=False, allow_nan=False)
     # short lists of numbers on one line; a text holds no line break of its own, so none is hit
     text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
     with atomic_write(path) as temporary_file:
@@ -147,17 +128,14 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
     if not isinstance(table, dict) or MARK not in table:
         raise ProgdfError(f"{name} is not a session; give a file that progdf view saved with Ctrl+S")
     version = table.pop(MARK)
-    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise ProgdfError(f"{name} is a damaged session: its version is {version!r}; save it again")
-    if version > VERSION:
+    if version != VERSION:
         raise ProgdfError(
-            f"{name} is a session of version {version}; this progdf reads up to {VERSION}, update it"
+            f"{name} is a session of version {version!r:.40}; this progdf reads {VERSION}, update it"
         )
     try:
-        found = convert_json(table, _Table)
+        return convert_json(table, SessionFile)
     except ValueError as error:
         raise ProgdfError(f"{name} is a damaged session ({error}); save it again or update progdf") from None
-    return SessionFile(found.scene, tuple(found.edits), found.view, tuple(found.snapshots))
 
 
 def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:

@@ -9,17 +9,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 import torch
+from msgspec import Meta
 
 from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians
+from progdf.io.json_values import one_of
 from progdf.scene.bounds import scene_sphere
 from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
 
 from .up_axis import Vec3, up_of
+
+FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
+
+_Number = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
 
 
 @dataclass(frozen=True)
@@ -36,16 +42,14 @@ class ViewCamera:
         mode: "orbit" or "fly"
     """
 
-    pivot: Vec3 = (0.0, 0.0, 0.0)
-    distance: float = 5.0
-    azimuth: float = 0.0
-    elevation: float = 15.0
-    fov_y: float = 45.0
-    up: Vec3 = (0.0, 1.0, 0.0)
-    mode: str = "orbit"
+    pivot: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)
+    distance: Annotated[float, Meta(gt=0.0, le=FARTHEST)] = 5.0
+    azimuth: _Number = 0.0
+    elevation: Annotated[float, Meta(ge=-90.0, le=90.0)] = 15.0
+    fov_y: Annotated[float, Meta(ge=1.0, le=179.0)] = 45.0
+    up: tuple[_Number, _Number, _Number] = (0.0, 1.0, 0.0)
+    mode: Annotated[str, one_of(("orbit", "fly"))] = "orbit"
 
-
-FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
 
 FILL = 0.72
 """Share of the picture's tighter side that what one looks at takes at first."""

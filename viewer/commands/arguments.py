@@ -16,8 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import FARTHEST, ViewCamera
-from viewer.state.comparison import MOST_AMPLIFIED
-from viewer.state.view_state import Comparison, LayerState
+from viewer.state.view_state import MOST_AMPLIFIED, Comparison, LayerState
 
 LARGEST_SIDE = 16_384
 _BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means

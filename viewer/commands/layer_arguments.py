@@ -15,7 +15,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.npy import open_npy
 from viewer.state import layers as stack
 from viewer.state.paint import encode
-from viewer.state.view_state import LayerState
+from viewer.state.view_state import OVERSHOOT, LayerState
 
 from .arguments import known_edit, layers_of
 
@@ -36,14 +36,14 @@ def stack_of(
         settings: `NAME=S`, the strengths
         gains: `NAME:KIND=G`, with geometry, opacity or color for KIND
         solo: names of the edits that alone are shown
-        overshoot: whether strengths go to `stack.OVERSHOOT`
+        overshoot: whether strengths go to `OVERSHOOT`
         paint: `NAME=WEIGHTS.npy`, a weight 0..1 per member, or per Gaussian of the scene
         unset: the strength of the edits where there are no settings
 
     Raises:
         ProgdfError: there is no such edit or kind, or a number is outside its range.
     """
-    most = stack.OVERSHOOT if overshoot else 1.0
+    most = OVERSHOOT if overshoot else 1.0
     layers = {layer.name: layer for layer in layers_of(gdfs, settings, most, unset)}
     for text in gains:
         name, kind, gain = _gain(text, gdfs)

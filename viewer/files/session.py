@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from progdf.compose.layers import BLENDS
+import msgspec
+
 from progdf.errors import ProgdfError
+from progdf.io.json_values import convert_json, plain
 from progdf.io.session import SUFFIX, SessionFile, read_session, reference, verify_files, write_session
-from viewer.camera.view_camera import FARTHEST, ViewCamera
 from viewer.state import paint
-from viewer.state.comparison import AGAINST, MODES, MOST_AMPLIFIED
-from viewer.state.history import Edit
-from viewer.state.layers import OVERSHOOT
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import RESOLUTION_MODES, LayerState, ViewState
+from viewer.state.view_state import LayerState, ViewState
 
 from . import document, timeline_file
 from .document import Document
-from .json_form import JsonFormError, from_json, to_json
 
 
 @dataclass(frozen=True)
@@ -31,6 +25,13 @@ class WindowSession:
     document: Document
     view: ViewState
     snapshots: tuple[SliderSnapshot, ...] = ()
+
+
+class _State(msgspec.Struct):
+    """What the file holds of the window."""
+
+    view: ViewState
+    snapshots: tuple[SliderSnapshot, ...]
 
 
 def save(path: Path, session: WindowSession) -> None:
@@ -48,8 +49,8 @@ def save(path: Path, session: WindowSession) -> None:
     state = SessionFile(
         reference(scene, folder),
         tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
-        to_json(session.view),
-        tuple(to_json(snapshot) for snapshot in session.snapshots),
+        plain(session.view),
+        tuple(plain(snapshot) for snapshot in session.snapshots),
     )
     write_session(path, state)
 
@@ -114,58 +115,14 @@ def prune(session: WindowSession) -> WindowSession:
 def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
     """The state of a session, every value of it one that the window could have made."""
     try:
-        view = from_json(ViewState, file.view, "view")
-        snapshots = tuple(
-            from_json(SliderSnapshot, entry, f"snapshots[{i}]") for i, entry in enumerate(file.snapshots)
-        )
-        count = len(file.edits)
-        _check_camera("view.camera", view.camera)
-        _check_edit("view", Edit(view.layers, view.blend), count)
-        timeline_file.check(view.timeline, "view.timeline.keys")
-        _check("view.background", view.background, 0.0, 1.0)
-        _check("view.compare.divider", [view.compare.divider], 0.0, 1.0)
-        _check("view.compare.amplify", [view.compare.amplify], 1.0, MOST_AMPLIFIED)
-        _check_known("view.compare.mode", view.compare.mode, MODES)
-        _check_known("view.compare.against", view.compare.against, AGAINST)
-        _check_known("view.dynamic_resolution", view.dynamic_resolution, RESOLUTION_MODES)
-        _check_known("view.brush.mode", view.brush.mode, paint.MODES)
-        _check("view.brush.radius", [view.brush.radius], paint.SMALLEST_PX, paint.LARGEST_PX)
-        _check("view.brush.softness", [view.brush.softness], 0.0, 1.0)
-        timeline_file.check(view.timeline, "view.timeline.keys")
-        for i, snapshot in enumerate(snapshots):
-            _check_camera(f"snapshots[{i}].camera", snapshot.camera)
-            _check_edit(f"snapshots[{i}].edit", snapshot.edit, count)
-    except JsonFormError as error:
+        found = convert_json({"view": file.view, "snapshots": list(file.snapshots)}, _State, closed=True)
+        timeline_file.check(found.view.timeline, "view.timeline.keys")
+        stacks = {"view": found.view.layers}
+        stacks |= {f"snapshots[{i}].edit": kept.edit.layers for i, kept in enumerate(found.snapshots)}
+        for where, layers in stacks.items():
+            for i, layer in enumerate(layers):
+                if not 0 <= layer.gdf < len(file.edits):
+                    raise ValueError(f"{where}.layers[{i}].gdf is {layer.gdf} of {len(file.edits)} edits")
+    except ValueError as error:
         raise ProgdfError(f"{name} cannot be opened: {error}; save it again, or update progdf") from None
-    return view, snapshots
-
-
-def _check_edit(where: str, edit: Edit, count: int) -> None:
-    _check_known(f"{where}.blend", edit.blend, BLENDS)
-    for i, layer in enumerate(edit.layers):
-        at = f"{where}.layers[{i}]"
-        if not 0 <= layer.gdf < count:
-            raise JsonFormError(f"{at}.gdf is {layer.gdf} of {count} edits")
-        _check(f"{at}.strength", [layer.strength], 0.0, OVERSHOOT)
-        gains = layer.gains
-        _check(f"{at}.gains", [gains.geometry, gains.opacity, gains.color], 0.0, 1.0)
-
-
-def _check_camera(where: str, camera: ViewCamera) -> None:
-    _check(where, [*camera.pivot, camera.azimuth], -FARTHEST, FARTHEST)
-    _check(f"{where}.distance", [camera.distance], math.ulp(0.0), FARTHEST)
-    _check(f"{where}.elevation", [camera.elevation], -90.0, 90.0)
-    _check(f"{where}.fov_y", [camera.fov_y], 1.0, 179.0)
-    _check(f"{where}.up", camera.up, -FARTHEST, FARTHEST)
-    _check_known(f"{where}.mode", camera.mode, ("orbit", "fly"))
-
-
-def _check(where: str, values: Sequence[float], least: float, most: float) -> None:
-    for value in values:
-        if not least <= value <= most:
-            raise JsonFormError(f"{where} is {value:g}, outside {least:g} to {most:g}")
-
-
-def _check_known(where: str, value: Any, known: Sequence[str]) -> None:
-    if value not in known:
-        raise JsonFormError(f"{where} is '{value}', not one of {', '.join(known)}")
+    return found.view, found.snapshots

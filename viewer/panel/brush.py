@@ -9,8 +9,7 @@ from imgui_bundle import imgui
 
 from viewer.render import highlight
 from viewer.state import layers as stack
-from viewer.state import paint
-from viewer.state.view_state import Brush, ViewState
+from viewer.state.view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush, ViewState
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import choice, icon_button, label, tip, value_slider
 from viewer.ui.widgets import section as heading
@@ -45,14 +44,12 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     heading("Paint", ui)
     label("Brush", column)
-    mode = choice("brush mode", tuple(NAMES[m] for m in paint.MODES), paint.MODES.index(brush.mode), ui)
+    mode = choice("brush mode", tuple(NAMES[m] for m in BRUSH_MODES), BRUSH_MODES.index(brush.mode), ui)
     tip("Brush mode (X). While painting, Ctrl inverts and Shift smooths")
     if mode is not None:
-        brush = replace(brush, mode=paint.MODES[mode])
+        brush = replace(brush, mode=BRUSH_MODES[mode])
     label("Radius", column)
-    radius = value_slider(
-        "##radius", brush.radius, (paint.SMALLEST_PX, paint.LARGEST_PX), "%.0f px", Brush.radius, ui
-    )
+    radius = value_slider("##radius", brush.radius, (SMALLEST_PX, LARGEST_PX), "%.0f px", Brush.radius, ui)
     tip("Brush radius ([ and ])")
     label("Softness", column)
     softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", Brush.softness, ui)

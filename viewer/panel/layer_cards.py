@@ -13,7 +13,7 @@ from imgui_bundle import imgui
 from progdf.compose.reference import BLENDS
 from viewer.panel.layer_card import Cards, draw_card
 from viewer.state import layers as stack
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import OVERSHOOT, ViewState
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.widgets import (
     right_edge,
@@ -75,11 +75,11 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
     ):
         imgui.push_style_color(slot, imgui.ImVec4(*color))
     imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y))
-    if imgui.button(f"{stack.OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
+    if imgui.button(f"{OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
         state = stack.with_overshoot(state, not on)
     imgui.pop_style_var()
     imgui.pop_style_color(2)
-    tip(f"Overshoot to {stack.OVERSHOOT:g} (O): extrapolates past the trained range")
+    tip(f"Overshoot to {OVERSHOOT:g} (O): extrapolates past the trained range")
     return state
 
 

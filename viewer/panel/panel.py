@@ -10,9 +10,8 @@ from imgui_bundle import imgui
 from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import ViewCamera
-from viewer.state import comparison as compare
 from viewer.state.layer_facts import LayerRow
-from viewer.state.view_state import Comparison, ViewState
+from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.widgets import (
     choice,
@@ -205,24 +204,24 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
 def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext) -> Comparison:
     """Off, beside each other or subtracted; with the original, or with what was recorded."""
     label("Compare", column)
-    chosen = choice("compare", ("Off", "Split", "Diff"), compare.MODES.index(shown.mode), ui)
+    chosen = choice("compare", ("Off", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
     tip("Split view (Y) or amplified difference (Shift+Y)")
     if chosen is not None:
-        shown = replace(shown, mode=compare.MODES[chosen])
+        shown = replace(shown, mode=COMPARE_MODES[chosen])
     if shown.mode == "off":
         return shown
     label("Against", column)
-    against = 0 if unrecorded else compare.AGAINST.index(shown.against)
+    against = 0 if unrecorded else AGAINST.index(shown.against)
     chosen = choice("against", ("Original", "Recorded"), against, ui, usable=1 if unrecorded else 2)
     told = f"\nNo recording: {unrecorded}" if unrecorded else ""
     tip(f"Compare with the original, or with the snapshots recorded in training (Alt+Y){told}")
     if chosen is not None:
-        shown = replace(shown, against=compare.AGAINST[chosen])
+        shown = replace(shown, against=AGAINST[chosen])
     if shown.mode == "difference":
         label("Amplify", column)
         imgui.set_next_item_width(-1.0)
         changed, times = imgui.slider_float(
-            "##amplify", shown.amplify, 1.0, compare.MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
+            "##amplify", shown.amplify, 1.0, MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
         )
         if is_double_clicked():
             changed, times = True, Comparison.amplify

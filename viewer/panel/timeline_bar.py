@@ -12,7 +12,7 @@ from imgui_bundle import imgui
 
 from viewer.state import timeline as tl
 from viewer.state.playback import Player
-from viewer.state.view_state import Timeline
+from viewer.state.view_state import FASTEST, LONGEST, Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import icon_button, is_released, tip
@@ -111,8 +111,8 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     tip("Ping-pong (Alt+K): " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     for name, now, most, unit, what in (
-        ("length", timeline.length, tl.LONGEST, "f", "Length in frames"),
-        ("fps", timeline.fps, tl.FASTEST, "fps", "Frames per second"),
+        ("length", timeline.length, LONGEST, "f", "Length in frames"),
+        ("fps", timeline.fps, FASTEST, "fps", "Frames per second"),
     ):
         imgui.set_next_item_width(58.0 * ui.scale)
         changed, value = imgui.drag_int(

@@ -16,7 +16,7 @@ from progdf.metrics.slider import visible_change
 from progdf.rasterize import render
 from viewer.camera.view_camera import ViewCamera, bounds_of, frame, to_camera
 
-from .layers import OVERSHOOT
+from .view_state import OVERSHOOT
 
 STEPS = 20
 """Of the slider from 0 to 1; the curve goes on to `OVERSHOOT` in steps of the same length."""

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from .view_state import ViewState
-
-MODES = ("off", "split", "difference")
-
-
-AGAINST = ("original", "recorded")
-
-
-MOST_AMPLIFIED = 64.0
+from .view_state import AGAINST, ViewState
 
 
 def toggle_mode(view: ViewState, mode: str) -> ViewState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from .view_state import LayerState, Timeline, ViewState
+from .view_state import Blend, LayerState, Timeline, ViewState
 
 LONGEST = 1000  # entries; each is a few hundred bytes
 
@@ -15,7 +15,7 @@ class Edit:
     """The part of the state that undo brings back."""
 
     layers: tuple[LayerState, ...]
-    blend: str
+    blend: Blend
     overshoot: bool = False
     timeline: Timeline = Timeline()
 

@@ -8,10 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from .view_state import LayerState, ViewState
-
-OVERSHOOT = 1.2
-"""How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
+from .view_state import OVERSHOOT, LayerState, ViewState
 
 SLIDERS = ("strength", "geometry", "opacity", "color")
 """What the arrow keys move: the strength, or a gain."""

@@ -24,10 +24,8 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 
-from .view_state import Brush
+from .view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush
 
-MODES = ("add", "erase", "smooth")
-SMALLEST_PX, LARGEST_PX = 4.0, 400.0
 FULL = ""
 """The paint of a layer that was never painted: weight 1 everywhere."""
 
@@ -46,7 +44,7 @@ class Stroke:
         places: where each member is in the picture, pixels, and f·log(depth), so that neighbors are as far
             apart as they look; NaN where the brush cannot reach it. [M,3]
         reached: largest touch of the brush so far, 0..1. [M]
-        mode: of `MODES`
+        mode: of `BRUSH_MODES`
         last: where the brush was last, pixels
     """
 
@@ -59,7 +57,7 @@ class Stroke:
 
 def next_mode(mode: str) -> str:
     """The mode after this one."""
-    return MODES[(MODES.index(mode) + 1) % len(MODES)]
+    return BRUSH_MODES[(BRUSH_MODES.index(mode) + 1) % len(BRUSH_MODES)]
 
 
 def mode_while(mode: str, modifier: str) -> str:
@@ -126,7 +124,7 @@ def begin_stroke(
         scene: as it is on screen
         camera: of the picture
         through: also what lies behind the front surface
-        mode: of `MODES`
+        mode: of `BRUSH_MODES`
     """
     weights, count = decode(paint, len(gdf.region)), len(gdf.region)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()

@@ -12,10 +12,9 @@ from dataclasses import replace
 from viewer.camera import tween
 from viewer.camera.view_camera import ViewCamera
 
-from .view_state import Keyframe, Timeline, ViewState
+from .view_state import FASTEST, LONGEST, Keyframe, Timeline, ViewState
 
 EASINGS = tween.EASINGS
-LONGEST, FASTEST = 9999, 120  # frames, frames per second
 
 
 def key_at(timeline: Timeline, frame: int) -> Keyframe | None:

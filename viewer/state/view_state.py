@@ -3,10 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
-from progdf.compose.reference import Gains
-from viewer.camera.up_axis import Vec3
+from msgspec import Meta
+
+from progdf.compose.layers import BLENDS, Gains
+from progdf.io.json_values import one_of
+from viewer.camera.tween import EASINGS
 from viewer.camera.view_camera import ViewCamera
+
+OVERSHOOT = 1.2
+"""How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
+BRUSH_MODES = ("add", "erase", "smooth")
+SMALLEST_PX, LARGEST_PX = 4.0, 400.0
+COMPARE_MODES = ("off", "split", "difference")
+AGAINST = ("original", "recorded")
+MOST_AMPLIFIED = 64.0
+LONGEST, FASTEST = 9999, 120  # frames, frames per second
+RESOLUTION_MODES = ("auto", "on", "off")
+"""`ViewState.dynamic_resolution`: where it pays, always, never."""
+
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Strength = Annotated[float, Meta(ge=0.0, le=OVERSHOOT)]
+Blend = Annotated[str, one_of(BLENDS)]
+Frame = Annotated[int, Meta(ge=0)]
+Length = Annotated[int, Meta(ge=1, le=LONGEST)]
+Fps = Annotated[int, Meta(ge=1, le=FASTEST)]
+Easing = Annotated[str, one_of(EASINGS)]
 
 
 @dataclass(frozen=True)
@@ -16,7 +39,7 @@ class LayerState:
     Args:
         gdf: index into the engine's edits
         name: no two layers of a stack share one
-        strength: 0..1, up to `stack.OVERSHOOT` where the view allows it
+        strength: 0..1, up to `OVERSHOOT` where the view allows it
         enabled: the eye; `solo` wins over it
         gains: how much of each kind of change comes through, 0..1
         solo: only soloed layers are shown while there are any
@@ -26,7 +49,7 @@ class LayerState:
 
     gdf: int
     name: str
-    strength: float = 0.0
+    strength: Strength = 0.0
     enabled: bool = True
     gains: Gains = Gains()
     solo: bool = False
@@ -42,15 +65,15 @@ class Brush:
         active: whether the left mouse button paints
         radius: pixels at 1×
         softness: the part of the radius over which its touch fades, 0..1
-        mode: of `paint.MODES`
+        mode: of `BRUSH_MODES`
         through: also behind the front surface
         weights: the members of the focused layer show their weights as colors meanwhile
     """
 
     active: bool = False
-    radius: float = 40.0
-    softness: float = 0.5
-    mode: str = "erase"
+    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 40.0
+    softness: Share = 0.5
+    mode: Annotated[str, one_of(BRUSH_MODES)] = "erase"
     through: bool = False
     weights: bool = True
 
@@ -60,16 +83,16 @@ class Comparison:
     """What the edited picture is set against, and how (see comparison.py).
 
     Args:
-        mode: "off", "split" or "difference"
+        mode: of `COMPARE_MODES`
         divider: where the edited side of a split begins, share of the picture's width
         amplify: what a difference is multiplied by, 1 to 64
         against: "original", or "recorded": the same strengths as training recorded them, where it did
     """
 
-    mode: str = "off"
-    divider: float = 0.5
-    amplify: float = 4.0
-    against: str = "original"
+    mode: Annotated[str, one_of(COMPARE_MODES)] = "off"
+    divider: Share = 0.5
+    amplify: Annotated[float, Meta(ge=1.0, le=MOST_AMPLIFIED)] = 4.0
+    against: Annotated[str, one_of(AGAINST)] = "original"
 
 
 @dataclass(frozen=True)
@@ -80,13 +103,13 @@ class Keyframe:
         frame: from 0
         strengths: `LayerState.gdf` and its strength
         camera: None where the film leaves the camera alone
-        easing: how it goes on from here, of `timeline.EASINGS`
+        easing: how it goes on from here, of `EASINGS`
     """
 
-    frame: int
-    strengths: tuple[tuple[int, float], ...] = ()
+    frame: Frame
+    strengths: tuple[tuple[int, Strength], ...] = ()
     camera: ViewCamera | None = None
-    easing: str = "smooth"
+    easing: Easing = "smooth"
 
 
 @dataclass(frozen=True)
@@ -101,8 +124,8 @@ class Timeline:
     """
 
     keys: tuple[Keyframe, ...] = ()
-    length: int = 72
-    fps: int = 24
+    length: Length = 72
+    fps: Fps = 24
     ping_pong: bool = False
 
 
@@ -111,7 +134,7 @@ class ViewState:
     """Everything that decides the picture, and what of the panel is open.
 
     Args:
-        overshoot: sliders go on to `stack.OVERSHOOT`, which extrapolates
+        overshoot: sliders go on to `OVERSHOOT`, which extrapolates
         unfolded: which edits (`LayerState.gdf`) show their gains and curve
         brush: what paints
         dynamic_resolution: of `RESOLUTION_MODES`: when the window draws coarsely while something moves
@@ -119,8 +142,8 @@ class ViewState:
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
-    blend: str = "normalized"
-    background: Vec3 = (1.0, 1.0, 1.0)
+    blend: Blend = "normalized"
+    background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     overlay: bool = False
     panel: bool = True
     compare: Comparison = Comparison()
@@ -128,11 +151,7 @@ class ViewState:
     unfolded: tuple[int, ...] = ()
     brush: Brush = Brush()
     timeline: Timeline = Timeline()
-    dynamic_resolution: str = "auto"
-
-
-RESOLUTION_MODES = ("auto", "on", "off")
-"""`ViewState.dynamic_resolution`: where it pays, always, never."""
+    dynamic_resolution: Annotated[str, one_of(RESOLUTION_MODES)] = "auto"
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

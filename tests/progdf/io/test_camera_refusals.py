@@ -68,19 +68,25 @@ BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what m
     "NaN": (lambda t: t["frames"][1]["transform_matrix"][0].__setitem__(0, math.nan), "NaN is not a usable"),
     "frame is a number": (lambda t: t["frames"].append(7), "frame 4"),
     "no frames": (lambda t: t["frames"].clear(), "no cameras"),
-    "a row too many": (lambda t: t["frames"][3]["transform_matrix"].append([0, 0, 0, 1]), "3x4 or 4x4"),
+    "a row too many": (
+        lambda t: t["frames"][3]["transform_matrix"].append([0, 0, 0, 1]),
+        "matrix is [[",
+    ),
     "a little stretched": (
         lambda t: t["frames"][1].update(
             transform_matrix=[[1.02 * x for x in row] for row in t["frames"][1]["transform_matrix"][:3]]
         ),
         "not a rotation",
     ),
-    "no angle": (lambda t: angle_instead(t, 0.0), "camera_angle_x = 0;"),
-    "an angle in degrees": (lambda t: angle_instead(t, 50.0), "camera_angle_x = 50;"),
-    "truth for a number": (lambda t: t.update(w=True), "w = True"),
-    "a billion pixels": (lambda t: t.update(w=10**9), "w = 1e+09"),
-    "half a pixel": (lambda t: t.update(w=320.5), "w = 320.5"),
-    "no pixels": (lambda t: t.update(h=0), "h = 0"),
+    "no angle": (lambda t: angle_instead(t, 0.0), "camera_angle_x is 0.0, expected float > 0.0"),
+    "an angle in degrees": (
+        lambda t: angle_instead(t, 50.0),
+        "camera_angle_x is 50.0, expected float < 3",
+    ),
+    "truth for a number": (lambda t: t.update(w=True), "w is True"),
+    "a billion pixels": (lambda t: t.update(w=10**9), "w is 1000000000"),
+    "half a pixel": (lambda t: t.update(w=320.5), "w is 320.5, expected a whole number"),
+    "no pixels": (lambda t: t.update(h=0), "h is 0"),
     "negative focal length": (lambda t: t.update(fl_y=-5.0), "focal lengths"),
 }
 

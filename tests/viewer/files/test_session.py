@@ -22,7 +22,6 @@ from tests.helpers.sessions import bear_files, full_view, opened_document, saved
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import eye, from_camera, to_camera
-from viewer.files import json_form as plain
 from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state.view_state import Comparison
@@ -63,20 +62,20 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("progdf_session",), "one", "version"),
     (("macros",), ["import os"], "macros"),
     (("scene",), "bear.ply", "scene"),
-    (("scene", "file"), "gone.ply", "not there"),
-    (("scene", "file"), "g" * 5000, "not there"),
+    (("scene", "file"), "gone.ply", "does not exist"),
+    (("scene", "file"), "g" * 5000, "does not exist"),
     (("scene", "file"), "", "scene"),
     (("scene", "file"), "a\0b", "scene"),
     (("scene", "sha256"), "0" * 64, "another bear.ply"),
     (("edits", 1, "sha256"), "0" * 64, "another ears.gdf"),
     (("edits",), [], "layers[0].gdf is 1 of 0"),
-    (("view",), [], "Expected"),
+    (("view",), [], "expected"),
     (("view", "blur"), 3, "view.blur is unknown"),
     (("view", "camera", "distance"), 0.0, "view.camera.distance"),
     (("view", "camera", "distance"), 1e400, "Infinity"),
-    (("view", "camera", "mode"), "walk", "walk"),
+    (("view", "camera", "mode"), "walk\n", "mode is 'walk\\n', expected one of (orbit|fly)"),
     (("view", "camera", "up"), [0.0, 1.0], "view.camera.up"),
-    (("view", "layers", 0, "strength"), 3.0, "strength"),
+    (("view", "layers", 0, "strength"), 3.0, "view.layers[0].strength is 3.0, expected float <= 1.2"),
     (("view", "layers", 0, "strength"), "1", "strength"),
     (("view", "layers", 0, "enabled"), 1, "enabled"),
     (("view", "layers", 0, "gains", "color"), -1.0, "gains"),
@@ -90,7 +89,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("view", "timeline", "length"), -5, "length"),
     (("view", "timeline", "keys", 0, "camera", "distance"), -1.0, "distance"),
     (("snapshots", 0, "edit", "blend"), "none", "none"),
-    (("snapshots",), {"a": 1}, "Expected"),
+    (("snapshots",), {"a": 1}, "expected"),
 ]
 
 
@@ -131,18 +130,6 @@ def test_what_an_older_file_does_not_hold_has_its_default(saved: Path) -> None:
     assert again.view.compare == Comparison()
     assert again.view.camera.fov_y == 45.0
     assert again.snapshots == ()
-
-
-def test_arrays_come_back_bit_for_bit() -> None:
-    for array in (np.linspace(0, 1, 7, dtype=np.float32), np.zeros((0, 3), np.uint8)):
-        packed = json.loads(json.dumps(plain.to_json(array)))
-        again = plain.from_json(np.ndarray, packed)
-        assert again.dtype == array.dtype
-        assert np.array_equal(again, array)
-    with pytest.raises(plain.JsonFormError):
-        plain.from_json(np.ndarray, {"dtype": "O", "shape": [1], "zlib": ""})
-    with pytest.raises(plain.JsonFormError):
-        plain.from_json(np.ndarray, {"dtype": "<f4", "shape": [1 << 40], "zlib": ""})
 
 
 def test_a_save_that_fails_leaves_the_old_session(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:

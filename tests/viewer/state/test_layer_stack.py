@@ -27,7 +27,7 @@ from viewer.panel.strength_slider import parse_strength
 from viewer.state import change_curve, timeline
 from viewer.state import layers as stack
 from viewer.state.layer_facts import layer_rows
-from viewer.state.view_state import LayerState, ViewState
+from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
 from viewer.state.workspace import original
 
 POINTS = (700, 640)
@@ -124,11 +124,11 @@ def test_a_lock_holds_strength_and_gains() -> None:
 def test_without_overshoot_nothing_stands_beyond_one() -> None:
     over = stack.with_overshoot(THREE, True)
     assert stack.nudge(over, 0, "strength", 0.6).layers[0].strength == 1.1
-    assert stack.nudge(over, 0, "strength", 9.0).layers[0].strength == stack.OVERSHOOT
+    assert stack.nudge(over, 0, "strength", 9.0).layers[0].strength == OVERSHOOT
     assert stack.nudge(over, 0, "color", 9.0).layers[0].gains.color == 1.0
     back = stack.with_overshoot(stack.nudge(over, 0, "strength", 9.0), False)
     assert back.layers[0].strength == 1.0
-    assert parse_strength("130%", stack.largest_strength(over)) == stack.OVERSHOOT
+    assert parse_strength("130%", stack.largest_strength(over)) == OVERSHOOT
 
 
 def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
@@ -154,7 +154,7 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     hand.key("O")
     for _ in range(9):
         hand.key("Shift+Right")
-    assert hand.strengths == [stack.OVERSHOOT, 0.5]
+    assert hand.strengths == [OVERSHOOT, 0.5]
     hand.key("O")
     assert hand.strengths == [1.0, 0.5]
 
@@ -328,7 +328,7 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
 def test_the_curve_begins_at_nothing_reaches_all_at_one_and_goes_beyond() -> None:
     made = bear()
     curve = layer_rows(made.scene, made.gdfs)[1].curve()
-    assert len(curve) == round(stack.OVERSHOOT * change_curve.STEPS) + 1
+    assert len(curve) == round(OVERSHOOT * change_curve.STEPS) + 1
     assert (curve[0], curve[change_curve.STEPS]) == (0.0, 1.0)
     assert curve[-1] > 1.0
     assert layer_fold.value_at(curve, 0.5) == curve[change_curve.STEPS // 2]

@@ -20,7 +20,7 @@ from viewer.camera.view_camera import to_camera
 from viewer.commands.layer_arguments import stack_of
 from viewer.state import paint
 from viewer.state.paint import Stroke, near_mean
-from viewer.state.view_state import Brush
+from viewer.state.view_state import LARGEST_PX, Brush
 
 POINTS = (700, 640)
 LINE = Stroke(
@@ -239,7 +239,7 @@ def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
     assert hand.main_view.work.view.brush == Brush(True, 25.0, 0.4, "smooth", True)
     for _ in range(40):
         hand.key("]")
-    assert hand.main_view.work.view.brush.radius == paint.LARGEST_PX
+    assert hand.main_view.work.view.brush.radius == LARGEST_PX
     hand.key("Backspace")
     assert weights(hand).max() == 0.0
     hand.key("Shift+Backspace")
