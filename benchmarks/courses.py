@@ -40,8 +40,9 @@ class KnownEdit:
         strengths: of the snapshots that fields are fitted to. [T]
         offsets: [T,M,C]
         truth: the offsets at any strength. [M,C]
-        judge: errors against the truth, in views that `look` does not show, over the pixels that change
-        look: pixels on which fields may be chosen
+        judge: errors against the truth, in views that no choice has seen, over the pixels that change
+        chooser: the same in other views that `look` does not show, which have the last word on a choice
+        look: pixels on which ranks are grown
         weights: visibility of the members. [M]
         unseen: the judge's pixels
     """
@@ -53,6 +54,7 @@ class KnownEdit:
     offsets: Tensor
     truth: Callable[[float], Tensor]
     judge: FieldEvaluator
+    chooser: FieldEvaluator
     look: Render
     weights: Tensor
     unseen: Render
@@ -91,9 +93,9 @@ def known_edit(
 
     strengths = torch.linspace(0, 1, snapshots)
     offsets = torch.stack([truth(float(s)) for s in strengths])
-    seen, unseen = cameras[::11][:3], cameras[5::10][:2]
-    shown = _changed_pixels(scene, members, offsets, unseen)
-    judge = FieldEvaluator(strengths, offsets, shown, truth)
+    seen, choosing, unseen = cameras[::11][:3], cameras[8::10][:2], cameras[5::10][:2]
+    shown, decides = (_changed_pixels(scene, members, offsets, views) for views in (unseen, choosing))
+    judge, chooser = (FieldEvaluator(strengths, offsets, render, truth) for render in (shown, decides))
     visible = sum(
         (
             alpha_weights(scene, camera, torch.ones(camera.height, camera.width))[members, 2].float()
@@ -103,7 +105,7 @@ def known_edit(
     )
     weights = visible / visible.mean() + 1e-3
     look = _changed_pixels(scene, members, offsets, seen)
-    return KnownEdit(name, scene, members, strengths, offsets, truth, judge, look, weights, shown)
+    return KnownEdit(name, scene, members, strengths, offsets, truth, judge, chooser, look, weights, shown)
 
 
 def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras: Sequence[Camera]) -> Render:

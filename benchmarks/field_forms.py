@@ -109,13 +109,13 @@ def baked_forms(course: KnownEdit) -> list[Form]:
         )
 
         def separable(size: float = size) -> tuple[BakedField, str]:
-            candidate = separable_within(courses, strengths, size, judge)
+            candidate = separable_within(courses, strengths, size, course.chooser)
             return candidate.field, candidate.label
 
         measure("separable", separable, straightened)
 
     def auto() -> tuple[BakedField, str]:
-        best = choose_field(strengths, offsets, course.look, weights, evaluator=judge).best
+        best = choose_field(strengths, offsets, course.look, weights, evaluator=course.chooser).best
         return best.field, f"auto at 40 dB: {best.label}"
 
     measure("auto", auto)

@@ -10,11 +10,12 @@ from progdf.field import FieldEvaluator
 from trainer.fit.fit import visibility
 from trainer.pipeline.fit_and_report import load_evaluator
 from trainer.pipeline.reopen import render_run_views, reopen_run
+from trainer.views.choose import split_held_out
 
 from .courses import KnownEdit
 
 LOOKED, JUDGED = 3, 2
-"""Training views that fields are chosen on, held-out views that they are judged in."""
+"""Training views that ranks are grown on; held-out views that choose, and as many others that judge."""
 
 
 def recorded_edit(root: Path) -> KnownEdit:
@@ -26,9 +27,10 @@ def recorded_edit(root: Path) -> KnownEdit:
     run = reopen_run(root)
     setup, trajectory = render_run_views(run), run.trajectory
     few = setup.train[:: max(1, len(setup.train) // LOOKED)][:LOOKED]
-    look, evaluator = (
+    choosing, reporting = split_held_out(setup.held_out)
+    look, chooser, judge = (
         load_evaluator(run.folder, setup, views, trajectory).counted_pixels
-        for views in (few, setup.held_out[:JUDGED])
+        for views in (few, choosing[:JUDGED], reporting[:JUDGED])
     )
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     return KnownEdit(
@@ -38,8 +40,9 @@ def recorded_edit(root: Path) -> KnownEdit:
         trajectory.s,
         offsets,
         trajectory.at,
-        FieldEvaluator(trajectory.s, offsets, evaluator),
+        FieldEvaluator(trajectory.s, offsets, judge),
+        FieldEvaluator(trajectory.s, offsets, chooser),
         look,
         visibility(run.scene, run.region.members, setup.train),
-        evaluator,
+        judge,
     )

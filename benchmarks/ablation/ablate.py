@@ -159,7 +159,7 @@ def _record(
     setup = whole_views(shared.setup) if plan.optimization.whole else shared.setup
     with log.stage("optimize"):
         trajectory, _ = optimize_members(optimization, setup, edited, perceptual, state, log)
-    trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator, optimization.prunes)
+    trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator.halves()[0], optimization.prunes)
     return retime_trajectory(trajectory, setup, plan.slider, optimization.raw, log)
 
 
@@ -171,7 +171,7 @@ def _fit(
         offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
         return fit_keyframes(trajectory.s, offsets, 2), {}
     target = shared.plan.field.target_psnr
-    fitted = fit_field(trajectory, shared.seen, shared.evaluator, shared.weights, "auto", target)
+    fitted = fit_field(trajectory, shared.seen, *shared.evaluator.halves(), shared.weights, "auto", target)
     field, remap = fitted.chosen.field, identity_remap()
     if resolve_slider(plan.slider, trajectory.strengths) == "even":
         field, remap = equalize_slider(field, shared.setup)

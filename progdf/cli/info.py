@@ -94,7 +94,9 @@ def _edit_lines(path: Path) -> Iterator[str]:
         yield f"asked for: {gdf.instruction}"
     yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
     yield f"region: {gdf.region}, {format_count(members)} ({members / max(1, count):.1%})"
-    yield f"field: {gdf.field.kind}, {gdf.bytes_per_member:.4g} bytes per Gaussian, {_describe_field(gdf)}"
+    whole = f"{gdf.size / max(1, members):.4g} with the header"
+    sizes = f"{gdf.bytes_per_member:.4g} bytes per Gaussian, {whole}"
+    yield f"field: {gdf.field.kind}, {sizes}, {_describe_field(gdf)}"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):

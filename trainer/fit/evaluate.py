@@ -16,6 +16,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.metrics.image import decibels, ssim
 from progdf.region import Region
 from trainer.optimize.losses import Perceptual
+from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, render_all
 from trainer.views.view import View, crop
 
@@ -78,6 +79,20 @@ class Evaluator:
         with torch.no_grad():
             values = [float(measure(a, b, k)) for a, b, k in zip(found, expected, keys, strict=True)]
         return sum(values) / max(1, len(values))
+
+    def halves(self) -> tuple[Evaluator, Evaluator]:
+        """The views that fields are chosen on, and those that their errors are reported on."""
+        choosing, reporting = (self._only(views) for views in split_held_out(range(len(self.crops))))
+        return choosing, reporting
+
+    def _only(self, views: Sequence[int]) -> Evaluator:
+        return replace(
+            self,
+            crops=[self.crops[i] for i in views],
+            pixels=[self.pixels[i] for i in views],
+            edited={s: [pictures[i] for i in views] for s, pictures in self.edited.items()},
+            names=[self.names[i] for i in views],
+        )
 
     def counted_pixels(self, offsets: Tensor) -> Tensor:
         """The pixels that count, of all views, with these offsets. [M,C] -> [P,3]"""

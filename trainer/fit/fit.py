@@ -31,10 +31,10 @@ class Fitted:
     """The chosen field and what it was chosen against.
 
     Args:
-        chosen: the field with its errors against the trajectory
-        met: whether it reaches the target, or the budget
-        tried: the fields that were looked at
-        baselines: keyframe fields by name
+        chosen: the field with its errors against the trajectory, on views that the choice has not seen
+        met: whether it reached the target on the views that it was chosen on, or the budget
+        tried: the fields that were looked at, with their errors on the views that the choice was made on
+        baselines: keyframe fields by name, on the same views as `chosen`
         why: it was chosen, in words
     """
 
@@ -48,7 +48,8 @@ class Fitted:
 def fit_field(
     trajectory: Trajectory,
     seen: Evaluator,
-    evaluator: Evaluator,
+    choosing: Evaluator,
+    reporting: Evaluator,
     weights: Tensor,
     kind: Kind,
     target_psnr: float,
@@ -59,7 +60,8 @@ def fit_field(
     Args:
         trajectory: what was recorded
         seen: training views, on which ranks are chosen
-        evaluator: held-out views, which have the last word
+        choosing: held-out views, which have the last word on the choice
+        reporting: other held-out views, on which the chosen field's errors are taken
         weights: how visible each member is. [M]
         kind: "auto" tries separable and keyframe fields, the others only their kind
         target_psnr: dB; where none reaches it, the best is kept and `met` is false
@@ -67,7 +69,6 @@ def fit_field(
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
-    errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
     target = target_psnr if budget is None else math.inf
     choice = choose_field(
         trajectory.s,
@@ -77,11 +78,13 @@ def fit_field(
         kind,
         target,
         budget,
-        evaluator=errors,
+        evaluator=FieldEvaluator(trajectory.s, offsets, choosing.counted_pixels),
         recorded=ticks,
     )
+    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
+    chosen = errors.candidate(choice.best.field, choice.best.label)
     baselines = _baselines(trajectory, offsets, errors)
-    return Fitted(choice.best, choice.met, choice.tried, baselines, choice.why)
+    return Fitted(chosen, choice.met, choice.tried, baselines, choice.why)
 
 
 def expected_looks(trajectory: Trajectory, kind: Kind) -> int:
@@ -90,15 +93,15 @@ def expected_looks(trajectory: Trajectory, kind: Kind) -> int:
     moving = len(moving_attributes(trajectory.offsets))
     ranks = snapshots if kind == "keyframes" else (1 + moving) * snapshots
     candidates = 1 if kind == "lossless" else 6
-    return ranks + SAMPLES * (1 + candidates + len(BASELINES))
+    return ranks + SAMPLES * (3 + candidates + len(BASELINES))
 
 
 def evaluate_field(
-    trajectory: Trajectory, evaluator: Evaluator, field: BakedField, target_psnr: float
+    trajectory: Trajectory, reporting: Evaluator, field: BakedField, target_psnr: float
 ) -> Fitted:
     """A field that is there already, a network's, beside the same baselines."""
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
+    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
     measured = errors.candidate(field, field.kind)
     baselines = _baselines(trajectory, offsets, errors)
     return Fitted(measured, measured.worst >= target_psnr, (measured,), baselines, "a network was asked for")

@@ -146,7 +146,7 @@ def fit_network(
     trajectory: Trajectory,
     setup: TrainingSetup,
     seen: Evaluator,
-    evaluator: Evaluator,
+    reporting: Evaluator,
     weights: Tensor,
     plan: NetworkPlan,
     perceptual: Perceptual,
@@ -159,7 +159,7 @@ def fit_network(
         trajectory: what was recorded
         setup: scene, region, views
         seen: training views, which tell how much each attribute shows
-        evaluator: held-out views
+        reporting: held-out views on which errors are taken
         weights: how visible each member is. [M]
         plan: see `NetworkPlan`
         perceptual: for the loss of pictures
@@ -191,9 +191,9 @@ def fit_network(
     except FloatingPointError as error:
         raise ProgdfError(f"{error}; try another --size, or --field auto") from error
     network = fit.field(tuple(float(s) for s in trajectory.s))
-    errors = FieldEvaluator(trajectory.s, offsets, evaluator.counted_pixels)
+    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
     return NetworkFit(
-        bake_network(network, rows, trajectory.at, evaluator.counted_pixels),
+        bake_network(network, rows, trajectory.at, reporting.counted_pixels),
         errors.curve(network.bind(rows)),
     )
 

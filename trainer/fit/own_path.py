@@ -16,6 +16,7 @@ import torch
 from progdf.field.trajectory import Trajectory
 from trainer.editors.base import ImageEditor
 from trainer.setup.training_setup import TrainingSetup
+from trainer.views.choose import split_held_out
 
 from .evaluate import make_evaluator
 
@@ -48,7 +49,7 @@ def choose_path(
 
     Args:
         trajectory: of one target, as recorded
-        setup: scene, region, and the held-out views, some of which judge
+        setup: scene, region, and the held-out views, of which those that fields are chosen on judge
         editor: what made the edited views; None where it pictures no half
         in_parts: connected parts were moved as wholes
         retimed: lays the slider over a trajectory; done only where its own way may be kept
@@ -57,7 +58,7 @@ def choose_path(
     if not in_parts and (editor is None or editor.stages):
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
-    views = setup.held_out[:_VIEWS]
+    views = split_held_out(setup.held_out)[0][:_VIEWS]
     halves = {}
     if editor is not None and not in_parts:
         halves = {0.5: [editor.edit(view, 0.5) for view in views]}

@@ -14,6 +14,7 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.remap import identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
+from progdf.formats.load_report import file_size
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
@@ -35,7 +36,11 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 _RANK_VIEWS = 4
-_REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves")
+_REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views")
+
+_LPIPS_OVER = (
+    "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
+)
 
 
 @dataclass(frozen=True)
@@ -80,22 +85,26 @@ def finish_run(
     scene, region = setup.scene, setup.region
     with log.stage("fit"):
         evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
+        choosing, reporting = evaluator.halves()
+        if len(setup.held_out) == 1:
+            log.say("one view alone is held out: the field is chosen and reported on it")
         few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
         seen = load_evaluator(folder, setup, few, trajectory)
         with log.looks("weigh the members", len(setup.train)) as looked:
             weights = visibility(scene, region.members, setup.train, looked)
         if plan.field.field == "neural":
             network = fit_network(
-                trajectory, setup, seen, evaluator, weights, plan.field.network, perceptual, log, begun
+                trajectory, setup, seen, reporting, weights, plan.field.network, perceptual, log, begun
             )
-            fitted = evaluate_field(trajectory, evaluator, network.field, target)
+            fitted = evaluate_field(trajectory, reporting, network.field, target)
         else:
             network = None
             with log.looks("fit the field", expected_looks(trajectory, plan.field.field)) as looked:
                 fitted = fit_field(
                     trajectory,
                     replace(seen, looked=looked),
-                    replace(evaluator, looked=looked),
+                    replace(choosing, looked=looked),
+                    replace(reporting, looked=looked),
                     weights,
                     plan.field.field,
                     target,
@@ -109,7 +118,8 @@ def finish_run(
         shown = replace(trajectory, s=remap(trajectory.s).float())
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
-        f"{field.bytes_per_member:.0f} bytes per Gaussian, worst {fitted.chosen.worst:.1f} dB, "
+        f"{field.bytes_per_member:.0f} bytes per Gaussian without the header, "
+        f"worst {fitted.chosen.worst:.1f} dB, "
         f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
     )
     if not fitted.met:
@@ -122,8 +132,8 @@ def finish_run(
         if clip.reason and plan.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
-            watched = replace(evaluator, looked=looked)
-            measured = measure(watched, trajectory, fitted, field, remap, perceptual, clip)
+            watched, apart = (replace(views, looked=looked) for views in (evaluator, reporting))
+            measured = measure(watched, apart, trajectory, fitted, field, remap, perceptual, clip)
         editor, told = plan.editor.editor, plain(plan)
         gdf = Gdf(plan.name, region, field, fingerprint(scene), editor, told)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
@@ -134,6 +144,12 @@ def finish_run(
         measures["field"] |= network.figures()
     report = {
         **measures,
+        "views": {
+            "edit": list(evaluator.names),
+            "field_chosen": list(choosing.names),
+            "field": list(reporting.names),
+            "lpips_over": _LPIPS_OVER,
+        },
         "trajectory": {
             "recordings": len(trajectory),
             "slider": slider,
@@ -160,6 +176,8 @@ def finish_run(
     # the .gdf has the options beside it, is small, and the same training writes the same file
     own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}
     save_gdf(folder.gdf(plan.name), replace(gdf, report=own))
+    size = folder.gdf(plan.name).stat().st_size
+    report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / max(1, len(region)), 1)}
     write_json(folder.report, report)
     write_image(folder.picture, picture)
     edit = report["edit"]
@@ -170,7 +188,10 @@ def finish_run(
             for s, e in report["between"].items()
         )
     )
-    log.say(f"wrote {folder.gdf(plan.name)}")
+    log.say(
+        f"wrote {folder.gdf(plan.name)}: {file_size(size)}, "
+        f"{size / max(1, len(region)):.0f} bytes per Gaussian with all that is in it"
+    )
     return RunResult(folder, folder.gdf(plan.name), report, shown)
 
 

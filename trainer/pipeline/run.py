@@ -245,8 +245,8 @@ def _record(
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
-            evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
-            trajectory, costs = drop_idle_attributes(trajectory, evaluator, optimization.prunes)
+            choosing, _ = load_evaluator(folder, setup, setup.held_out, trajectory).halves()
+            trajectory, costs = drop_idle_attributes(trajectory, choosing, optimization.prunes)
         recorded = len(trajectory)
         way = ""
         if not optimization.raw and plan.field.field != "neural" and len(edited) == 1:

@@ -52,6 +52,8 @@ class Direction:
 class Measured:
     """Everything about the fitted field that the report tells, measured on held-out views.
 
+    What concerns the edit is measured on all of them, the field's errors on those that it was not chosen on.
+
     Args:
         fitted: the field and its baselines, on the trajectory's slider
         shown: the field as it is shipped, on a slider of its own
@@ -79,6 +81,7 @@ class Measured:
 
 def measure(
     evaluator: Evaluator,
+    reporting: Evaluator,
     trajectory: Trajectory,
     fitted: Fitted,
     shown: BakedField,
@@ -89,7 +92,8 @@ def measure(
     """Measure the chosen field beside the compared baseline.
 
     Args:
-        evaluator: held-out views
+        evaluator: all held-out views
+        reporting: those of them on which the field was not chosen
         trajectory: what was recorded
         fitted: the field and its baselines
         shown: the field as it is shipped
@@ -102,7 +106,7 @@ def measure(
     slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
     recorded = error_curves(
-        evaluator, fields, samples, lambda s: evaluator.pictures(trajectory.at(s)), perceptual
+        reporting, fields, samples, lambda s: reporting.pictures(trajectory.at(s)), perceptual
     )
     recorded = {n: replace(c, s=tuple(remap.at(s) for s in c.s)) for n, c in recorded.items()}
     asked = tuple((remap.at(s), strength) for s, strength in trajectory.asked)
@@ -110,7 +114,7 @@ def measure(
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
         (
-            evaluator.psnr(evaluator.pictures(field.offsets(s)), evaluator.pictures(trajectory.at(s)))
+            reporting.psnr(reporting.pictures(field.offsets(s)), reporting.pictures(trajectory.at(s)))
             for s in nodes
         ),
         default=fitted.chosen.worst,

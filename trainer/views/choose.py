@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ from progdf.region import Region
 
 from .view import View, fit_size, make_view
 from .visible_area import visible_area
+
+T = TypeVar("T")
 
 _SAMPLES = 256
 """Members that represent the region when views are compared."""
@@ -110,6 +113,14 @@ def choose_views(
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
         int((seeing & ~enough).sum()),
     )
+
+
+def split_held_out(held_out: Sequence[T]) -> tuple[Sequence[T], Sequence[T]]:
+    """Held-out views to choose a field on, every other one, and those to report its errors on, the others.
+
+    One view alone serves for both.
+    """
+    return held_out[::2], held_out[1::2] or held_out
 
 
 def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[View]]:

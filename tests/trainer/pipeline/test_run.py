@@ -17,6 +17,7 @@ import trainer.pipeline.training
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
+from progdf.field import FieldEvaluator, fit_keyframes
 from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
@@ -25,7 +26,9 @@ from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
 from trainer.option_checks import check_options
 from trainer.options import FitOptions
+from trainer.pipeline.fit_and_report import load_evaluator
 from trainer.pipeline.refit import refit
+from trainer.pipeline.reopen import render_run_views, reopen_run
 from trainer.pipeline.run import RunResult
 from trainer.plan import make_plan
 from trainer.report.plots import LINES, draw_plot
@@ -142,6 +145,32 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
     assert report["memory_mb"] > 0
     assert report["field"]["psnr_worst"] >= 40.0
     assert set(report["baselines"]["keyframes2"]) >= {"psnr_mean", "psnr_worst", "bytes_per_gaussian"}
+
+
+def test_a_field_s_errors_are_reported_on_views_that_its_choice_has_not_seen(done: RunResult) -> None:
+    views, report = done.report["views"], done.report
+    assert set(views["field_chosen"]) & set(views["field"]) == set()
+    assert sorted([*views["field_chosen"], *views["field"]]) == sorted(views["edit"])
+    assert "box" in views["lpips_over"]
+    run = reopen_run(done.folder.root)
+    trajectory, setup = run.trajectory, render_run_views(run)
+    halves = load_evaluator(run.folder, setup, setup.held_out, trajectory).halves()
+    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    linear = fit_keyframes(trajectory.s, offsets, 2)
+    chosen, reported = (
+        min(FieldEvaluator(trajectory.s, offsets, half.counted_pixels).curve(linear)) for half in halves
+    )
+    assert abs(chosen - reported) > 0.02
+    assert report["baselines"]["keyframes2"]["psnr_worst"] == pytest.approx(reported, abs=0.006)
+    tried = {t["field"]: t["psnr_worst"] for t in report["choice"]["tried"]}
+    assert tried[report["choice"]["chosen"]] != report["field"]["psnr_worst"]
+
+
+def test_bytes_per_gaussian_are_given_without_and_with_the_header(done: RunResult) -> None:
+    file, members = done.report["file"], len(load_gdf(done.gdf, None).region)
+    assert file["bytes"] == done.gdf.stat().st_size
+    assert file["bytes_per_gaussian"] == pytest.approx(file["bytes"] / members, abs=0.06)
+    assert file["bytes_per_gaussian"] > done.report["field"]["bytes_per_gaussian"]
 
 
 def test_every_view_is_kept_before_and_after(done: RunResult) -> None:

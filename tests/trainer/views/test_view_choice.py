@@ -22,7 +22,14 @@ from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_
 from tests.helpers.trained import WHITE, Small, small
 from trainer.setup.resolution import ViewSettings
 from trainer.setup.training_setup import make_training_setup
-from trainer.views.choose import ViewChoice, choose_views, in_frame, sample_members, split_views
+from trainer.views.choose import (
+    ViewChoice,
+    choose_views,
+    in_frame,
+    sample_members,
+    split_held_out,
+    split_views,
+)
 
 
 def test_a_camera_that_looks_away_is_left_out() -> None:
@@ -184,6 +191,11 @@ def test_views_that_show_what_the_others_show_are_held_out_one_from_each_side() 
     assert picked(likeness, 1) == [5]
     assert picked(likeness, 2) == [1, 5], "in the order of the list"
     assert picked(likeness.T.contiguous(), 2) != [1, 5]
+
+
+def test_one_half_of_the_held_out_views_chooses_and_the_other_reports_unless_there_is_one() -> None:
+    assert split_held_out(range(6)) == (range(0, 6, 2), range(1, 6, 2))
+    assert split_held_out("a") == ("a", "a")
 
 
 def test_no_more_than_a_third_is_held_out_and_no_view_twice() -> None:
