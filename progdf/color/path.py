@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import torch
@@ -18,7 +18,7 @@ Strength = float | Tensor
 
 _GREEN = math.radians(142.5)  # hue of sRGB's
 
-ColorPath = Literal["bowed", "hue"]
+ColorPath = Literal["bowed", "hue", "straight", "srgb"]
 """The way of colors from the original to the finished edit, see `bend_of`."""
 
 
@@ -31,12 +31,14 @@ class Bend:
         direction: 1 or −1: the sense in which nearly opposite hues turn, the same all over a region
         whole, none: hues that lie so near to opposite (angle missing, radians) that they turn in this sense
             altogether, and those from which on each takes its own shorter way; in between the two ways mix
+        fade: straight in sRGB instead, as pictures are cross-faded
     """
 
     bow: float
     direction: float
     whole: float
     none: float
+    fade: bool = False
 
 
 STRAIGHT = Bend(0.0, 1.0, 0.0, 1.0)
@@ -49,7 +51,10 @@ def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Ben
     - "bowed": mostly straight, bowed by 0.4 towards the shorter hue, so that half of blue is half way to blue
       and not gray. Hues that are opposite within 10° keep off green, which nobody expects.
     - "hue": along the hue circle, the shorter way; between nearly opposite hues the way over green.
+    - "straight": straight in OKLab; "srgb": straight in sRGB. Both go through gray between opposite hues.
     """
+    if path in ("straight", "srgb"):
+        return replace(STRAIGHT, fade=path == "srgb")
     start, end = (hue_of(srgb_to_oklab(color.clamp(0, 1))) for color in (reference, target))
     short, to_green = _wrap(end - start), _wrap(_GREEN - start)
     over_green = bool(to_green * short > 0) and bool(to_green.abs() <= short.abs())
@@ -83,8 +88,17 @@ def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend)
         bend: of the region
     """
     inside = rgb.clamp(0, 1)
-    a, b = srgb_to_oklab(inside), srgb_to_oklab(end)
-    s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(a.shape[:-1]).clamp(0, 1)
+    s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
+    if bend.fade:
+        way = torch.lerp(inside, end, s[..., None])
+    else:
+        way = _bowed(srgb_to_oklab(inside), srgb_to_oklab(end), s, bend)
+    edited = way + (1 - s)[..., None] * (rgb - inside)
+    return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
+
+
+def _bowed(a: Tensor, b: Tensor, s: Tensor, bend: Bend) -> Tensor:
+    """From OKLab to OKLab; sRGB. [...,3], [...,3], [...] -> [...,3]"""
     chroma_a, chroma_b = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1)
     turn = bend.direction * _wrap(hue_of(b) - hue_of(a))  # -pi..pi, the region's sense being positive
     own = _rise(turn + math.pi, bend.whole, bend.none)
@@ -98,8 +112,7 @@ def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend)
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
     lab = torch.lerp(a, b, s[..., None])
     lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])
-    edited = fit_gamut(lab) + (1 - s)[..., None] * (rgb - inside)
-    return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
+    return fit_gamut(lab)
 
 
 def _wrap(angle: Tensor) -> Tensor:

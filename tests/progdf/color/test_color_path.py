@@ -111,6 +111,18 @@ def test_hues_near_the_target_take_their_own_short_way(s: float, path: ColorPath
     assert bool((way[:, 2] > way[:, 1]).all())
 
 
+def test_the_straight_paths_are_straight_in_oklab_and_in_srgb() -> None:
+    start, end = parse_color("#e0ac88").expand(21, 3), recolor(parse_color("#e0ac88").expand(21, 3), BLUE)
+    lab, faded = (
+        interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE, path))
+        for path in ("straight", "srgb")
+    )
+    assert torch.allclose(faded, torch.lerp(start, end, STRENGTHS[:, None]))
+    expected = torch.lerp(srgb_to_oklab(start), srgb_to_oklab(end), STRENGTHS[:, None])
+    assert torch.allclose(srgb_to_oklab(lab), expected, atol=2e-3)
+    assert float((lab - faded).abs().max()) > 0.02, "they are two ways"
+
+
 def test_a_straight_and_a_bent_way_have_the_same_lightness() -> None:
     start, end = parse_color("#e0ac88").expand(21, 3), BLUE.expand(21, 3)
     lab = srgb_to_oklab(interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE)))
