@@ -146,7 +146,7 @@ class TrainOptions:
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     field_loss: FieldLoss = NETWORK_OPTIONS["field_loss"]
     """neural: what it is trained on: the recorded offsets, or pictures of them (the paper's L1 + LPIPS and
-    sharpness; half a second a step, and no more accurate)."""
+    sharpness; about .3 s a step with the network of 6 million)."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
     bytes_budget: float | None = None
@@ -180,7 +180,7 @@ class FitOptions:
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     field_loss: FieldLoss = NETWORK_OPTIONS["field_loss"]
     """neural: what it is trained on: the recorded offsets, or pictures of them (the paper's L1 + LPIPS and
-    sharpness; half a second a step, and no more accurate)."""
+    sharpness; about .3 s a step with the network of 6 million)."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
     bytes_budget: float | None = None
