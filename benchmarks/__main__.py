@@ -27,6 +27,8 @@ COMMAND = "python -m benchmarks"
 BENCHES: dict[str, str] = {
     "rasterize": "benchmarks.rasterizer:tables",
     "field": "benchmarks.field:tables",
+    "edits": "benchmarks.edits:tables",
+    "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",
     "frames": "benchmarks.viewer.frames:tables",
     "window": "benchmarks.viewer.window:tables",
@@ -40,10 +42,10 @@ class BenchOptions:
     """Measure speed against error; each benchmark interleaves what it compares in one process.
 
     Args:
-        what: rasterize, field, viewer, frames, window; all of them when none is named
+        what: rasterize, field, edits, networks, viewer, frames, window; all of them when none is named
         json: also write the tables to this JSON file
         markdown: also put the tables between their markers in this Markdown file
-        runs: finished run folders whose recorded edits `field` measures beside the bear's
+        runs: finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits
         plot: `field` also draws its errors into this PNG file
         scenes: .ply files that viewer, frames and window draw in place of the bears
         seconds: how long `window` drags its slider; 60 where not said
@@ -66,8 +68,11 @@ def main(argv: Sequence[str]) -> int:
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate'))}")
-    if (options.runs or options.plot) and options.what and "field" not in options.what:
-        raise ProgdfError("--runs and --plot are for fields; use python -m benchmarks field")
+    if options.plot and options.what and "field" not in options.what:
+        raise ProgdfError("--plot is for fields; use python -m benchmarks field")
+    trained = ("field", "edits", "networks")
+    if options.runs and options.what and not set(trained) & set(options.what):
+        raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
     drawing = ("viewer", "frames", "window")
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks {drawing[0]}")
@@ -79,7 +84,8 @@ def main(argv: Sequence[str]) -> int:
     if options.markdown is not None and not options.markdown.is_file():
         raise ProgdfError(f"{options.markdown} does not exist; check the name and the folder")
     given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
-    if options.runs:
+    given |= {name: {"runs": options.runs} for name in ("edits", "networks")}
+    if options.runs and (not options.what or "field" in options.what):
         given["field"]["recorded"] = [_function(RECORDED)(run) for run in options.runs]
     given |= {name: {"scenes": options.scenes} for name in drawing}
     if options.seconds is not None:

@@ -27,11 +27,9 @@ from progdf.io.atomic import atomic_write
 from progdf.rasterize import set_threads
 from progdf.rasterize.cpu.parallel import threads
 
-from .courses import KnownEdit, edit_of, known_edit, milliseconds
+from .courses import KnownEdit, edit_of, known_edit, milliseconds, processor_milliseconds
 from .field_forms import Form, baked_forms
-from .field_network import STEPS, network_forms
 from .field_plot import draw_forms
-from .position_floor import floor_table
 from .table import Table
 
 EDITS = ("gold", "stripes", "big ears")
@@ -52,35 +50,30 @@ def tables(recorded: Sequence[KnownEdit] = (), plot: Path | None = None) -> list
     cameras = [camera.resize(SIDE, SIDE) for camera in scene.cameras]
     known = [known_edit(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS) for name in EDITS]
     courses = [*known, *recorded]
-    forms = [form for course in courses for form in (*baked_forms(course), *network_forms(course))]
+    forms = [form for course in courses for form in baked_forms(course)]
     if plot is not None:
         with atomic_write(plot) as temporary_file:
             drawn = draw_forms(forms).quantize(128, kmeans=3, dither=Image.Dither.NONE)
             drawn.save(temporary_file, format="PNG", optimize=True)
-    return [field_table(forms), floor_table(courses), _compose_table()]
+    return [field_table(forms), _compose_table()]
 
 
 def field_table(forms: Sequence[Form]) -> Table:
     """The table of all fields of all edits, in their order."""
-    paper = {form.edit: form for form in forms if form.worst is None}
-    rows = []
-    for form in forms:
-        ratio = min(paper[form.edit].step) / min(form.step) if form.edit in paper else None
-        between = "-" if form.mean is None or form.worst is None else f"{form.mean:.1f} / {form.worst:.1f}"
-        rows.append(
-            (
-                f"{form.edit}, {form.members} members",
-                form.label,
-                f"{form.numbers:,}".replace(",", " "),
-                f"{form.bytes_per_member:.0f}",
-                between,
-                "-" if form.at_snapshots is None else f"{form.at_snapshots:.1f}",
-                "-" if form.seconds is None else f"{form.seconds:.1f}",
-                f"{form.step[0]:.2f}",
-                f"{form.step[1]:.2f}",
-                "-" if ratio is None else f"{ratio:.0f}×" if ratio >= 2 else f"{ratio:.1f}×",
-            )
+    rows = [
+        (
+            f"{form.edit}, {form.members} members",
+            form.label,
+            f"{form.numbers:,}".replace(",", " "),
+            f"{form.bytes_per_member:.0f}",
+            f"{form.mean:.1f} / {form.worst:.1f}",
+            f"{form.at_snapshots:.1f}",
+            f"{form.seconds:.1f}",
+            f"{form.step[0]:.2f}",
+            f"{form.step[1]:.2f}",
         )
+        for form in forms
+    ]
     return Table(
         name="field",
         title="Fields: error against bytes and time",
@@ -88,19 +81,17 @@ def field_table(forms: Sequence[Form]) -> Table:
             "edit",
             "field",
             "numbers",
-            "bytes a member",
+            "bytes a member, no header",
             "PSNR between snapshots, mean / worst, dB",
             "worst at snapshots",
             "s to fit",
             "ms a slider step, 1 thread",
             "2 threads",
-            "as fast as the paper's network",
         ),
         rows=tuple(rows),
         note=f"Bear of {BEAR} Gaussians, {SNAPSHOTS} snapshots, against the true course; recorded edits "
-        "against the recording. 25 slider values, views that the choice has not seen, pixels that the edit "
-        f"changes. Keyframes lie where pictures bend. Networks: {STEPS} steps, asked before they are baked, "
-        "without adding offsets to the scene; the paper's is timed, not trained, and so not judged. "
+        "against the recording. 13 slider values, views that no choice has seen, pixels that the edit "
+        "changes. Keyframes lie where pictures bend. For networks see python -m benchmarks networks. "
         f"{_at_same_bytes(forms)}",
     )
 
@@ -109,10 +100,10 @@ def _at_same_bytes(forms: Sequence[Form]) -> str:
     """By how much the separable field's worst error is better than the best keyframes' of the same bytes."""
     told = []
     for edit in dict.fromkeys(form.edit for form in forms):
-        own = [form for form in forms if form.edit == edit and form.worst is not None]
+        own = [form for form in forms if form.edit == edit]
         limit = next(form.bytes_per_member for form in own if form.label == "4 keyframes, int8") + 0.5
         best = {
-            kind: max(f.worst for f in own if kind in f.kind and f.bytes_per_member <= limit and f.worst)
+            kind: max(f.worst for f in own if kind in f.kind and f.bytes_per_member <= limit)
             for kind in ("separable", "keyframes")
         }
         told.append(f"{edit} {best['separable'] - best['keyframes']:+.1f} dB")
@@ -143,7 +134,7 @@ def _compose_table() -> Table:
             "members / Gaussians",
             "MB moved",
             "copying, ms",
-            "compose, ms",
+            "compose, processor ms",
             "Composer 1 thread, ms",
             "2 threads, ms",
             "of these for one member",
@@ -171,7 +162,7 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
             s = 0.03 + 0.9 * i / 50
             layer = Layer(edit, s)
             if i % 10 == 0:
-                times["plain"].append(milliseconds(partial(compose_layers, scene, [layer])))
+                times["plain"].append(processor_milliseconds(partial(compose_layers, scene, [layer])))
             for count in (1, 2):
                 set_threads(count)
                 composer.update([])

@@ -29,9 +29,9 @@ class Form:
         edit, members: what was edited
         kind: as the plot tells them apart
         label: what it is
-        numbers: stored, or learned by a network
+        numbers: stored
         bytes_per_member: on disk
-        curve: PSNR over the slider between the snapshots, dB; empty where it was not judged
+        curve: PSNR over the slider between the snapshots, dB
         at_snapshots: least PSNR at snapshots, dB
         seconds: to fit it, with the pictures that this looks at
         step: ms for one change of the slider, with one thread and with two
@@ -44,19 +44,19 @@ class Form:
     numbers: int
     bytes_per_member: float
     curve: tuple[float, ...]
-    at_snapshots: float | None
-    seconds: float | None
+    at_snapshots: float
+    seconds: float
     step: tuple[float, float]
 
     @property
-    def worst(self) -> float | None:
+    def worst(self) -> float:
         """Least PSNR over the slider, dB."""
-        return min(self.curve, default=None)
+        return min(self.curve)
 
     @property
-    def mean(self) -> float | None:
+    def mean(self) -> float:
         """Mean PSNR over the slider, dB."""
-        return sum(self.curve) / len(self.curve) if self.curve else None
+        return sum(self.curve) / len(self.curve)
 
 
 def baked_forms(course: KnownEdit) -> list[Form]:

@@ -18,8 +18,6 @@ STYLES: dict[str, tuple[tuple[int, int, int], str]] = {
     "keyframes, int8": ((214, 96, 36), "square"),
     "cubic keyframes, int8": ((196, 158, 28), "triangle"),
     "keyframes, float32": ((150, 140, 130), "ring"),
-    "neural": ((60, 150, 90), "cross"),
-    "neural, code": ((70, 160, 180), "plus"),
     "auto": (INK, "star"),
 }
 """Color and marker of each kind, in the order of the legend; the later lies above."""
@@ -61,10 +59,7 @@ class _Axis:
 
 
 def draw_forms(forms: Sequence[Form]) -> Image.Image:
-    """Small multiples: for each edit a panel over bytes a member and, below it, one over ms a slider step.
-
-    The network of the paper's size, which is not judged, is a dashed line at its ms and told by its bytes.
-    """
+    """Small multiples: for each edit a panel over bytes a member and, below it, one over ms a slider step."""
     edits = list(dict.fromkeys(form.edit for form in forms))
     groups = -(-len(edits) // COLUMNS)
     width = COLUMNS * PANEL[0] + 12
@@ -75,7 +70,7 @@ def draw_forms(forms: Sequence[Form]) -> Image.Image:
     _legend(draw, [kind for kind in STYLES if any(f.kind == kind for f in forms)], small)
     # one scale for all edits, so that panels can be compared
     scales = (
-        _Axis.around("bytes a member", [form.bytes_per_member for form in forms if form.curve]),
+        _Axis.around("bytes a member", [form.bytes_per_member for form in forms]),
         _Axis.around("ms a slider step", [min(form.step) for form in forms]),
     )
     for i, edit in enumerate(edits):
@@ -119,15 +114,7 @@ def _panel(
     draw.text(((left + right) / 2, bottom + 28 * _ZOOM), name, PALE, font, anchor="mm")
     points: dict[str, list[tuple[float, float]]] = {}
     for form, place in zip(forms, places, strict=True):
-        if form.worst is None and place > axis.high:
-            said = f"paper's 6 M: {place:,.0f} bytes".replace(",", " ")
-            draw.text((right - 4 * _ZOOM, bottom - 9 * _ZOOM), said, PALE, font, anchor="rm")
-        elif form.worst is None:
-            for dash in range(round(top), round(bottom), 8 * _ZOOM):
-                draw.line([(at_x(place), dash), (at_x(place), dash + 4 * _ZOOM)], PALE, _ZOOM)
-            draw.text((at_x(place) - 4 * _ZOOM, bottom - 9 * _ZOOM), "paper's 6 M", PALE, font, anchor="rm")
-        else:
-            points.setdefault(form.kind, []).append((at_x(place), at_y(form.worst)))
+        points.setdefault(form.kind, []).append((at_x(place), at_y(form.worst)))
     for kind, (color, _) in STYLES.items():
         if joined and len(points.get(kind, [])) > 1:
             path: list[tuple[float, float]] = sorted(points[kind])
@@ -150,12 +137,6 @@ def _mark(draw: ImageDraw.ImageDraw, kind: str, x: float, y: float) -> None:
         draw.polygon([(x - r, y), (x, y - 1.2 * r), (x + r, y), (x, y + 1.2 * r)], color)
     elif shape == "triangle":
         draw.polygon([(x - r, y + 0.8 * r), (x, y - r), (x + r, y + 0.8 * r)], color)
-    elif shape == "cross":
-        draw.line([(x - r, y - r), (x + r, y + r)], color, thin)
-        draw.line([(x - r, y + r), (x + r, y - r)], color, thin)
-    elif shape == "plus":
-        draw.line([(x - 1.2 * r, y), (x + 1.2 * r, y)], color, thin)
-        draw.line([(x, y - 1.2 * r), (x, y + 1.2 * r)], color, thin)
     else:
         turns = [math.pi * (i / 5 - 0.5) for i in range(10)]
         sizes = [(1.7 if i % 2 == 0 else 0.7) * r for i in range(10)]

@@ -31,8 +31,8 @@ ORDER = {
     "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
         optimize fit report plan pipeline evaluate cli""",
     "viewer": "__init__ camera gl state render files pictures ui panel app commands",
-    "benchmarks": """__init__ courses joint_svd table position_floor ablation field_forms rasterizer
-        recorded_runs viewer field_network field_plot field __main__""",
+    "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer
+        recorded_runs viewer field_plot field edits networks __main__""",
 }
 
 MOST_FILES = 14

@@ -1,0 +1,223 @@
+"""`python -m benchmarks edits --runs RUN …`: finished runs beside what is simpler, from afar and all along.
+
+Beside the slider stand two keyframes, re-timed as ours are, and a cross-fade of the rendered ends. What takes
+too long for every run's own report is measured here: 101 slider values, and views from elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera, look_at
+from progdf.errors import ProgdfError
+from progdf.field import BakedField
+from progdf.field.evaluate import sample_strengths
+from trainer.editors import VIEW_BY_VIEW, make_editor
+from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
+from trainer.fit.evaluate import Evaluator, make_evaluator
+from trainer.optimize.losses import perceptual_loss
+from trainer.report.curves import picture_courses
+from trainer.report.measures import COMPARED
+from trainer.views.choose import split_held_out
+from trainer.views.view import make_view
+
+from .table import Table
+
+RAISED, ZOOM = (30.0, -15.0), 3.0
+"""Degrees of elevation that far views stand above and below a held-out one; how near the third comes."""
+
+VALUES = 101
+
+EDIT_NOTE = (
+    "PSNR on all held-out views, over the pixels that show the region or that the editor changes; LPIPS over "
+    "each view's box. 2 keyframes: original and end, a straight line in raw parameters, made even as ours "
+    "is. Cross-fade: the rendered ends, blended in sRGB. Even: smallest over largest change of 20 equal "
+    "steps. A file holds the field, the region, the plan and the report."
+)
+SLIDER_NOTE = (
+    "Against the recording, on the half of the held-out views on which the field was not chosen. Far views: "
+    f"each of these from {RAISED[0]:.0f}° above, from {-RAISED[1]:.0f}° below, and {ZOOM:.0f} times as near "
+    "by its lens; nothing was trained, chosen or asked for there. Where the editor is a function of the "
+    "picture it is asked for these views too, at the strengths that training used."
+)
+
+
+def tables(runs: Sequence[Path] = ()) -> list[Table]:
+    """Measure finished runs.
+
+    Raises:
+        ProgdfError: no run is named, or one is not finished.
+    """
+    if not runs:
+        raise ProgdfError("edits are those of finished runs; name some with --runs")
+    opened = [open_run(run) for run in runs]
+    return [edit_table(opened), slider_table(opened)]
+
+
+def edit_table(opened: Sequence[OpenedRun]) -> Table:
+    """Each edit against the editor's own pictures."""
+    perceptual, _ = perceptual_loss()
+    rows = []
+    for run in opened:
+        strength = dict(run.trajectory.asked)
+        curves = picture_courses(
+            run.evaluator,
+            run.contenders(),
+            tuple(strength),
+            lambda s, run=run, strength=strength: run.evaluator.edited[strength[s]],  # type: ignore[misc]
+            perceptual,
+        )
+        quarters = [
+            min(range(len(strength)), key=lambda i, q=q: abs(list(strength)[i] - q))  # type: ignore[misc]
+            for q in (0.25, 0.5, 0.75)
+        ]
+        between = len(strength) > 1
+        rows.append(
+            (
+                _title(run),
+                *(
+                    " / ".join(f"{curves[name].psnr[i]:.1f}" for i in quarters) if between else "-"
+                    for name in (SLIDER, KEYFRAMES, FADE)
+                ),
+                f"{curves[SLIDER].psnr[-1]:.1f}",
+                f"{curves[SLIDER].lpips[-1]:.4f}",
+                f"{run.report['slider']['uniformity']:.2f}",
+                f"{run.gdf.field.bytes_per_member:.0f} / {_file_bytes(run):.0f}",
+                f"{run.report['time']['total']:.0f}",
+            )
+        )
+    return Table(
+        name="edits",
+        title="Edits against the editor's own pictures",
+        columns=(
+            "edit",
+            "slider, about s = ¼ / ½ / ¾, dB",
+            "2 keyframes, re-timed",
+            "cross-fade",
+            "all at 1",
+            f"{perceptual.name} at 1",
+            "even",
+            "bytes a Gaussian, field / file",
+            "run, s",
+        ),
+        rows=tuple(rows),
+        note=EDIT_NOTE,
+    )
+
+
+def slider_table(opened: Sequence[OpenedRun]) -> Table:
+    """Each field against what was recorded, at 101 slider values and in views from elsewhere."""
+    rows = []
+    for run in opened:
+        _, reporting = run.evaluator.halves()
+        inner = [i / (VALUES - 1) for i in range(1, VALUES - 1)]
+        few = sample_strengths()
+        report = run.report
+        far = far_evaluator(run)
+        rows.append(
+            (
+                _title(run),
+                f"{report['field']['psnr_mean']:.1f} / {report['field']['psnr_worst']:.1f}",
+                f"{report['baselines'][COMPARED]['psnr_mean']:.1f} / "
+                f"{report['baselines'][COMPARED]['psnr_worst']:.1f}",
+                f"{min(_against_recording(run, reporting, inner)):.1f}",
+                _mean_worst(_against_recording(run, far, few)),
+                *_from_elsewhere(run, far),
+            )
+        )
+    return Table(
+        name="slider values",
+        title="Fields against their recordings, and edits from elsewhere",
+        columns=(
+            "edit",
+            "field, mean / worst of 13 values, dB",
+            "2 keyframes",
+            f"worst of {VALUES} values",
+            "far views, mean / worst of 13",
+            "far views: to the editor's pictures at 1",
+            "between, mean / worst",
+            "2 keyframes, between",
+        ),
+        rows=tuple(rows),
+        note=SLIDER_NOTE,
+    )
+
+
+def far_evaluator(run: OpenedRun) -> Evaluator:
+    """Views from elsewhere, beside the editor's pictures of them where it can make any."""
+    scene, region, setup = run.setup.scene, run.setup.region, run.setup
+    _, reporting = split_held_out(setup.held_out)
+    center = scene.means[region.members].mean(dim=0)
+    up = setup.up.direction if setup.up is not None else torch.tensor([0.0, 1.0, 0.0])
+    cameras = [far for view in reporting for far in far_cameras(view.camera, center, up)]
+    views = [make_view(scene, region, camera, setup.background) for camera in cameras]
+    views = [view for view in views if bool((view.mask > 0.05).any())]
+    edited: dict[float, list[Tensor]] = {}
+    plan = run.run.record.plan
+    if plan.editor.family not in VIEW_BY_VIEW:
+        settings = plan.editor.settings(run.run.folder.painted)
+        editor = make_editor(plan.editor.editor, scene, region, [*setup.train, *setup.held_out], settings)
+        edited = {s: [editor.edit(view, s) for view in views] for s in run.trajectory.strengths}
+    channels = run.trajectory.end.shape[1]
+    return make_evaluator(scene, region, views, edited, setup.background, channels)
+
+
+def far_cameras(camera: Camera, center: Tensor, up: Tensor) -> list[Camera]:
+    """The camera raised, lowered and zoomed in, all looking at `center`. [3], [3]"""
+    unit = up / up.norm()
+    arm = camera.position - center
+    side = torch.linalg.cross(unit, arm)
+    side = side / side.norm().clamp_min(1e-9)
+
+    def stand(place: Tensor, zoom: float = 1.0) -> Camera:
+        K = camera.K.clone()
+        K[:2, :2] *= zoom
+        return replace(camera, viewmat=look_at(place, center, unit), K=K)
+
+    found = []
+    for degrees in RAISED:
+        # about the side, by which a positive turn lowers
+        angle = -math.radians(degrees)
+        turned = arm * math.cos(angle) + torch.linalg.cross(side, arm) * math.sin(angle)
+        found.append(stand(center + turned))
+    return [*found, stand(camera.position, ZOOM)]
+
+
+def _against_recording(run: OpenedRun, views: Evaluator, values: Sequence[float]) -> list[float]:
+    field = run.gdf.field
+    return [
+        views.psnr(views.pictures(field.offsets(s)), views.pictures(run.trajectory.at(s))) for s in values
+    ]
+
+
+def _from_elsewhere(run: OpenedRun, far: Evaluator) -> tuple[str, str, str]:
+    """The shipped field at 1 and between, and two keyframes between, against the editor's pictures."""
+    if not far.edited:
+        return "-", "-", "-"
+
+    def errors(field: BakedField) -> list[float]:
+        asked = run.trajectory.asked
+        return [far.psnr(far.pictures(field.offsets(s)), far.edited[strength]) for s, strength in asked]
+
+    ours, plain = errors(run.gdf.field), errors(run.keyframes)
+    return f"{ours[-1]:.1f}", _mean_worst(ours[:-1]), _mean_worst(plain[:-1])
+
+
+def _mean_worst(values: Sequence[float]) -> str:
+    return f"{sum(values) / len(values):.1f} / {min(values):.1f}" if values else "-"
+
+
+def _title(run: OpenedRun) -> str:
+    plan = run.run.record.plan
+    return f"{plan.name}: {plan.editor.editor}, {len(run.gdf.region)} members"
+
+
+def _file_bytes(run: OpenedRun) -> float:
+    path = run.run.folder.gdf(run.run.record.plan.name)
+    return path.stat().st_size / max(1, len(run.gdf.region))

@@ -1,0 +1,228 @@
+"""`python -m benchmarks networks --runs RUN …`: networks trained to the end, judged beside what is shipped.
+
+A network is trained as `progdf fit --field neural` trains one of its size, on the numbers of the recording,
+judged as it answers itself and as it is baked, and timed both ways. Trained networks are kept in
+RUN/networks, so that an interrupted benchmark goes on.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from progdf.compose.composer import Composer
+from progdf.compose.layers import Layer
+from progdf.errors import ProgdfError
+from progdf.field import (
+    BakedField,
+    NeuralField,
+    NeuralSettings,
+    bake_network,
+    choose_field,
+    fit_keyframes,
+    fit_neural,
+)
+from progdf.field.evaluate import Field
+from progdf.field.neural_fit import NeuralFit
+from progdf.field.separable import moving_attributes
+from progdf.gaussians import Gaussians, pack
+from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.io.atomic import make_folder
+from progdf.rasterize import set_threads
+
+from .courses import KnownEdit, edit_of, processor_milliseconds
+from .field_forms import stored_numbers
+from .recorded_runs import recorded_edit
+from .table import Table
+
+NETWORKS: Mapping[str, NeuralSettings] = {
+    "tiny": NeuralSettings("tiny"),
+    "small": NeuralSettings("small"),
+    "paper's 6 M, hard bins": NeuralSettings("paper", "position", bins="hard"),
+    "paper's 6 M, smooth bins": NeuralSettings("paper", "position"),
+}
+
+LONGEST = 600.0
+"""Seconds of processor time that a network may take to train; others are timed untrained."""
+
+ROUNDS = 15
+"""Slider steps that are timed."""
+
+
+NOTE = (
+    "PSNR against the recording, at 13 slider values, in held-out views that no choice has seen, over the "
+    "pixels that show the region or that the edit changes. A training step draws as many members as there "
+    "are, at most 2048 (6 M: 1024); what would take more than ten minutes of one core is timed untrained. "
+    f"ms: median processor time of {ROUNDS} slider steps on one thread, all fields in turns; asked is the "
+    "network's answer alone, baked the step of the viewer with all new attributes. The paper gives 20 ms on "
+    "a V100 for its own, which cannot be checked here."
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One network of one edit.
+
+    Args:
+        network: as it is stored
+        baked: as the viewer shows it
+        steps: of training, 0 where it would take too long
+        seconds: of processor time that they took
+    """
+
+    network: NeuralField
+    baked: BakedField
+    steps: int
+    seconds: float
+
+
+def tables(runs: Sequence[Path] = ()) -> list[Table]:
+    """Judge networks on the recorded edits of finished runs.
+
+    Raises:
+        ProgdfError: no run is named, or one is not finished.
+    """
+    if not runs:
+        raise ProgdfError("networks are trained on finished runs; name some with --runs")
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    set_threads(1)
+    try:
+        rows = [row for run in runs for row in _rows(run, recorded_edit(run))]
+    finally:
+        torch.set_num_threads(before)
+        set_threads(None)
+    return [
+        Table(
+            name="networks",
+            title="Networks, trained to the end",
+            columns=(
+                "edit",
+                "field",
+                "numbers",
+                "bytes a Gaussian, no header",
+                "steps",
+                "processor s to fit",
+                "as it answers: mean / worst, dB",
+                "baked: mean / worst, dB",
+                "asked: ms a slider step",
+                "µs a Gaussian",
+                "baked: ms a slider step",
+                "asked / baked",
+            ),
+            rows=tuple(rows),
+            note=NOTE,
+        )
+    ]
+
+
+def _rows(run: Path, course: KnownEdit) -> list[tuple[str, ...]]:
+    before = pack(course.scene[course.members])
+    make_folder(run / "networks")
+    baked: dict[str, BakedField] = {}
+    seconds: dict[str, float] = {}
+    begin = time.process_time()
+    baked["2 keyframes"] = fit_keyframes(course.strengths, course.offsets, 2)
+    seconds["2 keyframes"] = time.process_time() - begin
+    begin = time.process_time()
+    best = choose_field(
+        course.strengths, course.offsets, course.look, course.weights, evaluator=course.chooser
+    ).best
+    baked["auto"] = best.field
+    seconds["auto"] = time.process_time() - begin
+    networks = {name: _trained(run, name, settings, course) for name, settings in NETWORKS.items()}
+    baked |= {name: found.baked for name, found in networks.items()}
+    asked = {name: found.network.bind(before) for name, found in networks.items()}
+    works: dict[str, Callable[[float], object]] = {
+        f"{name}, baked": _composed(course.scene, edit_of(course.scene, course.members, field))
+        for name, field in baked.items()
+    }
+    works |= {name: bound.offsets for name, bound in asked.items()}
+    ms = turns_ms(works)
+
+    def judged(field: Field) -> str:
+        curve = course.judge.curve(field)
+        return f"{statistics.mean(curve):.1f} / {min(curve):.1f}"
+
+    rows: list[tuple[str, ...]] = []
+    for name, field in baked.items():
+        network = networks.get(name)
+        trained = network is None or network.steps > 0
+        size = field.bytes_per_member
+        step, composed = ms.get(name), ms[f"{name}, baked"]
+        count = network.network.parameters if network else stored_numbers(field)
+        rows.append(
+            (
+                f"{course.name}, {len(course.members)} members",
+                f"auto at 40 dB: {best.label}" if name == "auto" else name,
+                f"{count:,}".replace(",", " "),
+                f"{size:.0f}",
+                str(network.steps) if network and trained else "-",
+                f"{network.seconds if network else seconds[name]:.1f}" if trained else "-",
+                judged(asked[name]) if network and trained else "-",
+                judged(field) if trained else "-",
+                "-" if step is None else f"{step:.2f}",
+                "-" if step is None else f"{1e3 * step / len(course.members):.1f}",
+                f"{composed:.3f}",
+                "-" if step is None else f"{step / composed:.0f}×",
+            )
+        )
+    return rows
+
+
+def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) -> Trained:
+    """The network of that name, from the run's folder or trained now."""
+    path = run / "networks" / f"{name.replace(', ', '-').replace(' ', '-')}.gdf"
+    before, members = pack(course.scene[course.members]), len(course.members)
+    effort = settings.resolve()
+    settings = replace(effort, batch=min(effort.batch, members))
+    if not path.is_file():
+        if (each := _step_seconds(course, settings)) * settings.steps > LONGEST:
+            fit = _begin(course, settings)
+            return Trained(fit.field(), bake_network(fit.field(), before), 0, each * settings.steps)
+        begin = time.process_time()
+        network = fit_neural(course.strengths, course.offsets, before, settings, course.weights, course.look)
+        took = {"steps": settings.steps, "seconds": round(time.process_time() - begin, 1)}
+        made = edit_of(course.scene, course.members, bake_network(network, before, course.truth))
+        save_gdf(path, replace(made, name=name, report=took))
+    kept = load_gdf(path, course.scene)
+    assert kept.field.origin is not None
+    return Trained(kept.field.origin.network, kept.field, kept.report["steps"], kept.report["seconds"])
+
+
+def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:
+    before = pack(course.scene[course.members])
+    fit = NeuralFit(before, course.offsets.shape[2], tuple(moving_attributes(course.offsets)), settings)
+    fit.scale_to(course.offsets)
+    return fit
+
+
+def _step_seconds(course: KnownEdit, settings: NeuralSettings) -> float:
+    """Processor time of one training step."""
+    fit = _begin(course, settings)
+    fit.step(course.strengths, course.offsets)
+    begin = time.process_time()
+    fit.step(course.strengths, course.offsets)
+    return time.process_time() - begin
+
+
+def _composed(scene: Gaussians, edit: Gdf) -> Callable[[float], object]:
+    """A slider step of the viewer, as far as attributes go: strength -> all of them, anew."""
+    composer = Composer(scene, [edit])
+    return lambda s: composer.update([Layer(edit, s)])
+
+
+def turns_ms(works: Mapping[str, Callable[[float], object]]) -> dict[str, float]:
+    """Median processor time of each at ever other strengths, all in turns, ms."""
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for i in range(ROUNDS + 1):
+        s = 0.03 + 0.9 * i / ROUNDS
+        for name, work in works.items():
+            times[name].append(processor_milliseconds(partial(work, s)))
+    return {name: statistics.median(found[1:]) for name, found in times.items()}
