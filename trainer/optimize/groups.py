@@ -1,15 +1,15 @@
-"""The group stage: before anything bends, each connected part is moved as a whole to where the edit shows it.
+"""The group stage: before members descend on their own, the region is moved to where the edit shows it.
 
 Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever color
-it lies on. So the parts' motions are found first, and the members' own offsets live in the frames of their
-parts from then on: what is learnt of a hand moves, turns and grows with the hand (docs/method.md 3).
-The way between two strengths is the parts' way, not the optimizer's: a slider shows the hand in motion.
+it lies on. So the parts' motions are found first, each a whole. Where those leave much of the way, as of an
+ear that is bent or an arm that is stretched, control points bend the region. The members' own offsets live in
+the moved frames from then on: what is learnt of a hand moves, turns and grows with it (docs/method.md 3).
+The way between two strengths is theirs too, not the optimizer's: a slider shows the hand in motion.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,11 +17,15 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
+from trainer.motion.descent import OnStep
+from trainer.motion.part_search import GroupSearch
+from trainer.motion.parts import connected_parts
+from trainer.motion.placement import PartsPlacement, Placement, WarpPlacement, between
+from trainer.motion.similarity import Motion, Parts, make_parts
+from trainer.motion.warp import WarpMotion, rest_warp, warp_of_parts
+from trainer.motion.warp_search import WarpSearch
 from trainer.views.crops import CropScene, render_all
 
-from .group_search import GroupSearch, OnStep
-from .motion import Motion, Parts, carry_offsets, interpolate_motion, local_offsets, make_parts
-from .parts import connected_parts
 from .pgs import TargetStage, visible_way
 
 GROWTH = 2.0
@@ -32,6 +36,9 @@ GROWTH = 2.0
 # was (docs/experiments.md, Parts that move).
 _EXTENT, _LEFT, _REST = 7.0, 0.065, 0.28
 
+_WHOLE = 0.25  # share of the distance that parts may leave and still count as moved as wholes
+_BETTER = 0.9  # share of what parts leave that control points may leave: they cost more and hold less
+
 
 @dataclass(frozen=True)
 class Groups:
@@ -40,24 +47,38 @@ class Groups:
     Args:
         parts: the region taken apart
         motions: of the parts, one per stage
+        warps: of control points, one per stage; none where parts moved as wholes
     """
 
     parts: Parts
     motions: tuple[Motion, ...]
+    warps: tuple[WarpPlacement, ...] = ()
 
     @property
     def extent(self) -> float:
-        """Size of what the members still have to move within their parts, world units."""
+        """Size of what the members still have to move within their frames, world units."""
         return _EXTENT * float(self.parts.sizes.mean())
+
+    @property
+    def placements(self) -> tuple[Placement, ...]:
+        """Where each stage ends."""
+        return self.warps or tuple(PartsPlacement(self.parts, motion) for motion in self.motions)
+
+    @property
+    def rest(self) -> Placement:
+        """Where the first stage begins."""
+        if self.warps:
+            return WarpPlacement(self.warps[0].control, rest_warp(self.warps[0].control))
+        return PartsPlacement(self.parts, self.parts.rest_motion())
 
     def to_stages(
         self, original: Tensor, crops: Sequence[CropScene], stages: Sequence[TargetStage]
     ) -> list[TargetStage]:
-        """The stages, their members' offsets now in the parts' frames. `original`: raw member rows [M,C]"""
+        """The stages, their members' offsets now in the moved frames. `original`: raw member rows [M,C]"""
         before: Sequence[Tensor] = render_all(crops, original)
         staged = []
-        for stage, motion in zip(stages, self.motions, strict=True):
-            place = partial(self._place, original, motion)
+        for stage, placement in zip(stages, self.placements, strict=True):
+            place = partial(placement.carry, original)
             found = render_all(crops, original + place(torch.zeros_like(original)))
             whole, _ = visible_way(stage.targets, before)
             rest, left = visible_way(stage.targets, found)
@@ -66,24 +87,18 @@ class Groups:
             before = stage.targets
         return staged
 
-    def _place(self, original: Tensor, motion: Motion, offsets: Tensor) -> Tensor:
-        return carry_offsets(original, offsets, self.parts, motion)
-
     def lines(self) -> list[str]:
-        """What the log says of the finished edit: where each part went, in its own sizes."""
-        motion, sizes = self.motions[-1], self.parts.sizes
-        return [
-            f"part {index}, {int((self.parts.part == index).sum())} Gaussians: moved by "
-            f"{float(motion.shift[index].norm() / sizes[index]):.2f} of its size, turned by "
-            f"{math.degrees(float(motion.turn[index].norm())):.0f} degrees, "
-            f"{math.exp(float(motion.log_scale[index])):.2f} times as large"
-            for index in range(len(sizes))
-        ]
+        """What the log says of the finished edit."""
+        return self.placements[-1].lines()
 
     def capture_state(self) -> dict[str, Tensor]:
-        """Part of each member [M] and motions [T,P,7]; `restore_groups` takes them."""
+        """Part of each member [M], motions [T,P,7] and warps [T,C,12]; `restore_groups` takes them."""
         motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
-        return {"part": self.parts.part, "motions": torch.stack(motions)}
+        state = {"part": self.parts.part, "motions": torch.stack(motions)}
+        if self.warps:
+            warps = [torch.cat([w.motion.shift, w.motion.turn, w.motion.stretch], dim=1) for w in self.warps]
+            state["warps"] = torch.stack(warps)
+        return state
 
 
 def group_stage(
@@ -93,16 +108,18 @@ def group_stage(
     steps: int = 120,
     seed: int = 0,
     on_step: OnStep | None = None,
+    strengths: Sequence[float] = (),
 ) -> Groups:
-    """Find the parts and their motions; the same inputs give the same bits.
+    """Find the parts and their motions, and bend what those leave; the same inputs give the same bits.
 
     Args:
         original: raw member rows. [M,C]
         crops: the training views
         targets: of each stage, the edited box of each view. [h,w,3] each
-        steps: of a search; a stage takes one or two
+        steps: of a search; a stage takes one or two, and one a level of control points where it is bent
         seed: order of the views
         on_step: progress: steps done in all, each stage counting as `steps` however many it takes; loss
+        strengths: of the stages; even where not given
 
     Raises:
         FloatingPointError: the loss is not finite.
@@ -111,21 +128,66 @@ def group_stage(
     parts = make_parts(original, connected_parts(means))
     search = GroupSearch(original, parts, crops, steps, seed)
     motions: list[Motion] = []
+
+    def step_done(stage: int, step: int, loss: float) -> None:
+        if on_step is not None:
+            on_step(stage * steps + step, loss)
+
     for stage, pictures in enumerate(targets):
-
-        def step_done(step: int, loss: float, begun: int = stage * steps) -> None:
-            if on_step is not None:
-                on_step(begun + step, loss)
-
         start = motions[-1] if motions else parts.rest_motion()
-        motions.append(search.find(pictures, start, step_done))
-    return Groups(parts, tuple(motions))
+        motions.append(search.find(pictures, start, partial(step_done, stage)))
+    groups = Groups(parts, tuple(motions))
+    left = search.distance(targets[-1], motions[-1])
+    if left <= _WHOLE * search.distance(targets[-1], parts.rest_motion()):
+        return groups
+    return bend_groups(groups, search, targets, strengths or range(1, len(targets) + 1), step_done)
 
 
 def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
     """What `Groups.capture_state` gave, of the same members."""
     motions = tuple(Motion(m[:, :3], m[:, 3], m[:, 4:]) for m in saved["motions"])
-    return Groups(make_parts(original, saved["part"]), motions)
+    warps: tuple[WarpPlacement, ...] = ()
+    if "warps" in saved:
+        control = WarpSearch(original, saved["part"], ()).levels[-1]
+        warps = tuple(
+            WarpPlacement(control, WarpMotion(w[:, :3], w[:, 3:6], w[:, 6:])) for w in saved["warps"]
+        )
+    return Groups(make_parts(original, saved["part"]), motions, warps)
+
+
+def bend_groups(
+    groups: Groups,
+    search: GroupSearch,
+    targets: Sequence[Sequence[Tensor]],
+    strengths: Sequence[float],
+    on_step: Callable[[int, int, float], None],
+) -> Groups:
+    """The same region bent by control points, each stage from where the last one ended.
+
+    Args:
+        groups: parts moved as wholes
+        search: that found their motions
+        targets, strengths: of the stages
+        on_step: progress: stage, steps done in it, loss
+
+    Returns:
+        `groups` as they are where control points do not come clearly nearer to the finished edit.
+    """
+    parts = groups.parts
+    bending = WarpSearch(search.original, parts.part, search.crops, search.steps, search.seed)
+    control, motions = bending.levels[-1], list[WarpMotion]()
+    for stage, pictures in enumerate(targets):
+        done = partial(on_step, stage)
+        if stage:
+            further = strengths[stage] / strengths[stage - 1]
+            motions.append(bending.find_next(pictures, motions[-1], further, done))
+        else:
+            coarse = warp_of_parts(bending.levels[0], parts, groups.motions[0])
+            motions.append(bending.find_first(pictures, coarse, done))
+    left = bending.distance(targets[-1], motions[-1])
+    if left > _BETTER * search.distance(targets[-1], groups.motions[-1]):
+        return groups
+    return replace(groups, warps=tuple(WarpPlacement(control, motion) for motion in motions))
 
 
 def group_path(
@@ -143,16 +205,16 @@ def group_path(
     Returns:
         (step, stage, ends_stage, offsets [M,C] float16) in order, as `trajectory.record` takes them
     """
-    motion, own, begun = groups.parts.rest_motion(), torch.zeros_like(original), 0
+    placement, own, begun = groups.rest, torch.zeros_like(original), 0
     each = max(2, count // len(ends))
     found = []
-    for stage, (end, step, next_motion) in enumerate(zip(ends, steps, groups.motions, strict=True)):
-        next_own = local_offsets(original, end, groups.parts, next_motion)
+    for stage, (end, step, after) in enumerate(zip(ends, steps, groups.placements, strict=True)):
+        next_own = after.carry_back(original, end)
         for i in range(1, each):
             share = i / each
-            halfway = interpolate_motion(motion, next_motion, share)
-            offsets = carry_offsets(original, torch.lerp(own, next_own, share), groups.parts, halfway)
+            halfway = between(placement, after, share)
+            offsets = halfway.carry(original, torch.lerp(own, next_own, share))
             found.append((begun + round(share * (step - begun)), stage, False, offsets.half()))
         found.append((step, stage, True, end.half()))
-        motion, own, begun = next_motion, next_own, step
+        placement, own, begun = after, next_own, step
     return found

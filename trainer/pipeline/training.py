@@ -105,7 +105,7 @@ def optimize_members(
     ]
     groups = None
     if optimization.group_steps:
-        groups = _groups(optimization, original, crops, [stage.targets for stage in stages], folder, log)
+        groups = _groups(optimization, original, crops, stages, folder, log)
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
@@ -221,7 +221,7 @@ def _groups(
     optimization: Optimization,
     original: Tensor,
     crops: Sequence[CropScene],
-    targets: Sequence[Sequence[Tensor]],
+    stages: Sequence[TargetStage],
     folder: StateFolder,
     log: RunLog,
 ) -> Groups:
@@ -231,14 +231,15 @@ def _groups(
         return restore_groups(original, done.tensors)
     steps = optimization.group_steps
     try:
-        with log.steps("move parts", steps * len(targets)) as advance:
+        with log.steps("move parts", steps * len(stages)) as advance:
             groups = group_stage(
                 original,
                 crops,
-                targets,
+                [stage.targets for stage in stages],
                 steps,
                 optimization.seed,
                 lambda step, loss: advance(step, f"loss {loss:.4f}"),
+                [stage.strength for stage in stages],
             )
     except FloatingPointError as error:
         raise ProgdfError(

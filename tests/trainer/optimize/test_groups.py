@@ -15,10 +15,9 @@ from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth
 from tests.helpers.trained import WHITE, Small, quick_options, small, train
-from trainer.optimize.group_search import GroupSearch
-from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.motion import (
+from trainer.motion.part_search import GroupSearch
+from trainer.motion.parts import connected_parts
+from trainer.motion.similarity import (
     Motion,
     Parts,
     carry_offsets,
@@ -27,8 +26,9 @@ from trainer.optimize.motion import (
     make_parts,
     move_rows,
 )
+from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
+from trainer.optimize.losses import GradientL1
 from trainer.optimize.objective import LossWeights, Objective
-from trainer.optimize.parts import connected_parts
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.pipeline.run import RunResult
 from trainer.views.crops import CropScene, crop_scene

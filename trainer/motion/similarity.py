@@ -13,6 +13,8 @@ from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
 
+from .rotations import multiply_quats, quat_turns, rotate, turn_quats
+
 _COLUMNS = attribute_slices(BASE_CHANNELS)
 _MOVING = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row
 
@@ -71,10 +73,10 @@ def move_rows(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
     """Raw rows where the motion takes them; differentiable in both. [M,≥10] -> [M,≥10]"""
     part = parts.part
     means, log_scales, quats = _split(rows)
-    turn, size = _quaternion(motion.turn)[part], motion.log_scale[part, None]
+    turn, size = turn_quats(motion.turn)[part], motion.log_scale[part, None]
     arm = means - parts.centers[part]
-    means = parts.centers[part] + motion.shift[part] + size.exp() * _rotate(arm, turn)
-    return torch.cat([means, log_scales + size, _product(turn, quats), rows[:, _MOVING.stop :]], dim=1)
+    means = parts.centers[part] + motion.shift[part] + size.exp() * rotate(arm, turn)
+    return torch.cat([means, log_scales + size, multiply_quats(turn, quats), rows[:, _MOVING.stop :]], dim=1)
 
 
 def carry_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
@@ -99,52 +101,27 @@ def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
     """The inverse of `carry_offsets`. [M,C] -> [M,C]"""
     moving, part = _MOVING, parts.part
     means, log_scales, quats = _split(original[:, moving] + offsets[:, moving])
-    back, size = _quaternion(-motion.turn)[part], motion.log_scale[part, None]
+    back, size = turn_quats(-motion.turn)[part], motion.log_scale[part, None]
     arm = means - parts.centers[part] - motion.shift[part]
-    own = [parts.centers[part] + _rotate(arm, back) * (-size).exp(), log_scales - size, _product(back, quats)]
+    own = [
+        parts.centers[part] + rotate(arm, back) * (-size).exp(),
+        log_scales - size,
+        multiply_quats(back, quats),
+    ]
     return torch.cat([torch.cat(own, dim=1) - original[:, moving], offsets[:, moving.stop :]], dim=1)
 
 
 def interpolate_motion(a: Motion, b: Motion, share: float) -> Motion:
     """The way from one motion to another: shift and log-scale straight, the turn along the great circle."""
-    start = _quaternion(a.turn)
-    rest = _rotation_vector(_product(_quaternion(-a.turn), _quaternion(b.turn)))
+    start = turn_quats(a.turn)
+    rest = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     return Motion(
         torch.lerp(a.shift, b.shift, share),
         torch.lerp(a.log_scale, b.log_scale, share),
-        _rotation_vector(_product(start, _quaternion(share * rest))),
+        quat_turns(multiply_quats(start, turn_quats(share * rest))),
     )
 
 
 def _split(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Means [M,3], log-scales [M,3] and quaternions [M,4] of packed rows."""
     return rows[:, _COLUMNS["means"]], rows[:, _COLUMNS["log_scales"]], rows[:, _COLUMNS["quats"]]
-
-
-def _quaternion(turn: Tensor) -> Tensor:
-    """Unit quaternion wxyz of a rotation vector, smooth at zero. [P,3] -> [P,4]"""
-    half = 0.5 * (turn.square().sum(dim=1, keepdim=True) + 1e-12).sqrt()
-    return torch.cat([half.cos(), 0.5 * turn * half.sin() / half], dim=1)
-
-
-def _rotation_vector(quaternion: Tensor) -> Tensor:
-    """Of at most half a turn. [P,4] -> [P,3]"""
-    quaternion = torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
-    sine = quaternion[:, 1:].norm(dim=1, keepdim=True)
-    angle = 2.0 * torch.atan2(sine, quaternion[:, :1])
-    return torch.where(sine > 1e-9, quaternion[:, 1:] * angle / sine.clamp_min(1e-9), 2.0 * quaternion[:, 1:])
-
-
-def _rotate(vectors: Tensor, turn: Tensor) -> Tensor:
-    """Vectors turned by unit quaternions. [M,3], [M,4] -> [M,3]"""
-    axis = turn[:, 1:]
-    twice = 2.0 * torch.linalg.cross(axis, vectors)
-    spun: Tensor = vectors + turn[:, :1] * twice + torch.linalg.cross(axis, twice)
-    return spun
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton's product, wxyz. [M,4], [M,4] -> [M,4]"""
-    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(dim=1, keepdim=True)
-    xyz = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])
-    return torch.cat([w, xyz], dim=1)

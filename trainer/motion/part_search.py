@@ -6,8 +6,7 @@ what both are blurred to.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,18 +15,15 @@ from torch.nn.functional import avg_pool2d
 
 from trainer.views.crops import CropScene
 
-from .motion import Motion, Parts, move_rows
+from .descent import OnStep, descend, falling
+from .similarity import Motion, Parts, move_rows
 
 _BLURS = (9, 21)  # pixels
 _WIDE_BLURS = (0.4, 0.2, 0.1)  # of the box's longer side: a part feels a place three times its size away
 _WIDE = 0.4  # share of a wide search's steps that see no more than those, shift thrice as fast, never turn
 _RATES = (0.06, 0.03, 0.03)  # a step of shift in part sizes, of log-scale, of turn in radians
-_SETTLED = 0.25  # share of the steps, the last, over which the motion is averaged
 _MISSED = 0.25  # share of the distance that is left where the near search is taken to have lost its way
 _MOVING = ("means", "log_scales", "quats")
-
-OnStep = Callable[[int, float], None]
-"""Called after every step: steps done, loss."""
 
 
 @dataclass(frozen=True)
@@ -79,47 +75,25 @@ class GroupSearch:
 
     def distance(self, targets: Sequence[Tensor], motion: Motion) -> float:
         """Mean distance of all views from their targets, at full sharpness and blurred."""
-        with torch.no_grad():
-            rows = move_rows(self.original, self.parts, motion)
-            pairs = zip(self.crops, targets, strict=True)
-            return sum(float(_distance(crop, rows, target)) for crop, target in pairs) / len(targets)
+        return mean_distance(self.crops, move_rows(self.original, self.parts, motion), targets)
 
     def _search(self, targets: Sequence[Tensor], start: Motion, wide: bool, on_step: OnStep | None) -> Motion:
         values = torch.cat(
             [start.shift / self.parts.sizes[:, None], start.log_scale[:, None], start.turn], dim=1
-        ).requires_grad_()
+        )
         shift, size, turn = _RATES
         rates = torch.tensor([shift] * 3 + [size] + [turn] * 3)
         wide_rates = torch.tensor([3 * shift] * 3 + [size] + [0.0] * 3)
-        first, second = torch.zeros_like(values), torch.zeros_like(values)
-        settled = torch.zeros_like(values)
-        averaged = max(1, round(_SETTLED * self.steps))
         widening = round(_WIDE * self.steps) if wide else 0
-        order = torch.Generator().manual_seed(self.seed)
-        queue: list[int] = []
-        for step in range(self.steps):
-            if not queue:
-                queue = torch.randperm(len(self.crops), generator=order).tolist()
-            view = queue.pop()
+
+        def loss_in(values: Tensor, view: int, step: int) -> Tensor:
             rows = move_rows(self.original, self.parts, _motion(values, self.parts))
-            loss = _distance(self.crops[view], rows, targets[view], wide=step < widening)
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                raise FloatingPointError(f"the loss is {value} at step {step} of the group stage")
-            (gradient,) = torch.autograd.grad(loss, values)
-            with torch.no_grad():
-                # Adam with short memories: there are few steps, and few numbers to find
-                first.lerp_(gradient, 0.2)
-                second.lerp_(gradient.square(), 0.02)
-                mean = first / (1 - 0.8 ** (step + 1))
-                spread = (second / (1 - 0.98 ** (step + 1))).sqrt()
-                fall = 0.5 + 0.5 * math.cos(math.pi * max(0, step - widening) / (self.steps - widening))
-                rate = wide_rates if step < widening else (0.05 + 0.95 * fall) * rates
-                values -= rate * mean / (spread + 1e-12)
-                if self.steps - step <= averaged:
-                    settled += values / averaged
-            if on_step is not None:
-                on_step(step + 1, value)
+            return view_distance(self.crops[view], rows, targets[view], wide=step < widening)
+
+        def rates_at(step: int) -> Tensor:
+            return wide_rates if step < widening else falling(step - widening, self.steps - widening) * rates
+
+        settled = descend(values, loss_in, rates_at, self.steps, len(self.crops), self.seed, on_step=on_step)
         return _motion(settled, self.parts)
 
 
@@ -127,7 +101,14 @@ def _motion(values: Tensor, parts: Parts) -> Motion:
     return Motion(values[:, :3] * parts.sizes[:, None], values[:, 3], values[:, 4:])
 
 
-def _distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = False) -> Tensor:
+def mean_distance(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Tensor]) -> float:
+    """Mean distance of all views from their targets, at full sharpness and blurred. `rows`: members' [M,C]"""
+    with torch.no_grad():
+        pairs = zip(crops, targets, strict=True)
+        return sum(float(view_distance(crop, rows, target)) for crop, target in pairs) / len(targets)
+
+
+def view_distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = False) -> Tensor:
     """L1 at full sharpness and blurred, or blurred widely only: so a part feels where it does not lie yet."""
     image, _ = scene.render(rows, _MOVING)
     difference = image - target

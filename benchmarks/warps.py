@@ -1,0 +1,220 @@
+"""`python -m benchmarks warps`: edits that no motion of whole parts explains, bent and not.
+
+Their truth is known, so pictures of it are what is trained towards and, in other views, what judges.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from progdf.demo_scenes import AnalyticEdit, bear
+from progdf.demo_scenes.warps import column_warps, smile_warp
+from progdf.errors import ProgdfError
+from progdf.formats.ply import load_ply
+from progdf.gaussians import Gaussians
+from progdf.rasterize import render
+from progdf.region import Region, from_mask
+from progdf.scene.bounds import scene_sphere
+from trainer.editors import make_editor
+from trainer.fit.evaluate import Evaluator, make_evaluator
+from trainer.optimize.groups import Groups, group_stage
+from trainer.optimize.losses import erode, perceptual_loss
+from trainer.optimize.objective import Objective
+from trainer.optimize.pgs import TargetStage, optimize
+from trainer.optimize.settings import GROUP_STEPS, pgs_settings
+from trainer.options import TrainOptions
+from trainer.pipeline.kind_trial import Approach, approaches, try_approaches
+from trainer.plan import Plan, make_plan, plan_optimization
+from trainer.setup.training_setup import (
+    TrainingSetup,
+    make_training_setup,
+    probe_views,
+    quantize_image,
+    widen_views,
+)
+from trainer.views.crops import CropScene, crop_scene
+from trainer.views.view import View, crop
+
+from .table import Table
+
+STEPS, VIEWS, SIZE = 240, 15, 160
+_BEAR = 6000
+_STYLE = "style:14"
+_ROBOT = 1, 2, 3  # labels of the robot and its hands
+
+Picture = Callable[[View], Tensor]
+
+
+@dataclass(frozen=True)
+class WarpCase:
+    """One edit of one region.
+
+    Args:
+        name: of both
+        setup: scene, region, views
+        picture: the finished edit in a view
+    """
+
+    name: str
+    setup: TrainingSetup
+    picture: Picture
+
+
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """The bear's edits, or those of robots whose parts lie in NAME_labels.npy beside NAME.ply.
+
+    Raises:
+        ProgdfError: a scene has no labels beside it.
+    """
+    plan = make_plan(
+        TrainOptions(
+            Path("bear.ply"), Path("run"), "all", "folder:edited", views=VIEWS, image_size=SIZE, steps=STEPS
+        )
+    )
+    rows = [
+        _row(plan, case)
+        for case in ([c for path in scenes for c in _robot_cases(plan, path)] or _bear_cases(plan))
+    ]
+    return [
+        Table(
+            "warps",
+            "Edits that are not in the model's own family",
+            (
+                "edit",
+                "members",
+                "unedited",
+                "free",
+                "parts, free",
+                "bent",
+                "bent, free",
+                "trial takes",
+                "seconds",
+            ),
+            tuple(rows),
+            f"PSNR in held-out views over the pixels that count, dB; {STEPS} steps towards the end, "
+            f"{VIEWS} views of {SIZE} pixels, a fifth of them held out. free: members alone; parts, free: "
+            "connected parts moved as wholes first, as it was; bent: by control points, before and after the "
+            "members' own steps; seconds: processor time, free, then bent and free.",
+        )
+    ]
+
+
+def _row(plan: Plan, case: WarpCase) -> tuple[str, ...]:
+    setup = case.setup
+    edited = [case.picture(view) for view in setup.train]
+    judge = make_evaluator(
+        setup.scene,
+        setup.region,
+        setup.held_out,
+        {1.0: [case.picture(view) for view in setup.held_out]},
+        setup.background,
+        14 + 3 * setup.scene.shN.shape[1],
+    )
+    trial = try_approaches(plan.optimization, setup, edited, approaches(plan.optimization, setup, edited))
+    setup = widen_views(setup, {1.0: edited})
+    original = judge.original
+    nothing = torch.zeros_like(original)
+    crops = [
+        crop_scene(setup.scene, setup.region.members, v.camera, v.box, setup.background) for v in setup.train
+    ]
+    targets = [crop(p, v.box) for p, v in zip(edited, setup.train, strict=True)]
+
+    def trained(approach: Approach, groups: Groups | None) -> tuple[str, float]:
+        begun = time.process_time()
+        end = _train(plan, setup, crops, targets, original, approach, groups)
+        return _psnr(judge, end), time.process_time() - begun
+
+    unedited = _psnr(judge, nothing)
+    if trial.chosen.kind != "geometry":
+        found, seconds = trained(trial.chosen, None)
+        return case.name, str(len(original)), unedited, found, "", "", "", str(trial.chosen), f"{seconds:.0f}"
+    free, free_seconds = trained(Approach("geometry"), None)
+    ways = Approach("geometry", GROUP_STEPS)
+    begun = time.process_time()
+    groups = group_stage(original, crops, [targets], GROUP_STEPS)
+    searched = time.process_time() - begun
+    parts, _ = trained(ways, replace(groups, warps=()))
+    if not groups.warps:
+        said = f"{free_seconds:.0f}"
+        return case.name, str(len(original)), unedited, free, parts, "", "", str(trial.chosen), said
+    bent = _psnr(judge, groups.warps[0].carry(original, nothing))
+    both, both_seconds = trained(ways, groups)
+    said = f"{free_seconds:.0f}, {searched + both_seconds:.0f}"
+    return case.name, str(len(original)), unedited, free, parts, bent, both, str(trial.chosen), said
+
+
+def _train(
+    plan: Plan,
+    setup: TrainingSetup,
+    crops: Sequence[CropScene],
+    targets: Sequence[Tensor],
+    original: Tensor,
+    approach: Approach,
+    groups: Groups | None,
+) -> Tensor:
+    """The members' offsets at the end."""
+    optimization = plan_optimization(plan.optimization, approach.kind, approach.group_steps)
+    stages = [TargetStage(1.0, targets, STEPS)]
+    extent = 2.0 * scene_sphere(setup.scene[setup.region.members])[1]
+    if groups is not None:
+        stages, extent = groups.to_stages(original, crops, stages), groups.extent
+    settings = pgs_settings(optimization, True, original.shape[1], extent, 1)
+    inside = [erode(crop(view.mask, view.box)) for view in setup.train]
+    objective = Objective(perceptual_loss()[0], optimization.weights, inside)
+    *_, last = optimize(original, crops, probe_views(setup), stages, objective, settings)
+    return last.offsets
+
+
+def _psnr(judge: Evaluator, offsets: Tensor) -> str:
+    return f"{judge.psnr(judge.pictures(offsets), judge.edited[1.0]):.1f}"
+
+
+def _bear_cases(plan: Plan) -> list[WarpCase]:
+    demo = bear(_BEAR)
+    scene = demo.gaussians
+    head, body = demo.members("head"), demo.members("body")
+    corners = torch.tensor([[0.11, 1.305, 0.56], [-0.11, 1.305, 0.56]])
+    columns = column_warps(scene.means[body], demo.up)
+    found = [_case(plan, f"bear's body: {name}", scene, body, edit) for name, edit in columns.items()]
+    found.append(_case(plan, "bear: smile", scene, head, smile_warp(corners, demo.up, 0.08, 0.07)))
+    setup = _setup(plan, scene, body)
+    try:
+        editor = make_editor(_STYLE, scene, setup.region, [*setup.train, *setup.held_out])
+    except ProgdfError:  # its weights are an extra
+        return found
+    return [*found, WarpCase(f"bear's body: {_STYLE}", setup, lambda v: quantize_image(editor.edit(v, 1.0)))]
+
+
+def _robot_cases(plan: Plan, path: Path) -> list[WarpCase]:
+    labels = path.with_name(f"{path.stem}_labels.npy")
+    if not labels.is_file():
+        raise ProgdfError(f"{labels} does not exist; put the labels of the robot beside {path.name}")
+    scene = load_ply(path)
+    members = torch.from_numpy(np.isin(np.load(labels), _ROBOT)).nonzero()[:, 0]
+    columns = column_warps(scene.means[members], torch.tensor([0.0, -1.0, 0.0]))
+    return [_case(plan, f"{path.stem}: {name}", scene, members, edit) for name, edit in columns.items()]
+
+
+def _case(plan: Plan, name: str, scene: Gaussians, members: Tensor, edit: AnalyticEdit) -> WarpCase:
+    setup = _setup(plan, scene, members)
+    edited = edit.apply(scene, members, 1.0)
+
+    def picture(view: View) -> Tensor:
+        with torch.no_grad():
+            return quantize_image(render(edited, view.camera, setup.background).image.clamp(0.0, 1.0))
+
+    return WarpCase(name, setup, picture)
+
+
+def _setup(plan: Plan, scene: Gaussians, members: Tensor) -> TrainingSetup:
+    mask = torch.zeros(len(scene), dtype=torch.bool)
+    mask[members] = True
+    region: Region = from_mask("region", mask)
+    return make_training_setup(plan.views, scene, region)
