@@ -123,7 +123,7 @@ def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
     gdf = edit_for(scene, 50, moves=False)
     ctx = headless_context()
     drawn_by = ViewEngine(ctx, scene, [gdf], "cpu")
-    view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.3),), draft="off")
+    view = ViewState(first_camera(scene), (LayerState(0, "edit", 0.3),), dynamic_resolution="off")
     with Mouse(ctx, drawn_by, scene, [gdf], view, SIZE) as mouse:
         mouse.grip_slider()
         assert mouse.main_view.work.view.layers[0].strength == pytest.approx(0.3)

@@ -253,7 +253,7 @@ def test_weights_that_would_call_something_are_refused(
     path = tmp_path_factory.mktemp("weights") / "alexnet.ckpt"
     path.write_bytes(content)
     monkeypatch.setattr(lpips, "weights_file", lambda backbone: path)
-    with pytest.raises(ProgdfError, match="is not what was expected"):
+    with pytest.raises(ProgdfError, match="is not as expected"):
         Lpips.load()
 
 

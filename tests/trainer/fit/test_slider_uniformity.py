@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,11 +14,13 @@ from torch import Tensor
 from progdf.field import fit_separable
 from progdf.gaussians import pack
 from progdf.metrics.slider import slider_statistics
-from tests.helpers.trained import WHITE, small
+from tests.helpers.trained import WHITE, quick_options, small
 from trainer.editors import make_editor
 from trainer.editors.base import EditKind
 from trainer.fit.slider_uniformity import equalize_slider, equalized_strengths, equalizing_remap
 from trainer.optimize.settings import resolve_slider
+from trainer.options import Slider
+from trainer.plan import make_plan
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View
@@ -121,12 +124,16 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
 
 
 def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given() -> None:
-    assert resolve_slider("auto", "recolor:#3060d0", QUARTERS) == "even"
-    assert resolve_slider("auto", "folder:here", (1.0,)) == "even"
-    assert resolve_slider("auto", "folder:here", QUARTERS) == "stages"
-    assert resolve_slider("auto", "photographs:here", QUARTERS) == "stages"
-    assert resolve_slider("even", "folder:here", QUARTERS) == "even"
-    assert resolve_slider("time", "recolor:#3060d0", QUARTERS) == "time"
+    def resolved(slider: Slider, editor: str, strengths: tuple[float, ...] = QUARTERS) -> str:
+        plan = make_plan(quick_options(Path("nowhere"), editor=editor, slider=slider))
+        return resolve_slider(plan.slider, strengths)
+
+    assert resolved("auto", "recolor:#3060d0") == "even"
+    assert resolved("auto", "folder:here", (1.0,)) == "even"
+    assert resolved("auto", "folder:here") == "stages"
+    assert resolved("auto", "photographs:here") == "stages"
+    assert resolved("even", "folder:here") == "even"
+    assert resolved("time", "recolor:#3060d0") == "time"
 
 
 def test_the_stripes_of_a_scarf_are_asked_for_where_they_show() -> None:

@@ -199,9 +199,9 @@ def test_render_writes_a_difference_and_says_the_psnr(
 @pytest.mark.parametrize(
     ("options", "about"),
     [
-        (("--split", "1.5"), "0 to 1"),
-        (("--split=left",), "0 to 1"),
-        (("--difference", "0"), "1 to 64"),
+        (("--split", "1.5"), "between 0 and 1"),
+        (("--split=left",), "between 0 and 1"),
+        (("--difference", "0"), "between 1 and 64"),
         (("--split", "--difference"), "one of them"),
         (("--split", "--sheet", "scarf"), "one of them"),
     ],
