@@ -36,7 +36,7 @@ GROWTH = 2.0
 # was (docs/experiments.md, Parts that move).
 _EXTENT, _LEFT, _REST = 7.0, 0.065, 0.28
 
-_WHOLE = 0.25  # share of the distance that parts may leave and still count as moved as wholes
+_WHOLE = 0.1  # share of the distance that parts may leave and still count as moved as wholes
 _BETTER = 0.9  # share of what parts leave that control points may leave: they cost more and hold less
 
 
