@@ -15,11 +15,10 @@ from pathlib import Path
 
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from ui_rig import Rig, rig
-
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import Gdf
+from tests.helpers.ui_rig import Rig, rig
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import load_edits
 from viewer.panel import panel
@@ -69,20 +68,20 @@ def session(hand: Rig) -> None:
 
 def timeline(hand: Rig) -> None:
     """A film of three keys: the edits come while the camera goes around; the playhead on the way."""
-    start = hand.stage.work.view
+    start = hand.main_view.work.view
     bare = tuple(replace(layer, strength=0.0) for layer in start.layers)
-    hand.stage.change(replace(start, layers=bare))
+    hand.main_view.change(replace(start, layers=bare))
     hand.key("K")
     for frames, turn, first in ((32, 40.0, 1.0), (30, 30.0, 0.0)):
         for _ in range(frames):
             hand.key(".")
-        view = hand.stage.work.view
+        view = hand.main_view.work.view
         layers = tuple(
             replace(layer, strength=first if i == 0 else 1.0 - 0.5 * first)
             for i, layer in enumerate(view.layers)
         )
         turned = replace(view.camera, azimuth=view.camera.azimuth + turn)
-        hand.stage.change(replace(view, layers=layers, camera=turned))
+        hand.main_view.change(replace(view, layers=layers, camera=turned))
         hand.key("K")
     for _ in range(38):
         hand.key(",")
@@ -91,9 +90,9 @@ def timeline(hand: Rig) -> None:
 
 def _at(hand: Rig, strengths: Sequence[float]) -> None:
     """The edits at these strengths, as far as there are some."""
-    view = hand.stage.work.view
+    view = hand.main_view.work.view
     layers = (replace(layer, strength=s) for layer, s in zip(view.layers, strengths, strict=False))
-    hand.stage.change(replace(view, layers=tuple(layers)))
+    hand.main_view.change(replace(view, layers=tuple(layers)))
     hand.settle()
 
 
@@ -149,7 +148,7 @@ def main() -> None:
     gdfs = load_edits(asked.gdfs, scene, asked.scene)
     view = replace(first_state(gdfs), camera=first_camera(scene, aspect=(SIZE[0] - panel.WIDTH_PX) / SIZE[1]))
     with rig(view, SIZE, stack=_Opened(scene, gdfs), gdf_paths=asked.gdfs) as hand:
-        hand.stage.facts = replace(hand.stage.facts, title=asked.scene.name)
+        hand.main_view.facts = replace(hand.main_view.facts, title=asked.scene.name)
         SHOTS[asked.name](hand)
         hand.frame(3)
         picture = Image.fromarray(hand.image())
