@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 
 import pytest
 
@@ -33,16 +31,10 @@ def by_right_click(hand: Rig) -> None:
 ways = pytest.mark.parametrize("call_off", [by_escape, by_right_click])
 
 
-@contextmanager
-def new_rig() -> Iterator[Rig]:
-    with rig(replace(first_view(bear(), 0.5, 0.5), unfolded=(0,)), POINTS) as made:
-        made.key("2")  # the lower layer, the scarf
-        yield made
-
-
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with new_rig() as made:
+    with rig(replace(first_view(bear(), 0.5, 0.5), unfolded=(0,)), POINTS) as made:
+        made.key("2")  # the lower layer, the scarf
         yield made
 
 
@@ -79,12 +71,12 @@ def test_a_slider_goes_back_to_where_it_was_pressed(hand: Rig, call_off: CallOff
 
 @ways
 def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig, call_off: CallOff) -> None:
-    y = gain_row()
+    y = gain_row(hand)
+    hand.frame(40)  # a press soon after the last would be a double click, which resets
     hand.drag((LEFT + 218, y), (LEFT + 150, y))
     color = hand.main_view.work.view.layers[0].gains.color
     assert 0.0 < color < 1.0
     before = hand.main_view.work
-    hand.frame(40)  # a press soon after the last would be a double click, which resets
     hand.move(LEFT + 150, y)
     hand.press()
     hand.move(LEFT + 180, y)
@@ -96,14 +88,16 @@ def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig, call_o
     assert hand.main_view.work.past == before.past
 
 
-@cache
-def gain_row() -> float:
+def gain_row(hand: Rig) -> float:
     """Where the slider of the color gain of the first layer stands."""
-    with new_rig() as hand:
-        for y in range(200, 400, 10):
-            hand.drag((LEFT + 218, y), (LEFT + 150, y))
-            if hand.main_view.work.view.layers[0].gains.color != 1.0:
-                return float(y)
+    for y in range(200, 400, 6):
+        before = hand.main_view.work
+        hand.drag((LEFT + 218, y), (LEFT + 150, y))
+        moved = hand.main_view.work.view.layers[0].gains.color != 1.0
+        hand.main_view.restart(before.view)
+        hand.settle()
+        if moved:
+            return float(y)
     raise AssertionError("there is no gain to drag")
 
 
@@ -133,7 +127,7 @@ def test_a_key_of_the_timeline_goes_back(hand: Rig, call_off: CallOff) -> None:
     hand.main_view.restart(replace(hand.main_view.work.view, timeline=Timeline(keys)))
     hand.key("T")
     y = POINTS[1] - ROW_PX - HEIGHT_PX / 2
-    at = next(x for x in range(110, 400, 8) if grips_key(hand, float(x), y))
+    at = next(x for x in range(110, 400, 4) if grips_key(hand, float(x), y))
     dragged_and_called_off(hand, call_off, (at, y), (at + 40.0, y), (at + 60.0, y))
 
 
