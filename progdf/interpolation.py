@@ -28,9 +28,9 @@ def find_segment(knots: Tensor, x: float) -> Segment:
         knots: ascending, at least 2. [S]
         x: in their unit; which segment it is is told in their precision
     """
-    right = int(torch.searchsorted(knots, torch.tensor(x, dtype=knots.dtype)))
-    right = min(max(right, 1), len(knots) - 1)
-    low, high = knots[right - 1 : right + 1].tolist()
+    places = knots.numpy()  # for one place a tenth of the time that torch takes
+    right = min(max(int(places.searchsorted(places.dtype.type(x))), 1), len(places) - 1)
+    low, high = float(places[right - 1]), float(places[right])
     return Segment(right, (x - low) / (high - low))
 
 
