@@ -54,13 +54,14 @@ def _join_axes(argv: Sequence[str]) -> list[str]:
 
 
 def _short_message(box: str) -> str:
-    """What tyro's framed message says, without the frame and the advice below the rule."""
+    """What tyro's message says, without the title, the frame and the advice below the rule.
+
+    Where the output cannot show a frame, the title stands above a rule of its own.
+    """
     text = re.sub(r"\x1b\[[0-9;]*m", "", box)
-    lines = [line.strip("│ \t").strip() for line in text.splitlines()]
-    kept = []
-    for line in lines:
-        if line.startswith("────"):
-            break
-        if line and not line.startswith(("╭", "╰")):
-            kept.append(line)
-    return " ".join(kept) or "the options cannot be read"
+    lines = [line.strip("│ \t") for line in text.splitlines()]
+    parts = "\n".join(line for line in lines if not line.startswith(("╭", "╰")))
+    sections = re.split(r"^[─-]{4,}$", parts, flags=re.MULTILINE)
+    said = " ".join(sections[0 if "╭" in text else 1 % len(sections)].split())
+    said = re.sub(r"'None', |, 'None'", "", said).rstrip(".")  # None: the option left out
+    return said or "the options cannot be read"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.helpers.blank_plots import blank_plots
+from tests.helpers.trained import write_bear
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -14,3 +16,11 @@ def plots() -> Iterator[None]:
     """Runs draw no curves; the tests of the report draw them."""
     with blank_plots():
         yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small bear."""
+    made = tmp_path_factory.mktemp("bear")
+    write_bear(made)
+    return made

@@ -86,6 +86,24 @@ def test_an_option_that_does_not_exist_is_one_line(command: str, capsys: pytest.
     assert f"see progdf {command} --help" in said
 
 
+NO_SUITE = (
+    "invalid choice 'tables' for argument '--suite'. Expected one of ('sliders'); see progdf evaluate --help"
+)
+
+
+def test_a_choice_that_is_none_names_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    said = stderr_of(capsys, "evaluate", "run", "--suite", "tables")
+    assert said == f"progdf: {NO_SUITE}\n"
+
+
+def test_options_are_refused_in_one_line_where_no_frame_can_be_drawn() -> None:
+    command = [sys.executable, "-m", "progdf", "evaluate", "run", "--suite", "tables"]
+    for encoding in ("ascii", "utf-8"):
+        env = {**os.environ, "PYTHONIOENCODING": encoding}
+        refused = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+        assert (refused.returncode, refused.stderr) == (2, f"progdf: {NO_SUITE}\n")
+
+
 @pytest.mark.parametrize("threads", ["-1", "99999"])
 def test_a_number_of_threads_that_cannot_be_is_told(
     threads: str, capsys: pytest.CaptureFixture[str], tmp_path: Path

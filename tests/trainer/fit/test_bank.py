@@ -18,7 +18,7 @@ from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
-from tests.helpers.trained import quick_options, write_bear
+from tests.helpers.trained import quick_options
 from trainer.fit.memory_bank import JointTraining, MemoryBank
 from trainer.option_checks import check_network_options, check_options
 from trainer.options import FitOptions
@@ -38,13 +38,6 @@ def short_fits() -> Iterator[None]:
         patch.setattr("trainer.fit.network.PICTURE_STEPS", 20)
         yield
     torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made)
-    return made
 
 
 def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:

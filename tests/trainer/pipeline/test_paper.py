@@ -13,7 +13,7 @@ from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
-from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
+from tests.helpers.trained import WHITE, quick_options, small, train
 from trainer.cli import train_options
 from trainer.fit.picture_loss import RenderedLoss
 from trainer.optimize.losses import GradientL1, l1
@@ -28,13 +28,6 @@ from trainer.views.crops import crop_scene, moving_attributes
 def plan(*more: str, region: str = "all") -> Plan:
     words = ("scene.ply", "--out", "run", "--region", region, "--editor", "night", "--preset", "paper")
     return make_plan(train_options([*words, *more]))
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made)
-    return made
 
 
 @pytest.fixture(scope="module")

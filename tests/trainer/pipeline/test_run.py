@@ -22,7 +22,7 @@ from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
-from tests.helpers.trained import quick_options, train, write_bear
+from tests.helpers.trained import quick_options, train
 from trainer import cli
 from trainer.option_checks import check_options
 from trainer.options import FitOptions
@@ -32,14 +32,6 @@ from trainer.pipeline.reopen import render_run_views, reopen_run
 from trainer.pipeline.run import RunResult
 from trainer.plan import make_plan
 from trainer.report.plots import LINES, draw_plot
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small bear."""
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made)
-    return made
 
 
 @pytest.fixture(scope="module")
