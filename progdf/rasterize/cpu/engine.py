@@ -38,7 +38,7 @@ MOST_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 _LEAST_TILES = 4  # fewer are not worth a call
-_CHUNKS = 8  # for each thread: tiles take unequally long
+_CHUNKS = 4  # for each thread: tiles take unequally long
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
 _ALL = np.empty(0, np.bool_)
 
