@@ -98,10 +98,9 @@ def test_a_choice_that_is_none_names_those_there_are(capsys: pytest.CaptureFixtu
 
 def test_options_are_refused_in_one_line_where_no_frame_can_be_drawn() -> None:
     command = [sys.executable, "-m", "progdf", "evaluate", "run", "--suite", "tables"]
-    for encoding in ("ascii", "utf-8"):
-        env = {**os.environ, "PYTHONIOENCODING": encoding}
-        refused = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-        assert (refused.returncode, refused.stderr) == (2, f"progdf: {NO_SUITE}\n")
+    env = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    refused = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert (refused.returncode, refused.stderr) == (2, f"progdf: {NO_SUITE}\n")
 
 
 @pytest.mark.parametrize("threads", ["-1", "99999"])

@@ -15,7 +15,7 @@ from trainer.pipeline.demo import Effort
 
 _FEW = tuple(case for case in CASES if case.name in ("blue scarf", "tilted ears"))
 _SIZES = {"bear": 1500, "room": 2500}
-_EFFORT = Effort(views=6, image_size=72, steps=80)
+_EFFORT = Effort(views=6, image_size=72, steps=40)
 
 
 def _run(folder: Path) -> list[CaseResult]:

@@ -260,6 +260,7 @@ def ears_run(folder: Path, truth: Truth, strengths: tuple[float, ...], **more: o
     return train(options, quiet=True)
 
 
+@pytest.mark.slow
 def test_grown_ears_arrive_with_the_group_stage_and_smear_without(tmp_path: Path) -> None:
     truth = bear_truth(size=4000)
     free = ears_run(tmp_path, truth, (1.0,), group_steps=0)

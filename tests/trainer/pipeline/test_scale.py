@@ -67,7 +67,10 @@ def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: 
     return compose_layers(scene, [Layer(load_gdf(folder / "edit/edit.gdf", scene), 1.0)])
 
 
-@pytest.mark.parametrize(("editor", "kind"), [("recolor:#3060d0", "color"), ("darken:0.6", "style")])
+@pytest.mark.parametrize(
+    ("editor", "kind"),
+    [("recolor:#3060d0", "color"), pytest.param("darken:0.6", "style", marks=pytest.mark.slow)],
+)
 def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: str) -> None:
     demo = bear(1500)
     members = demo.members("scarf")

@@ -187,15 +187,7 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
     desktop.point(400, 400)  # away from the tooltip
     assert changed(first, desktop.rest()) == 0
     desktop.until_idle("a window that draws nothing when nothing changes")
-    desktop.xdotool("key", "ctrl+q")
-    assert desktop.process.wait(timeout=PATIENCE_S) == 0
-    assert desktop.process.communicate() == ("", "")
-
-
-@pytest.mark.window
-@pytest.mark.gl
-def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> None:
-    first = desktop.shot()
+    # and it orbits, flies and takes a new size
     desktop.drag((400, 400), (480, 380))
     desktop.until("the turn", lambda: changed(first, desktop.shot()) > 1000)
     orbited = desktop.rest()
@@ -208,6 +200,7 @@ def test_the_real_window_orbits_flies_and_takes_a_new_size(desktop: Desktop) -> 
     assert (650, 900 - panel.WIDTH_PX, 3) in shapes
     desktop.xdotool("key", "ctrl+q")
     assert desktop.process.wait(timeout=PATIENCE_S) == 0
+    assert desktop.process.communicate() == ("", "")
 
 
 @pytest.mark.window
