@@ -73,7 +73,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "session"
     if start.lstrip()[:1] == b"{" and f'"{TIMELINE_MARK}"'.encode() in start:
         return "timeline"
-    if start.lstrip()[:1] in (b"{", b"["):
+    if start.lstrip()[:1] in (b"{", b"[") or start.startswith(b"\x89PNG"):
         return "cameras"
     if path.suffix.lower() == ".gdf":
         return "gdf"  # its reader knows best what is wrong

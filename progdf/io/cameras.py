@@ -1,5 +1,5 @@
-"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, recognized by content; and
-folders: a COLMAP sparse model, or a folder with one of these files in it.
+"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, also in a picture, known by
+their content; and folders: a COLMAP sparse model, or a folder with one of these files in it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -30,6 +30,9 @@ _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 _FORMAT = "progdf cameras 1"
+PICTURE_KEY = "progdf:camera"
+"""Of the text in a .png that holds the camera from which it was rendered."""
+_LONGEST_TEXT = 1 << 16  # characters of one camera: a picture may claim megabytes
 _NOT_A_ROTATION = 1e-2
 _PINHOLES = (
     "",
@@ -43,6 +46,7 @@ _PINHOLES = (
 )
 """Camera models that are a pinhole behind a lens whose numbers we know."""
 
+_PNG = b"\x89PNG\r\n"
 _FILES = ("cameras.json", "transforms.json")
 _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
@@ -103,8 +107,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
     Three kinds of files are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
     `transforms.json` (frames with an OpenGL camera-to-world matrix; intrinsics per file or per frame) and
-    what `save_cameras` writes, also a single such camera. A folder is a sparse model (see `progdf.io.colmap`)
-    or holds one, or a cameras.json or transforms.json.
+    what `save_cameras` writes, also a single such camera, or one in a rendered picture. A folder is a sparse
+    model (see `progdf.io.colmap`) or holds one, or a cameras.json or transforms.json.
 
     The views are those of pinholes. A lens that bends photographs is kept as `Camera.lens` and logged.
 
@@ -164,16 +168,48 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
         return load_model(model)
     check_regular(path)
     try:
-        content = decode_json(Path(path).read_bytes())
+        found = Path(path).read_bytes()
+        if found.startswith(_PNG):
+            camera = camera_in_picture(path)
+            if camera is None:
+                raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
+            return [camera]
+        content = decode_json(found)
     except OSError as error:
         raise open_error(path, error) from None
     except ValueError as error:
         raise ProgdfError(
             f"{name} is not JSON ({error}); give a cameras.json, a transforms.json or a file of saved cameras"
         ) from None
+    return _from_content(name, content, Path(path))
+
+
+def camera_in_picture(path: str | os.PathLike[str]) -> Camera | None:
+    """The camera that a rendered picture carries; None for one that carries none.
+
+    Raises:
+        ProgdfError: no picture, or what it carries is no camera.
+    """
+    from .images import picture_text  # Pillow, which camera files do without
+
+    text = picture_text(path, PICTURE_KEY)
+    if text is None:
+        return None
+    where = f"the text {PICTURE_KEY} in {os.fspath(path)}"
+    try:
+        content = decode_json(text) if len(text) <= _LONGEST_TEXT else None
+    except ValueError as error:
+        raise ProgdfError(f"{where} is not JSON ({error}); render the picture again") from None
+    match content:
+        case {"format": format, "cameras": [entry]} if format == _FORMAT:
+            return replace(_own(where, 0, entry), name=Path(path).stem)
+    raise ProgdfError(f"{where} is not a camera; render the picture again")
+
+
+def _from_content(name: str, content: Any, path: Path) -> list[Camera]:
     match content:
         case {"frames": list() as frames}:
-            return [_nerfstudio(name, i, content, frame, Path(path)) for i, frame in enumerate(frames)]
+            return [_nerfstudio(name, i, content, frame, path) for i, frame in enumerate(frames)]
         case {"cameras": list() as entries}:
             return [_own(name, i, entry) for i, entry in enumerate(entries)]
         case {"viewmat": _}:
@@ -203,6 +239,12 @@ def kind_of_cameras(path: str | os.PathLike[str]) -> str:
 
 def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> None:
     """Write cameras as JSON, whole or not at all; `load_cameras` gives the same bits back."""
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_text(cameras_to_json(cameras, indent=1), encoding="utf-8")
+
+
+def cameras_to_json(cameras: Sequence[Camera], indent: int | None = None) -> str:
+    """What a file of saved cameras holds, ASCII."""
     entries = [
         {
             "name": camera.name,
@@ -214,10 +256,7 @@ def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> Non
         }
         for camera in cameras
     ]
-    with atomic_write(path) as temporary_file:
-        temporary_file.write_text(
-            json.dumps({"format": _FORMAT, "cameras": entries}, indent=1), encoding="utf-8"
-        )
+    return json.dumps({"format": _FORMAT, "cameras": entries}, indent=indent)
 
 
 def _read(where: str, entry: object, kind: type[_T]) -> _T:

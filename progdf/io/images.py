@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -127,6 +128,18 @@ def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Width and height of a picture. Raises ProgdfError as `open_picture` does."""
     with _open(path) as picture:
         return picture.size
+
+
+def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
+    """A text that a .png carries under `key`, before its pixels or behind them; None where there is none.
+
+    Raises ProgdfError as `open_picture` does.
+    """
+    with _open(path) as picture:
+        if not isinstance(picture, PngImageFile):
+            return None
+        found = picture.text.get(key)
+        return None if found is None else str(found)
 
 
 @contextmanager

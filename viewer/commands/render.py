@@ -14,6 +14,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write
+from progdf.io.picture_camera import camera_chunk
 from progdf.terminal import print_line
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
@@ -105,8 +106,11 @@ def _render_still(
     comparer = Comparer(engine, engine.ctx, where)
     try:
         image = comparer.image(view, camera=camera)
+        # a comparison is no view that could be edited and trained on
+        carried = camera_chunk(camera) if view.compare.mode == "off" else None
+        labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
-            Image.fromarray(draw_labels(image, view.compare, comparer.labels(view))).save(temporary_file)
+            labelled.save(temporary_file, pnginfo=carried)
         if view.compare.mode == "off":
             return ""
         if comparer.against(view) == "original":

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from progdf.__main__ import main
 from progdf.formats.load_report import format_count
@@ -139,8 +140,10 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
 
 
 def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    assert "is not a file progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.png"))
+    (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0")
+    assert "is not a file progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.jpg"))
+    Image.new("RGB", (4, 4)).save(tmp_path / "picture.png")
+    assert "carries no camera" in error_of(capsys, "info", str(tmp_path / "picture.png"))
     (tmp_path / "a.gdf").write_bytes(b"")
     assert "not a .gdf" in error_of(capsys, "info", str(tmp_path / "a.gdf"))
     (tmp_path / "a.ply").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")

@@ -18,7 +18,7 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES
 from progdf.gdf.file import save_gdf
-from progdf.io.cameras import read_camera, save_cameras
+from progdf.io.cameras import camera_in_picture, load_cameras, read_camera, save_cameras
 from progdf.rasterize import render
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import ViewCamera
@@ -63,6 +63,18 @@ def test_a_camera_file_and_strengths_give_the_composed_picture(run: Run, stack: 
     assert run("render", "bear.ply", "scarf.gdf", "ears.gdf", *options, "-o", "a.png") == 0
     expected = edited_by(stack, stack.demo.cameras[1].resize(64, 48), 0.7, 1.0)
     assert np.abs(pixels("a.png").astype(int) - expected).max() <= 1
+
+
+def test_a_picture_carries_its_camera_and_is_one_for_the_next(run: Run, stack: Stack) -> None:
+    assert run("render", "bear.ply", "--orbit", "30,15", *SMALL, "-o", "a.png") == 0
+    assert run("render", "bear.ply", "--camera", "a.png", "--engine", "cpu", "-o", "b.png") == 0
+    assert np.array_equal(pixels("a.png"), pixels("b.png"))
+    assert (load_cameras("a.png")[0].width, load_cameras("a.png")[0].name) == (64, "a")
+
+
+def test_a_comparison_carries_no_camera(run: Run) -> None:
+    assert run("render", "bear.ply", "scarf.gdf", "--split", *SMALL, "-o", "c.png") == 0
+    assert camera_in_picture("c.png") is None
 
 
 @pytest.mark.gl

@@ -1,0 +1,68 @@
+"""The camera of a picture: written into the .png that is rendered, found again for one that was changed.
+
+Any program may change the picture in between. Many keep the text in which the camera stands; for one that
+drops it, or writes another format, a file beside the picture or the camera of that name tells.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from PIL.PngImagePlugin import PngInfo
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+
+from .cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras
+
+
+def camera_chunk(camera: Camera) -> PngInfo:
+    """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered."""
+    info = PngInfo()
+    info.add_text(PICTURE_KEY, cameras_to_json([camera]))
+    return info
+
+
+def find_picture_camera(path: str | os.PathLike[str], given: Sequence[Camera] = ()) -> Camera:
+    """The camera of a picture: the one that it carries; else of A.camera.json beside A.png; else of the given
+    ones the one that is named as the picture is.
+
+    Args:
+        path: the picture, of any format
+        given: as of --cameras
+
+    Returns:
+        The camera, named as the picture is, of the size at which the picture was rendered.
+
+    Raises:
+        ProgdfError: no picture, a camera that cannot be used, or none is found.
+    """
+    path = Path(path)
+    camera = camera_in_picture(path)
+    beside = path.with_name(f"{path.stem}.camera.json")
+    if camera is None and beside.is_file():
+        cameras = load_cameras(beside)
+        if len(cameras) != 1:
+            raise ProgdfError(f"{beside} holds {len(cameras)} cameras; keep the one of {path.name}")
+        camera = cameras[0]
+    if camera is None:
+        named = [camera for camera in given if _stem(camera.name) == path.stem]
+        if len(named) > 1:
+            raise ProgdfError(f"{len(named)} cameras are named {path.stem}; give {beside.name} beside {path}")
+        if not named:
+            raise ProgdfError(
+                f"{path} does not say from where it was rendered; put {beside.name} beside it, or give a "
+                f"camera named {path.stem} with --cameras (the .png that progdf render wrote is one)"
+            )
+        camera = named[0]
+    return replace(camera, name=path.stem, lens=None)  # what was rendered is straight
+
+
+def _stem(name: str) -> str:
+    """The name of a camera, which may be a path and have a picture's ending."""
+    last = PurePosixPath(name).name
+    stem, dot, suffix = last.rpartition(".")
+    return stem if dot and suffix.lower() in ("png", "jpg", "jpeg", "webp") else last
