@@ -106,31 +106,33 @@ class Desktop:
         self.until(what, idle)
 
 
+def start_display() -> tuple[subprocess.Popen[bytes], dict[str, str]]:
+    """A server, and the environment of what shall open on it."""
+    for _ in range(5):  # two that start at once may take the same number, and then one of them is not there
+        receive, send = os.pipe()
+        screen = ("-screen", "0", f"{WIDTH + 100}x{HEIGHT + 100}x24")
+        # -r: on a busy machine a key may stay down long enough to repeat
+        command = ["Xvfb", "-displayfd", str(send), *screen, "-nolisten", "tcp", "-r"]
+        server = subprocess.Popen(command, pass_fds=[send], stderr=subprocess.DEVNULL)
+        os.close(send)
+        with os.fdopen(receive) as display:
+            number = display.readline().strip()
+        environment = os.environ | {"DISPLAY": f":{number}", "NUMBA_NUM_THREADS": "2"}
+        environment.pop("WAYLAND_DISPLAY", None)
+        answer = subprocess.run(["xdotool", "getdisplaygeometry"], env=environment, capture_output=True)
+        if answer.returncode == 0:
+            return server, environment
+        server.terminate()
+        server.wait(timeout=PATIENCE_S)
+    pytest.fail("Xvfb gives no display")
+
+
 @pytest.fixture
 def desktop(tmp_path: Path) -> Iterator[Desktop]:
     if not (shutil.which("Xvfb") and shutil.which("xdotool")):
         pytest.skip("Xvfb and xdotool are not installed")
     paths = bear().save(tmp_path)
-    receive, send = os.pipe()
-    server = subprocess.Popen(
-        [
-            "Xvfb",
-            "-displayfd",
-            str(send),
-            "-screen",
-            "0",
-            f"{WIDTH + 100}x{HEIGHT + 100}x24",
-            "-nolisten",
-            "tcp",
-            "-r",  # on a busy machine a key may stay down long enough to repeat
-        ],
-        pass_fds=[send],
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(send)
-    with os.fdopen(receive) as display:
-        environment = os.environ | {"DISPLAY": f":{display.readline().strip()}", "NUMBA_NUM_THREADS": "2"}
-    environment.pop("WAYLAND_DISPLAY", None)
+    server, environment = start_display()
     process = subprocess.Popen(
         [
             sys.executable,
