@@ -73,11 +73,11 @@ class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     snapshots: tuple[dict[str, Any], ...] = ()
 
 
-def reference(path: Path, folder: Path) -> FileRef:
-    """A file as a session in `folder` names it.
+def relative_name(path: Path, folder: Path) -> str:
+    """A file as a session in `folder` names it: with forward slashes, absolute where the two share no drive.
 
     Raises:
-        ProgdfError: it cannot be read, or its name is not UTF-8, which JSON cannot hold.
+        ProgdfError: its name is not UTF-8, which JSON cannot hold.
     """
     whole = path.resolve()
     try:
@@ -88,7 +88,16 @@ def reference(path: Path, folder: Path) -> FileRef:
         name.encode()
     except UnicodeEncodeError:
         raise ProgdfError(f"a session cannot hold the file name {name}: it is not UTF-8; rename it") from None
-    return FileRef(str(PurePosixPath(Path(name))), sha256(whole))
+    return str(PurePosixPath(Path(name)))
+
+
+def reference(path: Path, folder: Path) -> FileRef:
+    """A file of a session in `folder`, with its hash.
+
+    Raises:
+        ProgdfError: it cannot be read; or as `relative_name`.
+    """
+    return FileRef(relative_name(path, folder), sha256(path.resolve()))
 
 
 def write_session(path: Path, session: SessionFile) -> None:

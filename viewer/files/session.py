@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,8 +11,17 @@ import msgspec
 
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, plain
-from progdf.io.session import SUFFIX, SessionFile, read_session, reference, verify_files, write_session
+from progdf.io.session import (
+    SUFFIX,
+    SessionFile,
+    read_session,
+    reference,
+    relative_name,
+    verify_files,
+    write_session,
+)
 from viewer.state import paint
+from viewer.state.selection import check as check_selection
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 
@@ -49,7 +60,7 @@ def save(path: Path, session: WindowSession) -> None:
     state = SessionFile(
         reference(scene, folder),
         tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
-        plain(session.view),
+        plain(_with_region_paths(session.view, lambda region: Path(relative_name(region, folder)))),
         tuple(plain(snapshot) for snapshot in session.snapshots),
     )
     write_session(path, state)
@@ -66,9 +77,16 @@ def open_session(path: Path) -> WindowSession:
     view, snapshots = _states(path.name, file)
     scene, gdfs = verify_files(path, file)
     opened = document.load(scene, gdfs)
+    check_selection(view.selection, len(opened.scene))
+    view = _with_region_paths(view, lambda region: Path(os.path.normpath(path.resolve().parent / region)))
     for layer in (*view.layers, *(layer for kept in snapshots for layer in kept.edit.layers)):
         paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
     return WindowSession(opened, view, snapshots)
+
+
+def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewState:
+    regions = tuple(replace(region, path=change(region.path)) for region in view.selection.regions)
+    return replace(view, selection=replace(view.selection, regions=regions))
 
 
 def default_path(opened: Document) -> Path:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from .selection import SelectionState
 from .view_state import Blend, LayerState, Timeline, ViewState
 
-LONGEST = 1000  # entries; each is a few hundred bytes
+LONGEST = 1000  # entries; each is a few hundred bytes, with a selection some kilobytes
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class Edit:
     blend: Blend
     overshoot: bool = False
     timeline: Timeline = Timeline()
+    selection: SelectionState = SelectionState()
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class History:
 
 
 def edit_of(state: ViewState) -> Edit:
-    return Edit(state.layers, state.blend, state.overshoot, state.timeline)
+    return Edit(state.layers, state.blend, state.overshoot, state.timeline, state.selection)
 
 
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
@@ -92,5 +94,10 @@ def redo(history: History) -> History:
 def apply_edit(state: ViewState, edit: Edit) -> ViewState:
     """`state` edited as in `edit`, seen from where it is."""
     return replace(
-        state, layers=edit.layers, blend=edit.blend, overshoot=edit.overshoot, timeline=edit.timeline
+        state,
+        layers=edit.layers,
+        blend=edit.blend,
+        overshoot=edit.overshoot,
+        timeline=edit.timeline,
+        selection=edit.selection,
     )

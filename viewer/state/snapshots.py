@@ -10,6 +10,7 @@ from viewer.camera.view_camera import ViewCamera
 from . import history
 from .history import Edit
 from .layers import LONGEST_NAME
+from .selection import SelectionState
 from .view_state import Timeline, ViewState
 
 MOST = 200
@@ -63,12 +64,12 @@ def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     kept = {layer.gdf for layer in snapshot.edit.layers}
     later = tuple(replace(layer, strength=0.0) for layer in view.layers if layer.gdf not in kept)
     back = history.apply_edit(view, snapshot.edit)
-    return replace(back, layers=(*back.layers, *later), timeline=view.timeline)
+    return replace(back, layers=(*back.layers, *later), timeline=view.timeline, selection=view.selection)
 
 
 def _sliders(view: ViewState) -> Edit:
-    """What a snapshot keeps: all that undo knows but the film."""
-    return replace(history.edit_of(view), timeline=Timeline())
+    """What a snapshot keeps: all that undo knows but the film and the selection."""
+    return replace(history.edit_of(view), timeline=Timeline(), selection=SelectionState())
 
 
 def _name(snapshots: Sequence[SliderSnapshot]) -> str:

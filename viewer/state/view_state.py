@@ -12,10 +12,14 @@ from progdf.io.json_values import one_of
 from viewer.camera.tween import EASINGS
 from viewer.camera.view_camera import ViewCamera
 
+from .selection import SelectionState
+
 OVERSHOOT = 1.2
 """How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
 BRUSH_MODES = ("add", "erase", "smooth")
 SMALLEST_PX, LARGEST_PX = 4.0, 400.0
+SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "sphere", "surface", "color")
+SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "split", "difference")
 AGAINST = ("original", "recorded")
 MOST_AMPLIFIED = 64.0
@@ -79,6 +83,25 @@ class Brush:
 
 
 @dataclass(frozen=True)
+class SelectTool:
+    """What selects in the picture.
+
+    Args:
+        tool: of `SELECT_TOOLS`, "" for none
+        mode: of `SELECT_MODES`; modifiers go before it
+        through: also what lies behind the front surface
+        radius: of the brush, pixels at 1×
+        tolerance: how far colors may be from the one that was clicked, OKLab
+    """
+
+    tool: Annotated[str, one_of(("", *SELECT_TOOLS))] = ""
+    mode: Annotated[str, one_of(SELECT_MODES)] = "new"
+    through: bool = False
+    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 30.0
+    tolerance: Share = 0.1
+
+
+@dataclass(frozen=True)
 class Comparison:
     """What the edited picture is set against, and how (see comparison.py).
 
@@ -138,6 +161,8 @@ class ViewState:
         unfolded: which edits (`LayerState.gdf`) show their gains and curve
         brush: what paints
         dynamic_resolution: of `RESOLUTION_MODES`: when the window draws coarsely while something moves
+        selection: what is selected and hidden, and the regions
+        select: what selects
     """
 
     camera: ViewCamera = ViewCamera()
@@ -152,6 +177,8 @@ class ViewState:
     brush: Brush = Brush()
     timeline: Timeline = Timeline()
     dynamic_resolution: Annotated[str, one_of(RESOLUTION_MODES)] = "auto"
+    selection: SelectionState = SelectionState()
+    select: SelectTool = SelectTool()
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

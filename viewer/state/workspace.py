@@ -17,6 +17,7 @@ from .history import Edit, History
 from .layer_facts import LayerRow
 from .playback import Player
 from .recordings import RecordingFile
+from .selection import SelectionState
 from .snapshots import SliderSnapshot
 from .view_state import Comparison, ViewState
 
@@ -124,8 +125,9 @@ def new_workspace(view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> Wor
 
 
 def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]]:
-    """What it would be a pity to lose; where one looked from is not."""
-    return history.edit_of(workspace.view), workspace.snapshots
+    """What it would be a pity to lose; where one looked from, and what is selected, is not."""
+    edit = history.edit_of(workspace.view)
+    return replace(edit, selection=SelectionState(regions=edit.selection.regions)), workspace.snapshots
 
 
 def mark_saved(workspace: Workspace) -> Workspace:

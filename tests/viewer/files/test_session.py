@@ -24,6 +24,8 @@ from viewer.app import app as application
 from viewer.camera.view_camera import eye, from_camera, to_camera
 from viewer.files import session
 from viewer.files.session import WindowSession
+from viewer.state import selection
+from viewer.state.selection import SelectionState
 from viewer.state.view_state import Comparison
 
 
@@ -57,6 +59,31 @@ def test_a_session_can_be_read_by_people_and_moves_with_its_folder(saved: Path, 
     elsewhere.rename(tmp_path)
 
 
+def test_regions_come_back_with_their_files_wherever_the_folder_went(folder: Path, tmp_path: Path) -> None:
+    mask = np.arange(len(bear().scene)) % 3 == 0
+    chosen = selection.select(SelectionState(), mask)
+    kept = selection.add_region(chosen, "third", folder / "third.region.npy")
+    view = replace(full_view(), selection=kept)
+    session.save(folder / "work.session.json", WindowSession(opened_document(folder), view))
+    assert str(tmp_path) not in (folder / "work.session.json").read_text()
+    elsewhere = tmp_path.with_name(tmp_path.name + "_moved")
+    tmp_path.rename(elsewhere)
+    moved = elsewhere / folder.relative_to(tmp_path)
+    again = session.open_session(moved / "work.session.json").view.selection
+    elsewhere.rename(tmp_path)
+    assert again.members == kept.members
+    assert [region.path for region in again.regions] == [moved / "third.region.npy"]
+
+
+def test_a_session_from_before_selections_opens_with_nothing_selected(saved: Path) -> None:
+    table = json.loads(saved.read_text())
+    for state in (table["view"], *(kept["edit"] for kept in table["snapshots"])):
+        del state["selection"]
+    del table["view"]["select"]
+    saved.write_text(json.dumps(table))
+    assert session.open_session(saved).view == full_view()
+
+
 BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("progdf_session",), 2, "version 2"),
     (("progdf_session",), "one", "version"),
@@ -75,6 +102,8 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("view", "camera", "distance"), 1e400, "Infinity"),
     (("view", "camera", "mode"), "walk\n", "mode is 'walk\\n', expected one of (orbit|fly)"),
     (("view", "camera", "up"), [0.0, 1.0], "view.camera.up"),
+    (("view", "selection", "members"), "AAAA", "select it again"),
+    (("view", "selection", "count"), -1, "view.selection.count"),
     (("view", "layers", 0, "strength"), 3.0, "view.layers[0].strength is 3.0, expected float <= 1.2"),
     (("view", "layers", 0, "strength"), "1", "strength"),
     (("view", "layers", 0, "enabled"), 1, "enabled"),

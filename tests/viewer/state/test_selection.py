@@ -1,0 +1,81 @@
+"""Selections as values: packed, hidden, kept as regions, undone, and saved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from progdf.errors import ProgdfError
+from tests.helpers.ui_rig import bear, first_view
+from viewer.state import selection, workspace
+from viewer.state.actions import perform
+from viewer.state.selection import NOBODY, SelectionState
+from viewer.state.workspace import SceneFacts, Workspace
+
+TOTAL = 1003
+
+
+def every(step: int) -> np.ndarray:
+    return np.arange(TOTAL) % step == 0
+
+
+def selecting(work: Workspace, mask: np.ndarray) -> Workspace:
+    chosen = selection.select(work.view.selection, mask)
+    return workspace.record_undo(replace(work, view=replace(work.view, selection=chosen)))
+
+
+def test_a_mask_comes_back_as_it_was_packed() -> None:
+    rng = np.random.default_rng(3)
+    for share in (0.0, 0.01, 0.5, 1.0):
+        mask = rng.random(TOTAL) < share
+        assert (selection.unpack(selection.pack(mask), TOTAL) == mask).all()
+    assert selection.pack(np.zeros(TOTAL, bool)) == NOBODY
+
+
+@pytest.mark.parametrize(
+    "members", [b"not packed", selection.pack(every(3))[:-9], selection.pack(np.ones(2000, bool))]
+)
+def test_a_mask_that_does_not_fit_is_refused(members: bytes) -> None:
+    with pytest.raises(ProgdfError, match="select it again"):
+        selection.unpack(members, TOTAL)
+
+
+def test_what_is_hidden_cannot_be_selected_until_all_is_shown() -> None:
+    state = selection.select(SelectionState(), every(2))
+    assert state.count == 502
+    hidden = selection.hide(state, TOTAL)
+    assert hidden.count == 0
+    assert selection.select(hidden, every(1)).count == 501
+    assert selection.select(selection.show_all(hidden), every(1)).count == TOTAL
+
+
+def test_isolating_hides_all_but_the_selection_and_nothing_without_one() -> None:
+    state = selection.select(SelectionState(), every(4))
+    alone = selection.isolate(state, TOTAL)
+    assert (selection.unpack(alone.hidden, TOTAL) == ~every(4)).all()
+    assert alone.members == state.members
+    assert selection.isolate(SelectionState(), TOTAL) == SelectionState()
+
+
+def test_each_selection_is_one_undo_entry_and_no_reason_to_ask_before_closing() -> None:
+    work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
+    facts = SceneFacts("bear.ply", TOTAL, None, ())  # type: ignore[arg-type]
+    once = selecting(work, every(5))
+    twice = selecting(once, every(7))
+    assert len(twice.past.past) == 2
+    assert not workspace.has_unsaved(twice)
+    assert perform(twice, "undo", facts).view.selection == once.view.selection
+    assert perform(perform(twice, "undo", facts), "redo", facts).view == twice.view
+    kept = selection.add_region(twice.view.selection, "jacket", Path("jacket.region.npy"))
+    assert workspace.has_unsaved(replace(twice, view=replace(twice.view, selection=kept)))
+
+
+def test_regions_have_names_of_their_own_that_files_can_have() -> None:
+    state = selection.add_region(SelectionState(), "jacket", Path("jacket.region.npy"))
+    assert selection.free_name(state, " Jacket ") == "Jacket-2"
+    assert selection.free_name(state, "a/b\\c:d\n e") == "a_b_c_d e"
+    assert selection.free_name(state, "../..") == "_"
+    assert selection.free_name(state, "") == "region"

@@ -1,0 +1,159 @@
+"""What is selected in the scene, what of it is hidden, and the regions kept from selections.
+
+A set of Gaussians is a boolean mask over the scene, packed into a few kilobytes (`pack`), so that states
+compare, undo and are saved as values.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from progdf.errors import ProgdfError
+
+SUFFIX = ".region.npy"
+"""How the file of a region is called after its name."""
+LONGEST_NAME = 60
+
+NOBODY = b""
+"""The packed mask without a member."""
+
+Mask = NDArray[np.bool_]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Color = tuple[Share, Share, Share]
+
+COLORS: tuple[Color, ...] = (
+    (0.20, 0.65, 0.95),
+    (0.95, 0.45, 0.20),
+    (0.35, 0.80, 0.35),
+    (0.85, 0.35, 0.75),
+    (0.95, 0.80, 0.20),
+    (0.30, 0.80, 0.75),
+)
+"""Those that new regions take in turn."""
+
+
+@dataclass(frozen=True)
+class NamedRegion:
+    """A selection that was kept.
+
+    Args:
+        name: no two regions share one
+        path: its file, for `progdf train --region file:PATH`
+        members: its packed mask
+        count: of its members
+        color: of its swatch and its tint
+        visible: the picture shows it tinted
+    """
+
+    name: str
+    path: Path
+    members: bytes
+    count: Annotated[int, Meta(ge=0)]
+    color: Color = COLORS[0]
+    visible: bool = False
+
+
+@dataclass(frozen=True)
+class SelectionState:
+    """The present selection, what is hidden, and the regions; undo knows all of it.
+
+    Args:
+        members: packed mask of what is selected
+        count: of these
+        hidden: packed mask of what is not drawn and cannot be selected
+        regions: in the order of the panel's rows
+    """
+
+    members: bytes = NOBODY
+    count: Annotated[int, Meta(ge=0)] = 0
+    hidden: bytes = NOBODY
+    regions: tuple[NamedRegion, ...] = ()
+
+
+def pack(mask: Mask) -> bytes:
+    """A mask as states keep it; `NOBODY` where nothing is in it. [N]"""
+    return zlib.compress(np.packbits(mask).tobytes(), 1) if mask.any() else NOBODY
+
+
+@lru_cache(maxsize=64)
+def unpack(members: bytes, total: int) -> Mask:
+    """The mask of a scene of `total` Gaussians, read-only. [N]
+
+    Raises:
+        ProgdfError: it is damaged or of a scene of another size.
+    """
+    mask = np.zeros(total, bool)
+    if members != NOBODY:
+        unpacker = zlib.decompressobj()
+        try:
+            packed = unpacker.decompress(members, -(-total // 8) + 1)
+        except zlib.error:
+            raise ProgdfError("a selection is damaged; select it again") from None
+        if len(packed) != -(-total // 8):
+            raise ProgdfError(f"a selection does not fit the scene's {total} Gaussians; select it again")
+        mask = np.unpackbits(np.frombuffer(packed, np.uint8), count=total).astype(bool)
+    mask.flags.writeable = False
+    return mask
+
+
+def select(state: SelectionState, mask: Mask) -> SelectionState:
+    """With another selection; what is hidden is never in it. [N]"""
+    if state.hidden != NOBODY:
+        mask = mask & ~unpack(state.hidden, len(mask))
+    return replace(state, members=pack(mask), count=int(np.count_nonzero(mask)))
+
+
+def hide(state: SelectionState, total: int) -> SelectionState:
+    """What is selected is not drawn any more, and no longer selected."""
+    hidden = unpack(state.hidden, total) | unpack(state.members, total)
+    return replace(state, members=NOBODY, count=0, hidden=pack(hidden))
+
+
+def isolate(state: SelectionState, total: int) -> SelectionState:
+    """Nothing but what is selected is drawn; as it was where nothing is."""
+    return replace(state, hidden=pack(~unpack(state.members, total))) if state.count else state
+
+
+def show_all(state: SelectionState) -> SelectionState:
+    """Everything is drawn."""
+    return replace(state, hidden=NOBODY)
+
+
+def free_name(state: SelectionState, wanted: str) -> str:
+    """A name on one line, for a file too, with a number where a region has it already."""
+    kept = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(wanted.split()))
+    name = kept.strip(" .")[:LONGEST_NAME] or "region"
+    taken, free, number = {region.name.lower() for region in state.regions}, name, 2
+    while free.lower() in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free
+
+
+def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
+    """With the selection kept as one more region; it stays selected."""
+    color = COLORS[len(state.regions) % len(COLORS)]
+    region = NamedRegion(name, path, state.members, state.count, color)
+    return replace(state, regions=(*state.regions, region))
+
+
+def change_region(state: SelectionState, index: int, region: NamedRegion | None) -> SelectionState:
+    """With a region in another's place, or None: without it; as it was where there is no such region."""
+    if not 0 <= index < len(state.regions):
+        return state
+    kept: Sequence[NamedRegion] = () if region is None else (region,)
+    return replace(state, regions=(*state.regions[:index], *kept, *state.regions[index + 1 :]))
+
+
+def check(state: SelectionState, total: int) -> None:
+    """ProgdfError where a mask does not fit a scene of `total` Gaussians."""
+    for members in (state.members, state.hidden, *(region.members for region in state.regions)):
+        unpack(members, total)
