@@ -48,7 +48,7 @@ class BenchOptions:
         markdown: also put the tables between their markers in this Markdown file
         runs: finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits
         plot: `field` also draws its errors into this PNG file
-        scenes: .ply files that viewer, frames, window and warps take in place of the bears
+        scenes: .ply files that viewer, frames and window take in place of the bears, warps beside the bear
         seconds: how long `window` drags its slider; 60 where not said
     """
 

@@ -68,7 +68,7 @@ class WarpCase:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """The bear's edits, or those of robots whose parts lie in NAME_labels.npy beside NAME.ply.
+    """The bear's edits, and those of robots whose parts lie in NAME_labels.npy beside NAME.ply.
 
     Raises:
         ProgdfError: a scene has no labels beside it.
@@ -80,7 +80,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     )
     rows = [
         _row(plan, case)
-        for case in ([c for path in scenes for c in _robot_cases(plan, path)] or _bear_cases(plan))
+        for case in [*_bear_cases(plan), *(c for path in scenes for c in _robot_cases(plan, path))]
     ]
     return [
         Table(
