@@ -53,10 +53,8 @@ def _source_version() -> str:
 
 def find_cache_folder() -> Path:
     """A folder that this user may write, for this version of the kernels; never in the source tree."""
-    if "NUMBA_CACHE_DIR" in os.environ:
-        root = Path(os.environ["NUMBA_CACHE_DIR"])
-    else:
-        root = cache_folder() / "kernels"
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    root = Path(named) if named else cache_folder() / "kernels"
     temporary = temporary_folder()
     for place in (root, temporary / "kernels"):
         folder = place / _source_version()
