@@ -84,6 +84,13 @@ def difference(a: Region, b: Region, name: str = "") -> Region:
     return Region(name or f"{a.name}-{b.name}", members, torch.minimum(a.score, 1 - b.score))
 
 
+def intersection(a: Region, b: Region, name: str = "") -> Region:
+    """Members of both; the smaller score."""
+    _same_scene(a, b)
+    members = a.members[torch.isin(a.members, b.members)]
+    return Region(name or f"{a.name}&{b.name}", members, torch.minimum(a.score, b.score))
+
+
 def _same_scene(a: Region, b: Region) -> None:
     if a.score.shape != b.score.shape:
         raise ValueError(

@@ -1,15 +1,17 @@
 """The language in which a region is written: `labels:bear.npy:3,4-box:0,0,0,1,2,1`.
 
-    REGION  = PART (('+' | '-') PART)*          from left to right: '+' adds, '-' takes away
+    REGION  = PART (SIGN PART | '|' STEP)*      from left to right
+    SIGN    = '+' adds | '-' takes away | '&' keeps what is in both
     PART    = 'all'
             | 'labels:' FILE '.npy:' ID (',' ID)*
             | 'box:' x0,y0,z0,x1,y1,z1           two opposite corners, world units
             | 'sphere:' x,y,z,r                  center and radius, world units
             | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
+            | rectangle, lasso, brush, front, color, flood: and STEP, see region_parts.py
             | KIND ':' …                         other kinds that the caller knows, e.g. masks:, text:
 
-Numbers and file names hold '-' and '+' themselves, so a '+' or '-' joins two parts only where a kind and its
-colon (or a whole 'all') follow. Blanks around parts do not count.
+Numbers and file names hold '-' and '+' themselves, so a sign joins two parts only where a kind and its colon
+(or a whole 'all', or a step) follow. Blanks around parts do not count.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,9 +37,13 @@ from progdf.region import (
     from_mask,
     inside_box,
     inside_sphere,
+    intersection,
     union,
     whole_scene,
 )
+
+from .neighborhood import Neighborhood
+from .region_parts import PARTS, STEPS, read_part, read_step
 
 Kind = Callable[[str, Gaussians], Region]
 """Makes a region from the text after `KIND:`."""
@@ -44,6 +51,7 @@ Kind = Callable[[str, Gaussians], Region]
 Check = Callable[[str], object]
 """Raises ProgdfError where the text after `KIND:` cannot be, whatever the scene."""
 
+_SIGNS = {"+": union, "-": difference, "&": intersection}
 _NOTHING: Mapping[str, Kind] = {}
 _UNCHECKED: Mapping[str, Check] = {}
 
@@ -59,9 +67,17 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
     Raises:
         ProgdfError: the spec cannot be read, a file does not fit the scene, or nothing is in the region.
     """
-    known: dict[str, Kind] = {"labels": _labels, "box": _box, "sphere": _sphere, "file": _file, **kinds}
+    known: dict[str, Kind] = {"labels": _labels, "box": _box, "sphere": _sphere, "file": _file}
+    known |= {kind: partial(_by_hand, kind) for kind in PARTS} | dict(kinds)
     region = from_mask("", torch.zeros(len(scene), dtype=torch.bool))
+    neighborhood: Neighborhood | None = None
     for sign, part in split_spec(spec, tuple(known)):
+        if sign == "|":
+            neighborhood = neighborhood or Neighborhood(scene)
+            mask = np.zeros(len(scene), bool)
+            mask[region.members.numpy()] = True
+            region = from_mask("", torch.from_numpy(read_step(part)(neighborhood, mask)))
+            continue
         kind, colon, rest = part.partition(":")
         if part == "all":
             found = whole_scene(scene)
@@ -69,7 +85,7 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
             found = known[kind](rest, scene)
         else:
             raise _unknown(part, known)
-        region = (union if sign == "+" else difference)(region, found)
+        region = _SIGNS[sign](region, found)
     if not len(region):
         raise ProgdfError(f"region '{spec}' holds no Gaussian; the scene reaches {_extent(scene)}")
     return Region(name or spec.strip(), region.members, region.score)
@@ -87,11 +103,14 @@ def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
         "box": _corners,
         "sphere": _ball,
         "file": _check_file,
+        **{kind: partial(read_part, kind) for kind in PARTS},
         **checks,
     }
-    for _, part in split_spec(spec, tuple(known)):
+    for sign, part in split_spec(spec, tuple(known)):
         kind, colon, rest = part.partition(":")
-        if colon and kind in known:
+        if sign == "|":
+            read_step(part)
+        elif colon and kind in known:
             known[kind](rest)
         elif part != "all":
             raise _unknown(part, known)
@@ -103,13 +122,18 @@ def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
 
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
-    """('+' or '-', part) for each part of a spec, the first one with '+'."""
-    words = "|".join(re.escape(kind) for kind in kinds)
-    joint = re.compile(rf"\s*([+-])\s*(?=(?:{words}):|all\s*(?:$|[+-]))")
+    """(sign, part) for each part of a spec, the first one with '+'; a step's sign is '|'."""
+    words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
+    part, step = rf"(?:{words}):|all\s*(?:$|[+&|-])", rf"(?:{steps})(?::[0-9]+)?\s*(?:$|[+&|-])"
+    joint = re.compile(rf"\s*([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))\s*")
     pieces = joint.split(spec.strip())
     if not all(pieces[0::2]):
         raise ProgdfError(f"region '{spec}' is missing a part; write, for example, all-sphere:0,0,0,1")
     return list(zip(["+", *pieces[1::2]], (piece.strip() for piece in pieces[0::2]), strict=True))
+
+
+def _by_hand(kind: str, rest: str, scene: Gaussians) -> Region:
+    return from_mask(f"{kind}:{rest}", torch.from_numpy(read_part(kind, rest)(scene)))
 
 
 def read_labels(path: str, count: int) -> Tensor:

@@ -19,7 +19,7 @@ class RegionOptions:
     scene: tyro.conf.Positional[Path]
     """The scene, a 3DGS .ply file."""
     spec: tyro.conf.Positional[str]
-    """The region, as progdf train --region has it: box:…, labels:…, masks:DIR, file:MEMBERS.npy, …"""
+    """The region, as progdf train --region has it: box:…, lasso:…, masks:DIR, file:MEMBERS.npy, …"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """picture.png, in which the region is tinted and the rest is pale; or members.npy, its rows (int64)."""
     cameras: Path | None = None

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.io.cameras import save_cameras
 from progdf.region import Region, difference, from_mask, union
 from progdf.scene.region_spec import parse_region, split_spec
-from tests.helpers.scenes import random_gaussians
+from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
+from tests.helpers.scenes import orbit_camera, random_gaussians
 
 COUNT = 200
 KINDS = ("labels", "box", "sphere")
@@ -75,6 +77,43 @@ def test_parts_join_from_left_to_right(scene: Gaussians, tmp_path: Path) -> None
     spec = f"labels:{tmp_path}/l.npy:1-sphere:0,0,0,1+labels:{tmp_path}/l.npy:2"
     assert members(spec, scene) == rows(((labels == 1) & ~near) | (labels == 2))
     assert members("all-sphere:0,0,0,1", scene) == rows(~near)
+
+
+def test_what_is_in_both_parts_is_kept_and_steps_change_all_before_them(scene: Gaussians) -> None:
+    near = scene.means.norm(dim=1) <= 1.2
+    right = scene.means[:, 0] >= 0
+    spec = "sphere:0,0,0,1.2 & box:0,-99,-99,99,99,99"
+    assert members(spec, scene) == rows(near & right)
+    grown = members(f"{spec} | grow:2", scene)
+    assert grown == members(f"{spec}|grow|grow", scene) > members(spec, scene)
+    assert members(f"{spec}|grow:2-sphere:0,0,0,1.2", scene) == grown - rows(near)
+    assert members("all|largest", scene) <= members("all", scene)
+
+
+def test_shapes_are_drawn_over_the_picture_of_a_camera(scene: Gaussians, tmp_path: Path) -> None:
+    camera = orbit_camera(90, 60)
+    save_cameras(tmp_path / "c.json", [orbit_camera(30, 30, azimuth=2.0), camera])
+    points, _ = project_centers(scene, camera)
+    seen = f"{tmp_path}/c.json:1"
+    assert members(f"rectangle:{seen}:20,10,50,45.5", scene) == rows(
+        inside_rectangle(points, (20, 10), (50, 45.5))
+    )
+    outline = [(10, 5), (80, 20), (40, 55)]
+    assert members(f"lasso:{seen}:10,5,80,20,40,55", scene) == rows(inside_polygon(points, outline))
+    assert members(f"brush:{seen}:12.5,10,5,80,20", scene) == rows(inside_stroke(points, outline[:2], 12.5))
+    front = members(f"front:{seen}", scene)
+    assert 0 < len(front) < COUNT
+    assert members(f"lasso:{seen}:10,5,80,20,40,55&front:{seen}", scene) == front & rows(
+        inside_polygon(points, outline)
+    )
+
+
+def test_a_color_and_a_flood_take_a_tolerance(scene: Gaussians) -> None:
+    assert len(members("color:#808080,0.1", scene)) < len(members("color:#808080,.2", scene)) < COUNT
+    assert members("color:#808080", scene) == members("color:#808080,0.1", scene)
+    x, y, z = scene.means[7].tolist()
+    assert 7 in members(f"flood:{x},{y},{z},0.3", scene)
+    assert members(f"flood:{x},{y},{z},0.3", scene) <= members(f"flood:{x},{y},{z},1", scene)
 
 
 def test_signs_in_numbers_and_file_names_join_nothing(scene: Gaussians, tmp_path: Path) -> None:
@@ -149,6 +188,14 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("labels:nowhere.npy", "has no label"),
         ("labels:nowhere.npy:one", "list of integers"),
         ("labels:nowhere.npy:1,", "list of integers"),
+        ("lasso:1,2,3,4,5,6", "needs a camera"),
+        ("lasso:nowhere.json:0:1,2,3,4,5,6", "nowhere.json does not exist"),
+        ("front:", "needs a camera"),
+        ("color:red", "write for example color:#903020"),
+        ("color:#ff0000,2", "tolerance"),
+        ("flood:1,2", "write flood:x,y,z"),
+        ("all|grow:1000", "no step of a region"),
+        ("all|largest:2", "no step of a region"),
     ],
 )
 def test_a_spec_that_cannot_be_meant_is_one_line(spec: str, said: str, scene: Gaussians) -> None:

@@ -1,0 +1,206 @@
+"""Selecting Gaussians by hand: shapes drawn over a picture, a ball, a color; and how selections go together.
+
+A selection is a boolean mask over the scene. Shapes go by the centers of Gaussians as a camera sees them
+(`project_centers`); what lies behind the front surface is left out by `front_surface`.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw
+
+from progdf.camera import Camera
+from progdf.color.oklab import srgb_to_oklab
+from progdf.gaussians import Gaussians
+from progdf.rasterize import render
+from progdf.sh import sh0_to_rgb
+
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+
+MODES = ("new", "add", "subtract", "intersect")
+
+_COARSE = 4  # the front surface is looked up in a picture so many times smaller
+_BEHIND = 0.01  # of the depth: what lies no further behind the surface still belongs to it
+_COVERED = 0.05  # less than this in all counts as background
+_MOST_CELLS = 1024  # a side, of the grid into which a polygon is filled
+
+
+class Centers(NamedTuple):
+    """Where the centers of Gaussians are in a picture.
+
+    Args:
+        points: pixels from the upper left corner; NaN where a center is not in front of the camera. [N,2]
+        depths: camera z, world units. [N]
+    """
+
+    points: Floats
+    depths: Floats
+
+
+def combine(mask: Mask, found: Mask, mode: str) -> Mask:
+    """A selection after `found` was selected as well, by one of `MODES`. [N]"""
+    match mode:
+        case "new":
+            return found
+        case "add":
+            return mask | found
+        case "subtract":
+            return mask & ~found
+        case "intersect":
+            return mask & found
+    raise ValueError(f"mode is '{mode}', expected one of {', '.join(MODES)}")
+
+
+def project_centers(scene: Gaussians, camera: Camera) -> Centers:
+    """Where `camera` sees the centers of a scene's Gaussians."""
+    viewmat, K = camera.viewmat.float().numpy(), camera.K.float().numpy()
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # by columns: a row at a time takes many times as long
+        across, down, depths = viewmat[:3, :3] @ scene.means.numpy().T + viewmat[:3, 3:]
+        inverse = np.where(depths > 0.0, 1.0 / depths, np.nan).astype(np.float32)
+        points = np.stack([across * inverse * K[0, 0] + K[0, 2], down * inverse * K[1, 1] + K[1, 2]], axis=1)
+    return Centers(points, depths)
+
+
+def inside_rectangle(points: Floats, corner: ArrayLike, opposite: ArrayLike) -> Mask:
+    """The points [N,2] between two opposite corners [2], edges included. [N]"""
+    low, high = np.minimum(corner, opposite), np.maximum(corner, opposite)
+    x, y = points[:, 0], points[:, 1]
+    return np.asarray((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
+
+
+def inside_polygon(points: Floats, corners: ArrayLike) -> Mask:
+    """The points inside a polygon, also one that crosses itself (even-odd).
+
+    The polygon is filled into a grid; only points in cells near its edge are compared with each of its sides.
+
+    Args:
+        points: not finite ones are outside. [N,2]
+        corners: in order, closed by itself; fewer than three hold nothing. [K,2]
+    """
+    outline = np.asarray(corners, np.float64).reshape(-1, 2)
+    mask = np.zeros(len(points), bool)
+    if len(outline) < 3:
+        return mask
+    low, high = outline.min(0), outline.max(0)
+    near = np.flatnonzero(inside_rectangle(points, low, high))
+    cell = max(float((high - low).max()) / _MOST_CELLS, 1e-12)
+    filled = _fill((outline - low) / cell + 2.0)
+    column, row = (
+        (points[near, axis] * np.float32(1.0 / cell) + np.float32(2.0 - low[axis] / cell)).astype(np.int32)
+        for axis in (0, 1)
+    )
+    cells = filled.ravel().take(row * filled.shape[1] + column, mode="clip")
+    mask[near] = cells == _INSIDE
+    close = near[cells == _EDGE]
+    mask[close] = _crossings(points[close].astype(np.float64), outline) % 2 == 1
+    return mask
+
+
+def inside_stroke(points: Floats, path: ArrayLike, radius: float) -> Mask:
+    """The points that a round brush touches.
+
+    Args:
+        points: not finite ones are outside. [N,2]
+        path: where the brush goes in straight lines, or stays where it is a single point. [K,2]
+        radius: of the brush, in the unit of the points
+    """
+    way = np.asarray(path, np.float32).reshape(-1, 2)
+    mask = np.zeros(len(points), bool)
+    for start, end in pairwise(way if len(way) > 1 else [*way, *way]):
+        box = inside_rectangle(points, np.minimum(start, end) - radius, np.maximum(start, end) + radius)
+        rows = np.flatnonzero(box)
+        x, y = points[rows, 0] - start[0], points[rows, 1] - start[1]
+        dx, dy = end - start
+        along = np.clip((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0)
+        mask[rows] |= (x - along * dx) ** 2 + (y - along * dy) ** 2 <= radius * radius
+    return mask
+
+
+def inside_ball(scene: Gaussians, center: ArrayLike, radius: float) -> Mask:
+    """The Gaussians whose center is at most `radius` world units from `center` [3]. [N]"""
+    away = scene.means.numpy() - np.asarray(center, np.float32)
+    return np.asarray(np.einsum("ij,ij->i", away, away) <= radius * radius)
+
+
+def base_colors(scene: Gaussians) -> Floats:
+    """What color Gaussians have from no side in particular, OKLab. [N,3]"""
+    with torch.no_grad():
+        colors: Floats = srgb_to_oklab(sh0_to_rgb(scene.sh0).clamp(0.0, 1.0)).numpy()
+    return colors
+
+
+def alike_in_color(colors: Floats, color: ArrayLike, tolerance: float) -> Mask:
+    """The colors [N,3] no farther than `tolerance` from one [3], all OKLab: .02 is hardly told apart. [N]"""
+    away = colors - np.asarray(color, np.float32)
+    return np.asarray(np.einsum("ij,ij->i", away, away) <= tolerance * tolerance)
+
+
+def front_surface(
+    scene: Gaussians, camera: Camera, centers: Centers, rows: NDArray[np.int64] | None = None
+) -> Mask:
+    """Which Gaussians lie on what one sees, and not behind it.
+
+    A Gaussian belongs to the surface up to its own size behind the depth that the picture has there.
+
+    Args:
+        scene: as it is on screen
+        camera: of the picture
+        centers: of all its Gaussians, from `project_centers`
+        rows: those that are asked about, all if None; the fewer of the picture they take, the less it costs
+
+    Returns:
+        False also for what is not in front of the camera. [M]
+    """
+    part = slice(None) if rows is None else rows
+    points, depths = centers.points[part], centers.depths[part]
+    width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
+    place = points / np.array([camera.width / width, camera.height / height], np.float32)
+    shown = np.asarray(np.isfinite(place).all(axis=1))
+    if not shown.any():
+        return shown
+    cells = np.where(shown[:, None], place, place[shown][0]).clip(0, (width - 1, height - 1)).astype(np.intp)
+    (x0, y0), (x1, y1) = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
+    with torch.no_grad():
+        z = torch.from_numpy(centers.depths)[:, None].nan_to_num().expand(-1, 3).contiguous()
+        crop = (x0, y0, x1 + 1, y1 + 1)
+        image, clear, _ = render(scene, camera.resize(width, height), (0.0, 0.0, 0.0), colors=z, crop=crop)
+    covered = 1.0 - clear.numpy().reshape(y1 + 1 - y0, x1 + 1 - x0)
+    depth = np.where(covered > _COVERED, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
+    surface = depth[cells[:, 1] - y0, cells[:, 0] - x0]
+    size = np.exp(scene.log_scales.numpy()[part].max(axis=1))
+    return np.asarray(shown & (depths <= surface * (1.0 + _BEHIND) + size))
+
+
+_OUTSIDE, _INSIDE, _EDGE = 0, 1, 2
+
+
+def _fill(outline: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Which cells of a grid are outside or inside, or so near the edge that it takes a closer look."""
+    width, height = (int(side) + 4 for side in outline.max(0))
+    image = Image.new("L", (width, height), _OUTSIDE)
+    draw = ImageDraw.Draw(image)
+    corners = [(float(x), float(y)) for x, y in outline]
+    draw.polygon(corners, fill=_INSIDE)
+    draw.line([*corners, corners[0]], fill=_EDGE, width=3)
+    for x, y in corners:  # wide lines have notches where they meet
+        draw.rectangle((x - 2, y - 2, x + 2, y + 2), fill=_EDGE)
+    return np.asarray(image)
+
+
+def _crossings(points: NDArray[np.float64], outline: NDArray[np.float64]) -> NDArray[np.intp]:
+    """How many sides of a closed outline the ray from each point to the right crosses. [N]"""
+    count = np.zeros(len(points), np.intp)
+    order = np.argsort(points[:, 1])
+    x, y = points[order].T
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if y0 != y1:
+            level = slice(*np.searchsorted(y, sorted((y0, y1))))
+            count[order[level]] += x[level] < x0 + (y[level] - y0) / (y1 - y0) * (x1 - x0)
+    return count
