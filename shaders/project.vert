@@ -24,7 +24,7 @@ uniform vec4 intrinsics;     // fx, fy, cx, cy
 uniform vec2 size;           // width, height
 uniform bool antialiased;    // opacity × sqrt(det before dilation / det after)
 uniform bool highlighted;         // whether `highlight` is there
-uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own color
+uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own color; 1 hides it
 
 out vec2 center;
 out vec3 shape;              // slope, l11, l22
@@ -95,6 +95,7 @@ void main() {
     vec3 rgb = shade(texel, offset / length(offset));
     if (highlighted) {
         vec4 over = texelFetch(highlight, texel, 0);
+        if (over.a == 1.0) return;
         rgb = mix(rgb, over.rgb, over.a);
     }
     if (not_finite(rgb)) return;        // before the clamp, which hides NaN and -inf

@@ -16,6 +16,7 @@ from viewer.render.timings import FrameTimings
 from viewer.state.recordings import RecordingFile
 from viewer.state.snapshots import SliderSnapshot, with_original
 from viewer.state.view_state import ViewState
+from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE
 
 
@@ -49,12 +50,14 @@ class Canvas:
         now: float,
         focus: int | None = None,
         overlap: int | None = None,
+        pointed: Pointed | None = None,
     ) -> None:
         """Show `view` in the lower left `size` pixels of `screen`.
 
         Args:
             focus: the layer whose painted weights are shown while the brush is out, or None
             overlap: the layer of which is shown what it shares with the others, or None
+            pointed: what else the panel is asked about
             held: the mouse holds something, so that more will follow
             now: seconds on the main view's clock
 
@@ -68,7 +71,7 @@ class Canvas:
         self._last = aim, edits
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         self._resolution = dynamic_resolution.before_draw(self._resolution, mode, held, turned, slid, now)
-        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap)
+        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap, pointed)
         new = self.comparer.needs_draw(view, size, self.pixels)
         timings = self.comparer.draw(view, screen, size, self.pixels)
         if new:

@@ -170,8 +170,8 @@ class MainView:
         if self.work != before:
             self.wake()
         shown, area = self._shown_view(), self._pointer().size
-        focus, overlap = self.work.focus, self.work.overlap if shown.panel else None
-        self.canvas.draw(shown, screen, area, self._is_held(), self._clock, focus, overlap)
+        asked = (self.work.overlap, self.work.pointed) if shown.panel else (None, None)
+        self.canvas.draw(shown, screen, area, self._is_held(), self._clock, self.work.focus, *asked)
         self._draw_overlays()
         imgui.render()
         screen.use()

@@ -11,7 +11,8 @@ from .scene_textures import row_runs
 
 
 class HighlightTexture:
-    """rgb and the share of it, laid out as the scene's textures are; 0 leaves a Gaussian its own color.
+    """rgb and the share of it, laid out as the scene's textures are; 0 leaves a Gaussian its own color,
+    255 hides it.
 
     Args:
         ctx: where it lives

@@ -20,6 +20,8 @@ from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.present import Presenter
 from viewer.gl.scene_textures import row_runs
 
+from .highlight import HIDDEN
+
 Image = NDArray[np.float32]
 
 SH = ("sh0", "shN")
@@ -116,8 +118,10 @@ class CpuRenderer:
         """See `Renderer.highlight`."""
         if self._highlights is None:
             self._highlights = np.zeros((len(self._drawn.means), 4), np.float32)
+        hidden = self._highlights[rows, 3] == 1.0
         self._highlights[rows] = highlights.astype(np.float32) / 255.0
-        self.update(self._scene, SH, rows)
+        names = SH if (hidden == (highlights[:, 3] == HIDDEN)).all() else ("logit_opacities", *SH)
+        self.update(self._scene, names, rows)
         if not self._highlights[:, 3].any():
             self._highlights = None
 
@@ -208,6 +212,8 @@ class CpuRenderer:
                 scales[part] = _exp(scene.log_scales[part])
             case "logit_opacities":
                 opacities[part] = _sigmoid(scene.logit_opacities[part])
+                if self._highlights is not None:
+                    opacities[part] *= self._highlights[part, 3] < 1.0
             case "sh0":
                 sh[part, 0] = scene.sh0[part].numpy()
             case "shN":

@@ -104,10 +104,8 @@ class ViewEngine:
         self._ordered_for: bytes | None = None
         self._picture: _Picture | None = None
         self.highlight: Highlight | None = None
-        """What `draw` shows over the members of an edit; `image` never does."""
-        self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = (
-            None  # and the highlights of its members
-        )
+        """What `draw` shows over the scene; `image` never does, but for what is hidden."""
+        self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # and its colors. [N,4]
         if edit_pass == "gpu" and self.draws_with == "cpu":
             raise ProgdfError("the CPU draws here, so the GPU cannot edit; add --draw gl to --edit-pass gpu")
         self._edit_obstacle = ""
@@ -118,7 +116,7 @@ class ViewEngine:
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
         wanted = self._describe_picture(view, camera or to_camera(view.camera, *size))
-        return replace(wanted, highlight=self.highlight) != self._picture
+        return replace(wanted, highlight=_with_hidden(self.highlight, view)) != self._picture
 
     def draw(
         self,
@@ -219,6 +217,7 @@ class ViewEngine:
         self, view: ViewState, camera: Camera, highlight: Highlight | None = None
     ) -> FrameTimings:
         """Do what lies between the last picture and this one."""
+        highlight = _with_hidden(highlight, view)
         wanted = replace(self._describe_picture(view, camera), highlight=highlight)
         if wanted == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
@@ -260,17 +259,14 @@ class ViewEngine:
         """Bring the highlights up to date, those alone that are others than before; gives the ms it took."""
         if highlight == (self._highlighted and self._highlighted[0]):
             return 0.0
-        started = time.perf_counter()
-        if self._highlighted is not None and (highlight is None or highlight.gdf != self._highlighted[0].gdf):
-            last, shown = self._highlighted
-            self._highlighted = None
-            self.renderer.highlight(self._gdf(last.gdf).region.members.numpy(), np.zeros_like(shown))
-        if highlight is not None:
-            members = self._gdf(highlight.gdf).region.members.numpy()
-            new = highlight_colors(highlight, self.gdfs)
-            others = slice(None) if self._highlighted is None else (new != self._highlighted[1]).any(1)
-            self._highlighted = highlight, new
-            self.renderer.highlight(members[others], new[others])
+        started, total = time.perf_counter(), len(self.scene)
+        nothing = Highlight(), np.zeros((total, 4), np.uint8)
+        last = (self._highlighted or nothing)[1]
+        new = nothing[1] if highlight is None else highlight_colors(highlight, self.gdfs, total)
+        rows = np.flatnonzero(new.view(np.uint32) != last.view(np.uint32))
+        self._highlighted = None if highlight is None else (highlight, new)
+        if len(rows):
+            self.renderer.highlight(rows, new[rows])
         return 1e3 * (time.perf_counter() - started)
 
     def _stack(self, edits: _Edits) -> tuple[Stack, str]:
@@ -289,6 +285,12 @@ class ViewEngine:
 def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
     """Width and height of a picture of which each pixel fills `pixels` of `size`, each way."""
     return -(-size[0] // pixels), -(-size[1] // pixels)
+
+
+def _with_hidden(highlight: Highlight | None, view: ViewState) -> Highlight | None:
+    """With what `view` does not draw; None for nothing at all."""
+    full = replace(highlight or Highlight(), hidden=view.selection.hidden)
+    return None if full == Highlight() else full
 
 
 def _edits(view: ViewState) -> _Edits:

@@ -1,4 +1,6 @@
-"""Colors over the splats: painted weights, from blue (none of the edit) to yellow, or what layers share."""
+"""Colors over the splats: the selection and regions, painted weights from blue (none of the edit) to yellow,
+what layers share; and what is hidden.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from numpy.typing import NDArray
 from progdf.gdf.file import Gdf
 from viewer.state import layers as stack
 from viewer.state import paint
+from viewer.state.selection import NOBODY, Color, unpack
 from viewer.state.view_state import ViewState
+from viewer.state.workspace import Pointed
 
 SHARE = 0.75
 """Of a member's color that the ramp takes, so that the rest still tells its shape."""
@@ -22,41 +26,66 @@ RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1
 SHARED = 0xFF3FA0
 """The color of what is in several layers."""
 
+SELECTED: Color = (1.0, 0.72, 0.05)
+TINT, HIDDEN = 140, 255
+"""Shares of 255 that a tint takes; and the one that means that a Gaussian is not drawn at all."""
+
 Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Highlight:
-    """What to show of the members of one edit.
+    """What to show over the scene.
 
     Args:
-        gdf: the edit, as `LayerState.gdf` counts
+        gdf: an edit whose members show their weights, as `LayerState.gdf` counts; None for none
         paint: its weights, as `paint.encode` writes them
         others: edits of which to show, in place of weights, the members that they share with this one
+        tinted: packed masks and their colors, later ones over earlier ones
+        region: an edit whose members are tinted as one, or None
+        hidden: packed mask of what is not drawn
     """
 
-    gdf: int
+    gdf: int | None = None
     paint: str = paint.FULL
     others: tuple[int, ...] = ()
+    tinted: tuple[tuple[bytes, Color], ...] = ()
+    region: int | None = None
+    hidden: bytes = NOBODY
 
 
-def requested_highlight(view: ViewState, focus: int | None, overlap: int | None = None) -> Highlight | None:
-    """What `view` shows: an overlap where one is asked for, or weights while the brush is out.
+def requested_highlight(
+    view: ViewState, focus: int | None, overlap: int | None = None, pointed: Pointed | None = None
+) -> Highlight | None:
+    """What `view` shows: what the panel is asked about, weights while the brush is out, or the selection
+    while a tool selects, with the regions that are shown.
 
-    Not in a comparison, and no weights of a hidden layer.
+    Not in a comparison, and no weights of a hidden layer. What is hidden is the engine's to know.
 
     Args:
         focus: the focused layer, an index into `view.layers`, or None
         overlap: the layer of which to show what it shares with the others, or None
+        pointed: what else the mouse rests on in the panel
     """
-    if overlap is not None and overlap < len(view.layers) and view.compare.mode == "off":
+    if view.compare.mode != "off":
+        return None
+    if overlap is not None and overlap < len(view.layers):
         gdf = view.layers[overlap].gdf
         return Highlight(gdf, others=tuple(layer.gdf for layer in view.layers if layer.gdf != gdf))
-    asked = view.brush.active and view.brush.weights and view.compare.mode == "off"
-    if not asked or focus is None or focus >= len(view.layers):
-        return None
-    layer = view.layers[focus]
-    return Highlight(layer.gdf, layer.paint) if layer in stack.visible_layers(view) else None
+    state, kind, index = view.selection, *(pointed or ("", 0))
+    if kind == "layer" and index < len(view.layers):
+        return Highlight(region=view.layers[index].gdf)
+    if view.brush.active and view.brush.weights:
+        layer = None if focus is None or focus >= len(view.layers) else view.layers[focus]
+        return Highlight(layer.gdf, layer.paint) if layer in stack.visible_layers(view) and layer else None
+    tinted = [
+        (region.members, region.color)
+        for i, region in enumerate(state.regions)
+        if region.visible or (kind, index) == ("region", i)
+    ]
+    if state.count and (view.select.tool or kind == "selection"):
+        tinted.append((state.members, SELECTED))
+    return Highlight(tinted=tuple(tinted)) if tinted else None
 
 
 def ramp_colors(weights: NDArray[np.float32]) -> Bytes:
@@ -73,22 +102,36 @@ def rgba(color: int) -> tuple[float, float, float, float]:
     return red / 255, green / 255, blue / 255, 1.0
 
 
-def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf]) -> Bytes:
-    """What is drawn over each member: rgb and its share, 0..255. [M,4]
+def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> Bytes:
+    """What is drawn over each Gaussian of the scene: rgb and its share, 0..255, or `HIDDEN`. [N,4]
 
     Args:
         gdfs: the edits that `highlight` counts
+        total: N
 
     Raises:
-        ProgdfError: see `paint.decode`.
+        ProgdfError: see `paint.decode` and `unpack`.
     """
-    members = gdfs[highlight.gdf].region.members
-    shares = np.full(len(members), round(255 * SHARE), np.uint8)
-    if highlight.others:
-        others = np.concatenate([gdfs[i].region.members.numpy() for i in highlight.others])
-        shares[~np.isin(members.numpy(), others)] = 0
-        over = np.tile(np.round(255.0 * np.array(rgba(SHARED)[:3])), (len(members), 1)).astype(np.uint8)
-    else:
-        found = paint.decode(highlight.paint, len(members))
-        over = ramp_colors(np.ones(len(members), np.float32) if found is None else found.numpy())
-    return np.concatenate([over, shares[:, None]], axis=1)
+    colors = np.zeros((total, 4), np.uint8)
+    for packed, color in highlight.tinted:
+        colors[unpack(packed, total)] = _tint(color)
+    if highlight.region is not None:
+        colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED)
+    if highlight.gdf is not None:
+        members = gdfs[highlight.gdf].region.members.numpy()
+        if highlight.others:
+            others = np.concatenate([gdfs[i].region.members.numpy() for i in highlight.others])
+            members = members[np.isin(members, others)]
+            colors[members, :3] = np.round(255.0 * np.array(rgba(SHARED)[:3]))
+        else:
+            found = paint.decode(highlight.paint, len(members))
+            weights = np.ones(len(members), np.float32) if found is None else found.numpy()
+            colors[members, :3] = ramp_colors(weights)
+        colors[members, 3] = round(255 * SHARE)
+    if highlight.hidden != NOBODY:
+        colors[unpack(highlight.hidden, total), 3] = HIDDEN
+    return colors
+
+
+def _tint(color: Color) -> Bytes:
+    return np.array([*(round(255 * channel) for channel in color), TINT], np.uint8)

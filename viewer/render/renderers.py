@@ -37,7 +37,8 @@ class Renderer(Protocol):
         """Draw Gaussians (sorted) in other colors from now on, whatever becomes of their own.
 
         Args:
-            highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none. [R,4]
+            highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none, 255
+                hides the Gaussian. [R,4]
         """
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:

@@ -81,6 +81,10 @@ class Dialog:
     error: str = ""
 
 
+Pointed = tuple[str, int]
+"""What the mouse rests on in the panel: "layer" or "region" and which of them, or ("selection", 0)."""
+
+
 @dataclass(frozen=True)
 class Workspace:
     """The state on screen, how it came about, and what is focused.
@@ -100,6 +104,7 @@ class Workspace:
         requests: what the window has still to do, see `REQUESTS`
         player: the playhead of `view.timeline`
         overlap: the layer of which the panel asks to see what it shares with the others, or None
+        pointed: what else the mouse rests on in the panel, to be seen in the picture
     """
 
     view: ViewState
@@ -116,6 +121,7 @@ class Workspace:
     requests: tuple[str, ...] = ()
     player: Player = Player()
     overlap: int | None = None
+    pointed: Pointed | None = None
 
 
 def new_workspace(view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> Workspace:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import moderngl
 import numpy as np
@@ -16,8 +17,9 @@ from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.render import highlight
 from viewer.render.engine import ViewEngine
 from viewer.render.highlight import Highlight
-from viewer.state import paint
-from viewer.state.view_state import Brush, Comparison, ViewState
+from viewer.state import paint, selection
+from viewer.state.selection import SelectionState
+from viewer.state.view_state import Brush, Comparison, SelectTool, ViewState
 
 SIZE = (160, 120)
 SCARF = 0
@@ -43,7 +45,12 @@ def shown(engine: ViewEngine, state: ViewState, ctx: moderngl.Context) -> np.nda
 def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
     """The plain way: another scene, in which the members have the mixed colors."""
     members = bear().gdfs[shade.gdf].region.members
-    over = torch.from_numpy(highlight.highlight_colors(shade, bear().gdfs).astype(np.float32)) / 255.0
+    over = (
+        torch.from_numpy(
+            highlight.highlight_colors(shade, bear().gdfs, len(scene))[members].astype(np.float32)
+        )
+        / 255.0
+    )
     share = over[:, 3:]
     sh0, shN = scene.sh0.clone(), scene.shN.clone()
     sh0[members] = (1 - share) * sh0[members] + share * (over[:, :3] - 0.5) / C0
@@ -114,6 +121,64 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
 
 
 @pytest.mark.gl
+@pytest.mark.parametrize("draw", ["cpu", "gl"])
+def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
+    ctx: moderngl.Context, draw: str
+) -> None:
+    scene, mask = bear().scene, np.arange(len(bear().scene)) % 3 == 0
+    engine = ViewEngine(ctx, scene, bear().gdfs, draw)
+    clean = shown(engine, view(0.6), ctx).copy()
+    some = replace(view(0.6), selection=selection.hide(selection.select(SelectionState(), mask), len(mask)))
+    found = shown(engine, some, ctx).copy()
+    kept = torch.from_numpy(~mask)
+    less = ViewEngine(ctx, engine.gaussians(some)[kept.nonzero()[:, 0]], (), draw)
+    assert np.abs(found - shown(less, replace(view(), layers=()), ctx)).max() < 1e-5
+    assert np.abs(engine.image(some, SIZE) - found).max() < 1e-5
+    slid = replace(some, layers=view(1.0).layers)
+    shown(engine, slid, ctx)
+    assert np.array_equal(shown(engine, some, ctx), found), "a slider brings nothing back"
+    assert np.array_equal(shown(engine, view(0.6), ctx), clean)
+    engine.release()
+    less.release()
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("draw", ["cpu", "gl"])
+def test_the_selection_is_tinted_while_a_tool_selects(ctx: moderngl.Context, draw: str) -> None:
+    members = bear().gdfs[SCARF].region.members
+    mask = np.zeros(len(bear().scene), bool)
+    mask[members] = True
+    chosen = selection.select(SelectionState(), mask)
+    still = replace(view(0.6), selection=chosen)
+    assert highlight.requested_highlight(still, 0) is None
+    tinted = highlight.requested_highlight(replace(still, select=SelectTool("lasso")), 0)
+    assert tinted == Highlight(tinted=((chosen.members, highlight.SELECTED),))
+    assert highlight.requested_highlight(still, 0, None, ("selection", 0)) == tinted
+    assert highlight.requested_highlight(still, 0, None, ("layer", SCARF)) == Highlight(region=SCARF)
+    engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
+    engine.highlight = tinted
+    found = shown(engine, still, ctx)
+    engine.highlight = Highlight(region=SCARF)
+    assert np.array_equal(shown(engine, still, ctx), found), "a layer's region is tinted as a selection"
+    engine.highlight = None
+    assert np.abs(shown(engine, still, ctx) - found).max() > 0.1
+    engine.release()
+
+
+def test_regions_that_are_shown_have_their_own_colors_and_the_selection_lies_over_them() -> None:
+    mask = np.arange(len(bear().scene)) % 2 == 0
+    kept = selection.add_region(selection.select(SelectionState(), mask), "even", Path("even.region.npy"))
+    region = replace(kept.regions[0], visible=True)
+    kept = selection.change_region(selection.select(kept, np.arange(len(mask)) < 10), 0, region)
+    asked = highlight.requested_highlight(replace(view(), selection=kept, select=SelectTool("box")), 0)
+    assert asked is not None
+    colors = highlight.highlight_colors(asked, (), len(mask))
+    assert (colors[:10, :3] == np.round(255 * np.array(highlight.SELECTED))).all()
+    assert (colors[10:, 3] > 0).tolist() == mask[10:].tolist()
+    assert (colors[12, :3] == np.round(255 * np.array(region.color))).all()
+
+
+@pytest.mark.gl
 def test_a_stroke_draws_only_the_part_of_the_picture_that_it_touched(ctx: moderngl.Context) -> None:
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, "cpu")
     weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
@@ -159,11 +224,13 @@ def test_an_overlap_colors_what_both_edits_have_and_nothing_else() -> None:
     moved = torch.cat([scarf.region.members[10:40], torch.arange(len(scarf.region) - 30)]).unique()
     assert len(moved) == len(scarf.region), "the bear's first splats are not of its scarf"
     part = replace(scarf, region=replace(scarf.region, members=moved))
-    found = highlight.highlight_colors(Highlight(0, others=(1, 2)), (scarf, part, ears))
-    assert found.shape == (len(scarf.region), 4)
+    total = len(bear().scene)
+    found = highlight.highlight_colors(Highlight(0, others=(1, 2)), (scarf, part, ears), total)
+    assert found.shape == (total, 4)
+    found = found[scarf.region.members]
     assert (np.flatnonzero(found[:, 3]) == np.arange(10, 40)).all()
     assert (found[10, :3] == (0xFF, 0x3F, 0xA0)).all()
-    assert (highlight.highlight_colors(Highlight(1, others=(0,)), (scarf, part))[:, 3] > 0).sum() == 30
+    assert (highlight.highlight_colors(Highlight(1, others=(0,)), (scarf, part), total)[:, 3] > 0).sum() == 30
 
 
 @pytest.mark.gl
