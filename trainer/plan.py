@@ -38,7 +38,7 @@ from .options import (
     Slider,
     TrainOptions,
 )
-from .presets import CONSTANTS
+from .presets import CONSTANTS, Refinements
 
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
@@ -118,7 +118,7 @@ class OptimizationPlan:
         perceptual_weight: None: by kind
         progressive, progressive_norm: the progressive constraint
         reedit_every: steps between two edits of the current renders; 0: none
-        rates, perceptual_every, sharpness, raw, whole, prunes, propagates, joint: see `Constants`
+        rates, perceptual_every, sharpness, raw, whole, joint, refinements: see `Constants`
         seed: order of the views
     """
 
@@ -136,10 +136,9 @@ class OptimizationPlan:
     sharpness: Literal["kind"] | Sharpness
     raw: bool
     whole: bool
-    prunes: bool
-    propagates: bool
     joint: bool
     seed: int
+    refinements: Refinements = Refinements()
 
 
 @dataclass(frozen=True)
@@ -246,10 +245,9 @@ def make_plan(options: TrainOptions) -> Plan:
             constants.sharpness,
             constants.raw,
             constants.whole,
-            constants.prunes,
-            constants.propagates,
             joint,
             options.seed,
+            constants.refinements,
         ),
         "even" if options.slider == "auto" and family not in GIVEN else options.slider,
         FieldPlan(
@@ -301,14 +299,14 @@ def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int)
         asked.stages or min(most, QUICK_STAGES if asked.steps < STAGE_STEPS * most else most),
         group_steps if kind == "geometry" else 0,
         # only an edit of colors may leave the bands alone
-        "on" if asked.sh == "auto" and (kind != "color" or asked.rates == "3dgs") else asked.sh,
+        "on" if asked.sh == "auto" and kind != "color" else asked.sh,
         weights,
         asked.rates,
         asked.raw,
-        asked.prunes,
-        asked.propagates,
+        asked.refinements,
         # colors alone change, and nothing is asked for that only a descent view by view has
         solves_colors=kind == "color"
+        and asked.refinements.solves
         and asked.rates == "kind"
         and asked.progressive == "off"
         and sharpness == "off"

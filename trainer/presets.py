@@ -12,20 +12,50 @@ from .options import Preset, Rates, TrainOptions
 
 
 @dataclass(frozen=True)
+class Refinements:
+    """What this trainer does that the paper's does not, each of which can be left out alone.
+
+    Args:
+        solves: an edit of colors is solved for, all views at once, unless something is asked for that only a
+            descent view by view has
+        asks_evenly: where the slider is even, an editor with a strength control is asked for pictures that
+            are equally far apart; not for equally distant strengths
+        damps: members that hardly show are held still, see `PgsState.descend`
+        ramps: a stage's target moves from the last stage's pictures to its own, see `PgsSettings.ramp`
+        slows: the last steps of a stage are short, see `PgsSettings.fall`
+        sizes: steps are as long as a stage's way asks for, see `PgsSettings.reach`
+        averages: a running mean of the parameters is recorded, not the bare iterates
+        leads_back: clamps of colors and pixels pass gradients that lead back into range (`views.clamp`)
+        prunes: attributes that do not pay are left out
+        propagates: in an edit of colors, members that no view shows do what their neighbors do
+    """
+
+    solves: bool = True
+    asks_evenly: bool = True
+    damps: bool = True
+    ramps: bool = True
+    slows: bool = True
+    sizes: bool = True
+    averages: bool = True
+    leads_back: bool = True
+    prunes: bool = True
+    propagates: bool = True
+
+
+@dataclass(frozen=True)
 class Constants:
     """What only a preset changes.
 
     Args:
-        rates: learning rates as the kind of edit needs, with short steps on the last stretch; or 3DGS's own,
-            flat, for all attributes, which hardly move in 600 steps
+        rates: learning rates as the kind of edit needs; or 3DGS's own, for all attributes, which hardly move
+            in 600 steps
         perceptual_every: LPIPS is paid for every so many steps
         sharpness: of the renders: for a style not less than the target's, or the printed term, which pulls at
             no pixel but the rim's
-        raw: record the bare iterates every 100 steps, between which the slider's steps differ far more; not a
-            running mean of the parameters whenever the pictures have moved
+        raw: record every 100 steps and keep the jitter, between which the slider's steps differ far more; not
+            whenever the pictures have moved
         whole: losses are of whole pictures, not of the region's box in each
-        prunes: attributes that do not pay are left out
-        propagates: in an edit of colors, members that no view shows do what their neighbors do
+        refinements: see `Refinements`
         inputs: what a network sees, the position alone, or also what the Gaussian looks like and where it
             ends: 38 dB instead of 34 at no cost
         bins: a network's ten bins of the slider, interpolated, or hard, between which the edit jumps
@@ -38,17 +68,21 @@ class Constants:
     sharpness: Literal["kind", "paper"] = "kind"
     raw: bool = False
     whole: bool = False
-    prunes: bool = True
-    propagates: bool = True
+    refinements: Refinements = Refinements()
     inputs: Inputs = "own"
     bins: Bins = "smooth"
     code: int = 8
     joint: bool = False
 
 
+AS_PRINTED = Refinements(False, False, False, False, False, False, False, True, False, False)
+"""All but the clamps: with 3DGS's own, a sixth of the colors could never change, and the paper is silent."""
+
 CONSTANTS: Mapping[Preset, Constants] = {
     "default": Constants(),
-    "paper": Constants("3dgs", 1, "paper", True, True, False, False, "position", "hard", 0, True),
+    "paper": Constants(
+        "3dgs", 1, "paper", True, True, AS_PRINTED, inputs="position", bins="hard", code=0, joint=True
+    ),
 }
 
 PRESETS: Mapping[Preset, Mapping[str, Any]] = {

@@ -55,6 +55,7 @@ class NetworkPlan:
         inputs, bins, code: see `trainer.presets.Constants`
         draft: a third of the steps
         seed: of its weights and draws
+        sharpness: whether a loss of pictures has L_render
     """
 
     size: Size
@@ -64,6 +65,7 @@ class NetworkPlan:
     loss: FieldLoss
     draft: bool
     seed: int
+    sharpness: bool = True
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,9 @@ def begin_joint_training(
     if resolve_slider(slider, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
     fit = NeuralFit(rows, channels, attributes, settings, seen)
-    pictures = RenderedLoss(crops, rows, attributes, perceptual) if network.loss == "pictures" else None
+    pictures = None
+    if network.loss == "pictures":
+        pictures = RenderedLoss(crops, rows, attributes, perceptual, network.sharpness)
     return JointTraining(fit, channels, strengths, steps, render, pictures)
 
 
@@ -182,7 +186,9 @@ def fit_network(
         fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
         steps = 0 if plan.loss == "pictures" else round(_FINISHING * steps)
     fit.scale_to(offsets, rendered_importance(offsets, seen.counted_pixels))
-    pictures = _rendered_loss(setup, trajectory, perceptual) if plan.loss == "pictures" and steps else None
+    pictures = None
+    if plan.loss == "pictures" and steps:
+        pictures = _rendered_loss(setup, trajectory, perceptual, plan.sharpness)
     try:
         with log.steps("field", steps) as advance:
             train_network(
@@ -198,9 +204,11 @@ def fit_network(
     )
 
 
-def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual) -> RenderedLoss:
+def _rendered_loss(
+    setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual, sharpness: bool
+) -> RenderedLoss:
     """The loss of pictures in all training views."""
     members = setup.region.members
     crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background) for v in setup.train]
     rows = pack(setup.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
-    return RenderedLoss(crops, rows, tuple(moving_attributes(trajectory.end[None])), perceptual)
+    return RenderedLoss(crops, rows, tuple(moving_attributes(trajectory.end[None])), perceptual, sharpness)

@@ -22,12 +22,14 @@ class RenderedLoss:
         rows: raw values of the members before the edit, packed. [M,C]
         moving: attributes that differ from these
         perceptual: LPIPS, or what stands in for it
+        sharpness: whether L_render is paid
     """
 
     crops: Sequence[CropScene]
     rows: Tensor
     moving: Collection[str]
     perceptual: Perceptual
+    sharpness: bool = True
 
     @property
     def views(self) -> int:
@@ -41,4 +43,4 @@ class RenderedLoss:
             expected, _ = crop.render(self.rows + recorded, self.moving)
         image, _ = crop.render(self.rows + found, self.moving)
         predicted = l1(image, expected) + self.perceptual(image, expected)
-        return predicted + sharpness(image, expected, "paper")
+        return predicted + sharpness(image, expected, "paper") if self.sharpness else predicted

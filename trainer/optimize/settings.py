@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from progdf.gaussians import BASE_CHANNELS
 from trainer.editors.base import EditKind
 from trainer.options import Bands, Rates, Slider
+from trainer.presets import Refinements
 
 from .groups import GROWTH
 from .objective import LossWeights
@@ -29,7 +30,7 @@ class Optimization:
         group_steps: of the group stage per strength; 0 leaves it out
         sh: whether the SH bands beyond DC are trained; auto: where the region's colors change with the view
         weights: of the loss terms
-        rates, raw, prunes, propagates: see `trainer.presets.Constants`
+        rates, raw, refinements: see `trainer.presets.Constants`
         solves_colors: the edit is solved for, all views at once (`color_solver`)
         seed: order of the views
     """
@@ -42,8 +43,7 @@ class Optimization:
     weights: LossWeights
     rates: Rates
     raw: bool
-    prunes: bool
-    propagates: bool
+    refinements: Refinements
     solves_colors: bool
     seed: int
 
@@ -73,34 +73,21 @@ def pgs_settings(
         extent: size of what moves, world units
         stages: how many strengths there are to optimize towards
     """
-    kind = optimization.kind
+    kind, does = optimization.kind, optimization.refinements
     rates = learning_rates(kind, channels, extent, optimization.rates)
     if not bands:
         rates[BASE_CHANNELS:] = 0.0
-    warmup = optimization.weights.progressive == "warmup"
-    # a run too short for the paper's snapshots still has four
-    smoothing, every = (0.0, min(100, max(1, optimization.steps // 4))) if optimization.raw else (0.9, 0)
-    if optimization.rates == "3dgs":  # a plain descent: the target at once, the same steps throughout
-        return PgsSettings(
-            rates,
-            warmup,
-            damped=False,
-            ramp=0.0,
-            fall=0.0,
-            reach=0.0,
-            smoothing=smoothing,
-            every=every,
-            seed=optimization.seed,
-        )
     return PgsSettings(
         rates,
-        warmup,
+        optimization.weights.progressive == "warmup",
+        damped=does.damps,
         # one target alone is approached slowly: quick steps towards it shine in all colors half way
-        ramp=0.0 if kind == "geometry" else 0.9 if stages == 1 else 0.6,
-        reach=0.0 if kind == "geometry" else 0.16,
-        fall=1.0 if stages == 1 else 0.35,
-        smoothing=smoothing,
-        every=every,
+        ramp=0.0 if kind == "geometry" or not does.ramps else 0.9 if stages == 1 else 0.6,
+        reach=0.16 if kind != "geometry" and does.sizes else 0.0,
+        fall=0.0 if not does.slows else 1.0 if stages == 1 else 0.35,
+        smoothing=0.9 if does.averages else 0.0,
+        # a run too short for the paper's snapshots still has four
+        every=min(100, max(1, optimization.steps // 4)) if optimization.raw else 0,
         growth=GROWTH if optimization.group_steps else math.inf,
         seed=optimization.seed,
     )

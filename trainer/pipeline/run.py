@@ -178,7 +178,7 @@ def _edit_views(
     kind = approach.kind
     stages = plan_optimization(plan.optimization, kind, approach.group_steps).stages
     strengths = editor_strengths(editor, stages)
-    if resolve_slider(plan.slider, strengths) == "even":
+    if plan.optimization.refinements.asks_evenly and resolve_slider(plan.slider, strengths) == "even":
         strengths = equalized_strengths(editor, spec, views, strengths)
     confined = confines_edit(editor, kind)
     with log.steps("edit", len(views) * len(strengths)) as advance:
@@ -226,7 +226,7 @@ def _record(
         log.say(f"--group-steps: without effect on this {kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         renewal = reedit(plan.editor, plan.optimization.reedit_every, setup, kind, folder, log)
-        unseen_members = unseen_members_of(setup, kind) if optimization.propagates else None
+        unseen_members = unseen_members_of(setup, kind) if optimization.refinements.propagates else None
         trajectory, losses = optimize_members(
             optimization,
             setup,
@@ -246,7 +246,7 @@ def _record(
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
             choosing, _ = load_evaluator(folder, setup, setup.held_out, trajectory).halves()
-            trajectory, costs = drop_idle_attributes(trajectory, choosing, optimization.prunes)
+            trajectory, costs = drop_idle_attributes(trajectory, choosing, optimization.refinements.prunes)
         recorded = len(trajectory)
         way = ""
         if not optimization.raw and plan.field.field != "neural" and len(edited) == 1:

@@ -96,7 +96,8 @@ def optimize_members(
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     rates = learning_rates(kind, original.shape[1], 1.0, optimization.rates)
     still = not moving_attributes(rates[None], GEOMETRY)
-    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
+    back = optimization.refinements.leads_back
+    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still, back) for v in setup.train]
     steps = iterations(optimization.steps) if optimization.solves_colors else optimization.steps
     steps = max(steps, len(edited) + 1)  # each stage is to have one
     stages = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,8 @@ def test_the_loss_of_the_field_is_the_printed_sum() -> None:
     laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * gray[1:-1, 1:-1]
     printed = l1(image, expected) + GradientL1()(image, expected) - laplacian.mean()
     assert float(loss(found, recorded, 1)) == pytest.approx(float(printed), rel=1e-6)
+    without = replace(loss, sharpness=False)
+    assert float(without(found, recorded, 1)) == pytest.approx(float(printed + laplacian.mean()), rel=1e-6)
 
 
 def test_losses_are_of_whole_pictures(folder: Path, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,8 +10,10 @@ from typing import get_args
 import pytest
 import torch
 
+import trainer.pipeline.run
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, plain
+from tests.helpers.trained import quick_options
 from trainer.cli import train_options
 from trainer.editors.base import EditKind
 from trainer.optimize.settings import Optimization, pgs_settings
@@ -123,6 +125,46 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
     assert torch.equal(ours[:11], torch.zeros(11))
     assert float(plain[:11].min()) > 0
     assert float(ours[11]) > 10 * float(plain[11])
+
+
+def refined(kind: EditKind, **less: bool) -> Optimization:
+    """Without some of the refinements."""
+    optimization = make_plan(asked()).optimization
+    refinements = replace(optimization.refinements, **less)
+    return plan_optimization(replace(optimization, refinements=refinements), kind, 0)
+
+
+@pytest.mark.parametrize(
+    ("refinement", "changes"),
+    [
+        ("damps", "damped"),
+        ("ramps", "ramp"),
+        ("slows", "fall"),
+        ("sizes", "reach"),
+        ("averages", "smoothing"),
+    ],
+)
+def test_each_refinement_of_a_descent_can_be_left_out_alone(refinement: str, changes: str) -> None:
+    whole = vars(pgs_settings(planned("style"), True, 14, 1.0, 4))
+    less = vars(pgs_settings(refined("style", **{refinement: False}), True, 14, 1.0, 4))
+    assert torch.equal(whole.pop("rates"), less.pop("rates"))
+    assert {name for name in whole if whole[name] != less[name]} == {changes}
+    assert not less[changes]
+
+
+def test_colors_are_solved_for_unless_that_is_left_out() -> None:
+    assert planned("color").solves_colors
+    assert not refined("color", solves=False).solves_colors
+
+
+def test_an_editor_is_asked_at_equal_strengths_where_that_refinement_is_left_out(folder: Path) -> None:
+    plan = make_plan(
+        quick_options(folder, "equal", steps=16, views=4, image_size=48, editor="stripes:#20a040")
+    )
+    refinements = replace(plan.optimization.refinements, asks_evenly=False)
+    plan = replace(plan, optimization=replace(plan.optimization, refinements=refinements))
+    found = trainer.pipeline.run.train(plan, folder / "equal", threads=1, quiet=True)
+    assert found.report["trajectory"]["stages"] == [0.25, 0.5, 0.75, 1.0]
 
 
 def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
