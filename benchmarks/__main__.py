@@ -1,6 +1,6 @@
 """`python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
 
-`python -m benchmarks ablate RUN` trains a finished run again without each part of the method.
+`python -m benchmarks ablate RUN …` trains finished runs again without each part of the method.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def ablate(argv: Sequence[str]) -> int:
     from .ablation.options import AblateOptions
     from .ablation.table import print_table
 
-    done = run(parse_options(AblateOptions, argv, f"{COMMAND} ablate"))
-    print_table(done.outcomes, done.title, done.perceptual)
+    for ablation in run(parse_options(AblateOptions, argv, f"{COMMAND} ablate")):
+        print_table(ablation)
     return 0
 
 

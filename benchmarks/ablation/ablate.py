@@ -1,41 +1,47 @@
-"""`python -m benchmarks ablate RUN`: which part of the method is worth what, on one's own edit.
+"""`python -m benchmarks ablate RUN …`: which part of the method is worth what, on one's own edits.
 
 Every variant trains towards the run's own edited views and is judged by the same held-out ones, also at
-strengths that it was not shown. RUN/ablation holds ablation.json, ablation.md and ablation.png, and of each
-variant its .gdf, so that one can feel the difference in the window.
+strengths that it was not shown, with as many seeds as asked for. RUN/ablation holds ablation.json,
+ablation.md and ablation.png, and of each variant its .gdf, so that one can feel the difference in the window.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.table import machine
+from benchmarks.table import machine, put_tables
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.remap import identity_remap
 from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
+from progdf.interpolation import interpolate_at
 from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import write_image
 from progdf.io.json_values import decode_json, plain
 from progdf.metrics.slider import slider_statistics
 from trainer.fit.fit import drop_idle_attributes, fit_field
+from trainer.fit.network import PART as NETWORK
+from trainer.fit.network import fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.settings import Optimization, resolve_slider
+from trainer.optimize.settings import resolve_slider
+from trainer.optimize.unseen import unseen_members_of
 from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.threads import use_threads
-from trainer.pipeline.training import optimize_members, retime_trajectory
+from trainer.pipeline.training import JointNetwork, optimize_members, retime_trajectory
 from trainer.plan import Plan, plan_optimization
 from trainer.report.curves import against_editor
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
-from trainer.setup.training_setup import whole_views
+from trainer.setup.training_setup import Pictures, whole_views
 from trainer.store.images import read_picture
 from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
@@ -43,139 +49,229 @@ from trainer.store.run_folder import RunFolder, lock_folder, write_json
 from trainer.store.state import StateFolder
 
 from .options import AblateOptions
-from .setup import AblationSetup, digest_of, make_ablation_setup, run_plan
-from .table import Outcome, outcome_line, sheet_of, table_of
-from .variants import Variant, choose_variants, differing_variants
+from .plot import plot_ablations
+from .setup import AblationSetup, digest_of, edit_at_equal_strengths, make_ablation_setup, run_plan
+from .table import Ablation, Outcome, Row, row_line, sheet_of, table_of
+from .variants import Variant, choose_variants, differing_variants, is_seeded
 
 _WIDTH = 176  # of a picture in the sheet, pixels
 
 
-@dataclass(frozen=True)
-class Ablation:
-    """All variants that are done.
+def ablate(options: AblateOptions, quiet: bool = False) -> list[Ablation]:
+    """Train and judge the variants that are not done yet, and write the table and the picture of each run.
 
-    Args:
-        title: one line
-        outcomes: in order
-        perceptual: name of the distance, LPIPS or what stands in for it
-    """
-
-    title: str
-    outcomes: Sequence[Outcome]
-    perceptual: str
-
-
-def ablate(options: AblateOptions, quiet: bool = False) -> Ablation:
-    """Train and judge the variants that are not done yet, and write the table and the picture of all.
+    `options` may ask for one table and one picture of all runs as well.
 
     Args:
         options: see AblateOptions
         quiet: nothing on the screen
 
     Raises:
-        ProgdfError: the folder is no finished run, its scene or a view is gone, a variant does not exist.
+        ProgdfError: a folder is no finished run, its scene or a view is gone, a variant does not exist.
         KeyboardInterrupt: interrupted; the message says what is kept.
     """
+    check_options(options)
     use_threads(options.threads)
-    run = reopen_run(options.run, options.scene)
+    done = [_ablate_run(run, options, quiet) for run in options.runs]
+    if options.markdown is not None:
+        table = table_of(done, "The method part by part")
+        filled = put_tables(options.markdown.read_text(encoding="utf-8"), [table])
+        with atomic_write(options.markdown) as beside:
+            beside.write_text(filled, encoding="utf-8")
+    if options.plot is not None:
+        write_image(options.plot, plot_ablations(done))
+    return done
+
+
+def check_options(options: AblateOptions) -> None:
+    """Raises ProgdfError for what cannot be met, before an hour has been trained."""
+    if not options.runs:
+        raise ProgdfError("ablate needs a run; give a folder that progdf train finished")
+    if options.seeds < 1:
+        raise ProgdfError(f"--seeds must be at least 1, got {options.seeds}")
+    if options.scene is not None and len(options.runs) > 1:
+        raise ProgdfError("--scene is of one run; give the runs one by one")
+    if len({run.resolve() for run in options.runs}) < len(options.runs):
+        raise ProgdfError("a run is given twice; name each once")
+    if options.markdown is not None and not options.markdown.is_file():
+        raise ProgdfError(f"{options.markdown} does not exist; check the name and the folder")
+    if options.plot is not None and not options.plot.parent.is_dir():
+        raise ProgdfError(f"the folder {options.plot.parent} does not exist; create it first")
+
+
+def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
+    """The variants of one run."""
+    run = reopen_run(root, options.scene)
     own, kind = run_plan(run), run.record.kind
     variants = differing_variants(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
-    wanted = choose_variants(variants, options.only)
+    wanted = [
+        (variant, seed)
+        for variant in choose_variants(variants, options.only)
+        for seed in range(options.seeds if is_seeded(variant, own, kind) else 1)
+    ]
     root = run.folder.root / "ablation"
     make_folder(root)
     with interrupt_on_signals(), lock_folder(RunFolder(root)):
         log = RunLog(root / "log.txt", quiet)
         try:
             shared = make_ablation_setup(run, own, kind, options.quick)
-            for i, variant in enumerate(wanted):
-                if _load_outcome(root, variant, shared) is not None:
-                    log.say(f"{variant.name}: done before")
+            for i, (variant, seed) in enumerate(wanted):
+                home = _home(root, variant.name, seed)
+                if _load_outcome(home, variant, seed, shared) is not None:
+                    log.say(f"{home.name}: done before")
                     continue
-                log.say(f"{variant.name} ({i + 1} of {len(wanted)}): {variant.what}")
+                log.say(f"{home.name} ({i + 1} of {len(wanted)}): {variant.what}")
                 try:
-                    _run_variant(root, variant, shared, quiet)
+                    _run_variant(root, variant, seed, shared, quiet)
                 except KeyboardInterrupt:
+                    _publish(root, variants, shared)
                     raise KeyboardInterrupt(
                         f"{i} of {len(wanted)} variants are done and kept in {root}; "
                         "give the same command to go on"
                     ) from None
-                done = _publish(root, variants, shared)
-                found = next(outcome for outcome in done.outcomes if outcome.name == variant.name)
-                log.say(f"{variant.name}: {found.failed or outcome_line(found)}")
-            for variant in variants:
-                StateFolder(root / variant.name / "state").end()
+                outcome = _load_outcome(home, variant, seed, shared)
+                assert outcome is not None
+                log.say(f"{home.name}: {outcome.failed or row_line(Row([outcome]))}")
+            for state in root.glob("*/state"):
+                StateFolder(state).end()
             return _publish(root, variants, shared)
         finally:
             log.close()
 
 
-def _run_variant(root: Path, variant: Variant, shared: AblationSetup, quiet: bool) -> None:
+def _home(root: Path, name: str, seed: int) -> Path:
+    """The folder of a variant with one seed."""
+    return root / (f"{name}+{seed}" if seed else name)
+
+
+def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup, quiet: bool) -> None:
     """Train and judge one variant, and keep what became of it."""
-    folder = root / variant.name
+    folder = _home(root, variant.name, seed)
     folder.mkdir(exist_ok=True)
-    plan = variant.plan(shared.plan)
-    optimization = plan_optimization(plan.optimization, shared.kind, plan.optimization.group_steps or 0)
-    measure, _ = perceptual_loss()
+    plan = variant.plan(shared.plan, seed)
     perceptual = perceptual_loss()[0]
-    objective = optimization.objective(perceptual.name)
-    outcome = Outcome(variant.name, variant.what, objective=objective)
+    optimization = plan_optimization(plan.optimization, shared.kind, plan.optimization.group_steps or 0)
+    outcome = Outcome(
+        variant.name, variant.what, variant.of, objective=optimization.objective(perceptual.name)
+    )
+    state = _state(root, variant, seed, shared)
     log = RunLog(folder / "log.txt", quiet)
     try:
-        trajectory = _record(root, variant, shared, plan, optimization, perceptual, log)
-        seconds = log.seconds["optimize"]
+        trajectory = _record(plan, shared, perceptual, state, log)
+        field, asked = _fit(variant, trajectory, shared, plan, perceptual, state, log)
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
-        _save_outcome(folder, replace(outcome, failed=str(error.__cause__)), (), variant, shared)
+        _save_outcome(folder, replace(outcome, failed=str(error.__cause__)), (), variant, seed, shared)
         return
     finally:
         log.close()
-    field, asked = _fit(variant, trajectory, shared, plan)
-    outcome = _evaluate(replace(outcome, seconds=seconds), field, shared, asked, measure)
+    outcome = replace(outcome, seconds=round(_processor_seconds(state), 2))
+    outcome = _evaluate(outcome, field, shared, asked, perceptual_loss()[0])
     region, scene = shared.run.region, shared.run.scene
     told = plain(replace(plan, name=variant.name))
     gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, told)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
-    _save_outcome(folder, outcome, strip(shared.evaluator, field, shared.columns, _WIDTH), variant, shared)
+    pictures = strip(shared.evaluator, field, shared.columns, _WIDTH)
+    _save_outcome(folder, outcome, pictures, variant, seed, shared)
+
+
+def _state(root: Path, variant: Variant, seed: int, shared: AblationSetup) -> StateFolder:
+    """Where the variant's optimization goes on where it was stopped, or another's that it shares stands."""
+    home = _home(root, variant.trains_as, seed)
+    home.mkdir(exist_ok=True)
+    state = StateFolder(home / "state")
+    begun = {"digest": digest_of(shared, variant, seed, optimization=True)}
+    if state.identity() != begun:
+        state.begin(begun)
+    return state
 
 
 def _record(
-    root: Path,
-    variant: Variant,
-    shared: AblationSetup,
-    plan: Plan,
-    optimization: Optimization,
-    perceptual: Perceptual,
-    log: RunLog,
+    plan: Plan, shared: AblationSetup, perceptual: Perceptual, state: StateFolder, log: RunLog
 ) -> Trajectory:
-    """The variant's trajectory. Its optimization goes on where it was stopped, or is another variant's."""
-    home = root / variant.trains_as
-    home.mkdir(exist_ok=True)
-    state = StateFolder(home / "state")
-    begun = {"digest": digest_of(shared, variant, optimization=True)}
-    if state.identity() != begun:
-        state.begin(begun)
-    edited = shared.edited if plan.optimization.stages != 1 else {1.0: shared.edited[1.0]}
+    """The variant's trajectory."""
+    optimization = plan_optimization(plan.optimization, shared.kind, plan.optimization.group_steps or 0)
+    does = optimization.refinements
     setup = whole_views(shared.setup) if plan.optimization.whole else shared.setup
-    with log.stage("optimize"):
-        trajectory, _ = optimize_members(optimization, setup, edited, perceptual, state, log)
-    trajectory, _ = drop_idle_attributes(trajectory, shared.evaluator.halves()[0], optimization.prunes)
+    with _count_processor_seconds(state), log.stage("optimize"):
+        trajectory, _ = optimize_members(
+            optimization,
+            setup,
+            _targets(plan, shared),
+            perceptual,
+            state,
+            log,
+            unseen_members=unseen_members_of(setup, shared.kind) if does.propagates else None,
+            network=JointNetwork(plan.field.network, plan.slider) if plan.field.field == "neural" else None,
+        )
+    choosing, _ = shared.evaluators(trajectory.offsets)[0].halves()
+    trajectory, _ = drop_idle_attributes(trajectory, choosing, does.prunes)
     return retime_trajectory(trajectory, setup, plan.slider, optimization.raw, log)
 
 
+def _targets(plan: Plan, shared: AblationSetup) -> Pictures:
+    """The edited views that a variant is trained on."""
+    if plan.optimization.stages == 1:
+        return {1.0: shared.edited[1.0]}
+    asks_evenly = shared.plan.optimization.refinements.asks_evenly
+    if plan.optimization.refinements.asks_evenly != asks_evenly:
+        return edit_at_equal_strengths(shared)
+    return shared.edited
+
+
+@contextmanager
+def _count_processor_seconds(state: StateFolder) -> Iterator[None]:
+    """Keep beside a state what processor time it took, all sessions together."""
+    before, begun = _processor_seconds(state), time.process_time()
+    try:
+        yield
+    finally:
+        state.save("processor", {}, {"seconds": before + time.process_time() - begun})
+
+
+def _processor_seconds(state: StateFolder) -> float:
+    saved = state.load("processor")
+    return float(saved.values["seconds"]) if saved is not None else 0.0
+
+
 def _fit(
-    variant: Variant, trajectory: Trajectory, shared: AblationSetup, plan: Plan
+    variant: Variant,
+    trajectory: Trajectory,
+    shared: AblationSetup,
+    plan: Plan,
+    perceptual: Perceptual,
+    state: StateFolder,
+    log: RunLog,
 ) -> tuple[BakedField, Mapping[float, float]]:
     """The variant's field, and where on its slider it was shown which of the editor's strengths."""
     if variant.linear:
         offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
         return fit_keyframes(trajectory.s, offsets, 2), {}
-    target = shared.plan.field.target_psnr
-    fitted = fit_field(trajectory, shared.seen, *shared.evaluator.halves(), shared.weights, "auto", target)
-    field, remap = fitted.chosen.field, identity_remap()
-    if resolve_slider(plan.slider, trajectory.strengths) == "even":
-        field, remap = equalize_slider(field, shared.setup)
+    evaluator, seen = shared.evaluators(trajectory.offsets)
+    remap, (choosing, reporting) = identity_remap(), evaluator.halves()
+    if plan.field.field == "neural":
+        begun, network = state.load(NETWORK), plan.field.network
+        weights, setup = shared.weights, shared.setup
+        field = fit_network(
+            trajectory, setup, seen, reporting, weights, network, perceptual, log, begun
+        ).field
+    else:
+        target = shared.plan.field.target_psnr
+        fitted = fit_field(trajectory, seen, choosing, reporting, shared.weights, "auto", target)
+        field = fitted.chosen.field
+        if resolve_slider(plan.slider, trajectory.strengths) == "even":
+            field, remap = equalize_slider(field, shared.setup)
     return field, {strength: remap.at(s) for s, strength in trajectory.asked}
+
+
+def _slider_value(asked: Mapping[float, float], strength: float, at: float) -> float:
+    """Where on its slider a variant shows a strength: as it was asked, or between what it was asked; on the
+    run's own slider where it was shown the end alone."""
+    if strength in asked or len(asked) < 2:
+        return asked.get(strength, at)
+    knots = torch.tensor([0.0, *asked], dtype=torch.float64)
+    return float(interpolate_at(knots, torch.tensor([0.0, *asked.values()], dtype=torch.float64), strength))
 
 
 def _evaluate(
@@ -186,8 +282,12 @@ def _evaluate(
     measure: Perceptual,
 ) -> Outcome:
     """With the figures that the field deserves; where it was shown no picture, on the run's own slider."""
-    evaluator = shared.evaluator
-    shown = [(s, asked.get(e, at), e) for s, (at, e) in zip(SHOWN[1:], shared.columns[1:], strict=True) if e]
+    evaluator, _ = shared.evaluators(field.offsets(1.0)[None])
+    shown = [
+        (s, _slider_value(asked, e, at), e)
+        for s, (at, e) in zip(SHOWN[1:], shared.columns[1:], strict=True)
+        if e
+    ]
     course = against_editor(evaluator, {"slider": field}, [(at, e) for _, at, e in shown], measure)["slider"]
     slider = slider_statistics(lambda s: evaluator.pictures(field.offsets(s)), masks=evaluator.pixels)
     return replace(
@@ -200,54 +300,68 @@ def _evaluate(
         t50=round(slider.t50, 3),
         t90=round(slider.t90, 3),
         bytes_per_member=round(field.bytes_per_member, 1),
-        seconds=round(outcome.seconds, 2),
     )
 
 
 def _save_outcome(
-    folder: Path, outcome: Outcome, pictures: Sequence[Tensor], variant: Variant, shared: AblationSetup
+    folder: Path,
+    outcome: Outcome,
+    pictures: Sequence[Tensor],
+    variant: Variant,
+    seed: int,
+    shared: AblationSetup,
 ) -> None:
     """Write what became of a variant; the figures last, as they tell that it is done."""
     if pictures:
         write_image(folder / "strip.png", torch.cat(list(pictures), dim=1))
-    write_json(folder / "outcome.json", {"digest": digest_of(shared, variant), **asdict(outcome)})
+    write_json(folder / "outcome.json", {"digest": digest_of(shared, variant, seed), **asdict(outcome)})
 
 
-def _load_outcome(root: Path, variant: Variant, shared: AblationSetup) -> Outcome | None:
+def _load_outcome(folder: Path, variant: Variant, seed: int, shared: AblationSetup) -> Outcome | None:
     """What became of a variant in an earlier call; None where it was not done, or on other ground."""
     try:
-        found = decode_json((root / variant.name / "outcome.json").read_bytes())
-        if found.pop("digest") != digest_of(shared, variant):
+        found = decode_json((folder / "outcome.json").read_bytes())
+        if found.pop("digest") != digest_of(shared, variant, seed):
             return None
         return Outcome(**found)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
+def _load_row(root: Path, variant: Variant, shared: AblationSetup) -> Row | None:
+    """The seeds of a variant that are done, from the run's own on; None where that is not."""
+    outcomes: list[Outcome] = []
+    while (
+        found := _load_outcome(_home(root, variant.name, len(outcomes)), variant, len(outcomes), shared)
+    ) is not None:
+        outcomes.append(found)
+    return Row(outcomes) if outcomes else None
+
+
 def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> Ablation:
     """Table and picture of all that is done."""
-    kept = [_load_outcome(root, variant, shared) for variant in variants]
-    outcomes = [outcome for outcome in kept if outcome is not None]
+    rows = [row for variant in variants if (row := _load_row(root, variant, shared)) is not None]
     plan, setup, evaluator = shared.plan, shared.setup, shared.evaluator
-    title = f"{plan.name}: {plan.editor.editor}, part by part"
     size = setup.held_out[0].camera
     note = (
-        f"{plan.optimization.steps} steps, {len(setup.train)} views to train on and {len(setup.held_out)} "
+        f"{plan.editor.editor}, {plan.optimization.steps} steps in {len(shared.edited)} stages, "
+        f"{len(setup.train)} views to train on and {len(setup.held_out)} "
         f"to measure with, {size.width}x{size.height} pixels, {len(shared.run.region)} members."
     )
     measure = perceptual_loss()[0].name
-    distance = "LPIPS" if measure.startswith("lpips") else measure
-    table = table_of(outcomes, title, distance, note)
-    strips = {}
-    for outcome in outcomes:
-        if not outcome.failed:
-            strips[outcome.name] = read_picture(root / outcome.name / "strip.png").chunk(len(SHOWN), dim=1)
+    title = f"{plan.name}: {plan.editor.editor}, part by part"
+    done = Ablation(plan.name, title, note, rows, "LPIPS" if measure.startswith("lpips") else measure)
+    strips = {
+        row.first.name: read_picture(root / row.first.name / "strip.png").chunk(len(SHOWN), dim=1)
+        for row in rows
+        if not row.failed
+    }
     editor = [(image * 255).round() / 255 for image in editor_strip(evaluator, shared.columns, _WIDTH)]
     caption = f"held-out view {evaluator.names[best_view(evaluator)]}; PSNR to the editor's own pictures"
-    write_image(root / "ablation.png", sheet_of(editor, outcomes, strips, shared.columns, title, caption))
+    write_image(root / "ablation.png", sheet_of(editor, rows, strips, shared.columns, title, caption))
     with atomic_write(root / "ablation.md") as beside:
-        beside.write_text(table.markdown() + "\n", encoding="utf-8")
-    rows: list[Mapping[str, Any]] = [asdict(outcome) for outcome in outcomes]
+        beside.write_text(table_of([done], title).markdown() + "\n", encoding="utf-8")
+    outcomes: list[Mapping[str, Any]] = [asdict(outcome) for row in rows for outcome in row.outcomes]
     about = {"machine": machine(), "note": note, "perceptual": measure, "plan": plain(plan)}
-    write_json(root / "ablation.json", {**about, "variants": rows})
-    return Ablation(title, outcomes, distance)
+    write_json(root / "ablation.json", {**about, "variants": outcomes})
+    return done

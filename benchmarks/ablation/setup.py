@@ -12,6 +12,7 @@ from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS
 from progdf.io.json_values import plain
+from trainer.editors import make_editor
 from trainer.editors.base import EditKind
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
@@ -19,8 +20,16 @@ from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS
 from trainer.pipeline.reopen import FinishedRun, render_run_views
 from trainer.plan import Plan
 from trainer.report.report import Columns, columns_of
-from trainer.setup.training_setup import Pictures, TrainingSetup, widen_views
+from trainer.setup.training_setup import (
+    Pictures,
+    TrainingSetup,
+    confines_edit,
+    editor_strengths,
+    quantize_image,
+    widen_views,
+)
 from trainer.store.run_folder import read_views
+from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 from .variants import Variant
@@ -38,7 +47,8 @@ class AblationSetup:
         kind: what the edit moves
         setup: scene, region, views whose boxes hold the edit
         edited: strength → the edited training views, whole
-        evaluator: held-out views with the editor's pictures of the shown columns
+        evaluator: held-out views with the editor's pictures of the shown columns, for whatever moves
+        still: the same, and `seen`, for what moves nothing but colors, which they draw faster
         columns: where on the run's slider the variants are shown, and what the editor was asked there
         seen: a few training views, on which the field's ranks are chosen
         weights: how visible each member is. [M]
@@ -51,10 +61,15 @@ class AblationSetup:
     setup: TrainingSetup
     edited: Pictures
     evaluator: Evaluator
+    still: tuple[Evaluator, Evaluator]
     columns: Columns
     seen: Evaluator
     weights: Tensor
     digest: str
+
+    def evaluators(self, offsets: Tensor) -> tuple[Evaluator, Evaluator]:
+        """Held-out views and `seen`, for what moves as these do. [T,M,C]"""
+        return self.still if only_recolors(offsets) else (self.evaluator, self.seen)
 
 
 def run_plan(run: FinishedRun) -> Plan:
@@ -92,10 +107,11 @@ def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: boo
     few = _thin(setup.train, 4)
     channels = BASE_CHANNELS + 3 * run.scene.shN.shape[1]
 
-    def evaluator(views: Sequence[View], pictures: Pictures) -> Evaluator:
-        return make_evaluator(run.scene, run.region, views, pictures, setup.background, channels)
+    def evaluator(views: Sequence[View], pictures: Pictures, still: bool) -> Evaluator:
+        return make_evaluator(run.scene, run.region, views, pictures, setup.background, channels, still)
 
     drawn = {s: _read_edited(run, setup.held_out, s) for s in shown}
+    learned = {1.0: _read_edited(run, few, 1.0)}
     digest = hashlib.sha256(run.region.members.numpy().tobytes())
     for pictures in (*edited.values(), *drawn.values()):
         for picture in pictures:
@@ -108,20 +124,38 @@ def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: boo
         kind,
         setup,
         edited,
-        evaluator(setup.held_out, drawn),
+        evaluator(setup.held_out, drawn, False),
+        (evaluator(setup.held_out, drawn, True), evaluator(few, learned, True)),
         columns,
-        evaluator(few, {1.0: _read_edited(run, few, 1.0)}),
+        evaluator(few, learned, False),
         visibility(run.scene, run.region.members, setup.train),
         digest.hexdigest(),
     )
 
 
-def digest_of(shared: AblationSetup, variant: Variant, optimization: bool = False) -> str:
-    """Of all that decides a variant's figures, or of its optimization alone."""
-    decides = plain(variant.plan(shared.plan))
+def edit_at_equal_strengths(shared: AblationSetup) -> Pictures:
+    """The training views as the editor has them at as many strengths, these equally far apart."""
+    run, setup, plan = shared.run, shared.setup, shared.plan
+    views, settings = [*setup.train, *setup.held_out], plan.editor.settings(run.folder.painted)
+    editor = make_editor(plan.editor.editor, run.scene, run.region, views, settings)
+    confined = confines_edit(editor, shared.kind)
+
+    def picture(view: View, strength: float) -> Tensor:
+        made = editor.edit(view, strength)
+        return quantize_image(view.confine(made) if confined else made)
+
+    strengths = editor_strengths(editor, len(shared.edited))
+    return {strength: [picture(view, strength) for view in setup.train] for strength in strengths}
+
+
+def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: bool = False) -> str:
+    """Of all that decides a variant's figures, or of its optimization alone. `seed`: see `Variant.plan`"""
+    decides = plain(variant.plan(shared.plan, seed))
     del decides["scene"]  # its pictures are in the setup's digest
     if optimization:
-        del decides["slider"]
+        del decides["slider"], decides["optimization"]["refinements"]["prunes"]
+        if decides["field"]["field"] != "neural":
+            del decides["field"]
     told = json.dumps([shared.digest, decides, variant.linear and not optimization], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
 

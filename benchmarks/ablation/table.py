@@ -1,9 +1,10 @@
-"""What an ablation found: as a table on the terminal and in Markdown, and as a picture."""
+"""What ablations found: as a table on the terminal and in Markdown, and as a picture of each run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean, stdev
 
 from rich.console import Console
 from rich.table import Table as RichTable
@@ -11,30 +12,29 @@ from torch import Tensor
 
 from benchmarks.table import Table, machine
 from progdf.io.images import contact_sheet
-from trainer.report.report import SHOWN, Columns, column_heading
-
-BETWEEN = SHOWN[1:-1]
+from trainer.report.report import Columns, column_heading
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one variant, on held-out views.
+    """What became of one variant with one seed, on held-out views.
 
     Args:
-        name, what: of the variant
+        name, what, of: of the variant
         psnr, ssim, lpips: of the finished edit to the edited views
         between: a quarter, half or three quarters of the slider → PSNR to the editor's own picture from
             there or near by, dB, where it was asked
         uniformity: least over largest visible change of twenty equal steps, 0..1
         t50, t90: slider value at which half and nine tenths of the change are reached
         bytes_per_member: of the field
-        seconds: of the optimization
+        seconds: processor time of the optimization, with that of a network that is trained beside it
         objective: the loss, in words
         failed: why there are no figures, "" where there are
     """
 
     name: str
     what: str
+    of: str = ""
     psnr: float = 0.0
     ssim: float = 0.0
     lpips: float = 0.0
@@ -47,97 +47,174 @@ class Outcome:
     objective: str = ""
     failed: str = ""
 
+    @property
+    def way(self) -> float | None:
+        """Mean of `between`, dB."""
+        return fmean(self.between.values()) if self.between else None
 
-def table_of(outcomes: Sequence[Outcome], title: str, perceptual: str, note: str = "") -> Table:
-    """The outcomes as a table. `perceptual`: LPIPS, or what stands in for it."""
-    columns = ("variant", "what", "PSNR, dB", perceptual, *(f"at {s:g}, dB" for s in BETWEEN))
-    columns += ("uniform", "t50", "t90", "bytes", "train, s")
-    notes = [
+
+@dataclass(frozen=True)
+class Row:
+    """A variant of one run.
+
+    Args:
+        outcomes: with each seed, at least one
+    """
+
+    outcomes: Sequence[Outcome]
+
+    @property
+    def first(self) -> Outcome:
+        """With the run's own seed."""
+        return self.outcomes[0]
+
+    @property
+    def failed(self) -> str:
+        """Why there are no figures, "" where there are."""
+        return next((outcome.failed for outcome in self.outcomes if outcome.failed), "")
+
+    def values(self, figure: Callable[[Outcome], float | None]) -> list[float]:
+        """A figure with each seed; none where it was not taken."""
+        found = [] if self.failed else [figure(outcome) for outcome in self.outcomes]
+        return [value for value in found if value is not None]
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """All variants of one run that are done.
+
+    Args:
+        name: of the run
+        title: one line
+        note: what was measured, one line
+        rows: in order
+        perceptual: name of the distance, LPIPS or what stands in for it
+    """
+
+    name: str
+    title: str
+    note: str
+    rows: Sequence[Row]
+    perceptual: str
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A column of the table.
+
+    Args:
+        heading: with its unit
+        short: as the terminal has it
+        digits: behind the point
+        of: reads it
+    """
+
+    heading: str
+    short: str
+    digits: int
+    of: Callable[[Outcome], float | None]
+
+    def text(self, row: Row, spread: bool = True) -> str:
+        """The mean over the seeds, and ± its standard deviation where there are several."""
+        values = row.values(self.of)
+        if not values:
+            return "–"
+        mean = f"{fmean(values):.{self.digits}f}"
+        return f"{mean} ± {stdev(values):.{self.digits}f}" if spread and len(values) > 1 else mean
+
+
+FIGURES = (
+    Figure("end, dB", "end", 1, lambda outcome: outcome.psnr),
+    Figure("between, dB", "between", 1, lambda outcome: outcome.way),
+    Figure("LPIPS", "LPIPS", 4, lambda outcome: outcome.lpips),
+    Figure("even", "even", 2, lambda outcome: outcome.uniformity),
+    Figure("t50", "t50", 2, lambda outcome: outcome.t50),
+    Figure("t90", "t90", 2, lambda outcome: outcome.t90),
+    Figure("bytes", "bytes", 0, lambda outcome: outcome.bytes_per_member),
+    Figure("train, processor s", "s", 1, lambda outcome: outcome.seconds),
+)
+
+
+def rows_by_name(ablations: Sequence[Ablation]) -> Iterator[tuple[Outcome, list[Row | None]]]:
+    """Every variant that any run has, in order, with its row of each run."""
+    names = list(dict.fromkeys(row.first.name for ablation in ablations for row in ablation.rows))
+    order = max((ablation.rows for ablation in ablations), key=len, default=())
+    places = {row.first.name: i for i, row in enumerate(order)}
+    for name in sorted(names, key=lambda name: places.get(name, len(places))):
+        found = [
+            next((row for row in ablation.rows if row.first.name == name), None) for ablation in ablations
+        ]
+        yield next(row.first for row in found if row is not None), found
+
+
+def table_of(ablations: Sequence[Ablation], title: str) -> Table:
+    """The variants of all runs as one table; a cell has a line for each run."""
+    headings = tuple(figure.heading for figure in FIGURES)
+    perceptual = ablations[0].perceptual
+    columns = ("variant", "differs from", "by", "seeds", *headings)
+    columns = tuple(perceptual if column == "LPIPS" else column for column in columns)
+    rows, failures = [], []
+    for about, found in rows_by_name(ablations):
+        cells = ["<br>".join("–" if row is None else figure.text(row) for row in found) for figure in FIGURES]
+        seeds = dict.fromkeys(str(len(row.outcomes)) for row in found if row is not None)
+        rows.append((about.name, about.of, about.what, "<br>".join(seeds), *cells))
+        failures += [f"{about.name}: {row.failed}." for row in found if row is not None and row.failed]
+    runs = [f"{ablation.name}: {ablation.note}" for ablation in ablations]
+    note = (
         "On held-out views, over the pixels that show the region: the finished edit against the edited "
-        "views, the slider near these strengths against the editor's own picture (–: it was not asked); "
-        "least over largest visible change of 20 equal steps; slider value at 50 and 90 % of the change; "
-        "bytes per member.",
-        note,
-        *(f"{outcome.name}: {outcome.failed}." for outcome in outcomes if outcome.failed),
-        f"{machine()}.",
-    ]
-    rows = tuple(_row(outcome) for outcome in outcomes)
-    return Table("ablation", title, columns, rows, " ".join(text for text in notes if text))
-
-
-def print_table(outcomes: Sequence[Outcome], title: str, perceptual: str) -> None:
-    """The figures on the terminal, within 80 columns."""
-    drawn = RichTable(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0))
-    columns = (
-        "variant",
-        "PSNR",
-        perceptual,
-        *(f"{s:g}"[1:] for s in BETWEEN),
-        "even",
-        "t50",
-        "t90",
-        "bytes",
-        "s",
+        "views; the slider near a quarter, half and three quarters against the editor's own pictures, their "
+        "mean (–: it was not asked); least over largest visible change of 20 equal steps; slider value at 50 "
+        "and 90 % of the change; bytes of the field per member; of the optimization alone. "
+        "± is the standard deviation over the seeds; a row of one seed is solved for, and no seed changes a "
+        "bit of it."
     )
-    for i, column in enumerate(columns):
+    if len(ablations) > 1:
+        note += f" A cell's lines: {', '.join(ablation.name for ablation in ablations)}."
+    return Table("ablation", title, columns, tuple(rows), " ".join([note, *runs, *failures, f"{machine()}."]))
+
+
+def print_table(ablation: Ablation) -> None:
+    """The means of one run on the terminal, within 80 columns."""
+    drawn = RichTable(title=ablation.title, title_justify="left", box=None, padding=(0, 1, 0, 0))
+    for i, column in enumerate(("variant", *(figure.short for figure in FIGURES))):
         drawn.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
-    for outcome in outcomes:
-        name, _, *figures = _row(outcome)
-        drawn.add_row(name, *figures)
+    for row in ablation.rows:
+        drawn.add_row(row.first.name, *(figure.text(row, spread=False) for figure in FIGURES))
     console = Console(highlight=False)
     console.print(drawn)
-    for outcome in outcomes:
-        if outcome.failed:
-            console.print(f"{outcome.name}: {outcome.failed}", soft_wrap=True)
+    for row in ablation.rows:
+        if row.failed:
+            console.print(f"{row.first.name}: {row.failed}", soft_wrap=True)
 
 
 def sheet_of(
     editor: Sequence[Tensor],
-    outcomes: Sequence[Outcome],
+    rows: Sequence[Row],
     strips: Mapping[str, Sequence[Tensor]],
     columns: Columns,
     title: str,
     caption: str,
 ) -> Tensor:
-    """The picture: a row per variant, the editor's own pictures on top.
+    """The picture of a run: a row per variant, the editor's own pictures on top.
 
     Args:
         editor: what the editor made of the pictured view, at five strengths. [h,w,3] each
-        outcomes: variants in order
-        strips: their pictures, by name, of the same size
+        rows: variants in order
+        strips: their pictures with the run's own seed, by name, of the same size
         columns: where on the run's slider
         title, caption: a line above and below
     """
-    shown = [outcome for outcome in outcomes if outcome.name in strips]
+    shown = [row for row in rows if row.first.name in strips]
     return contact_sheet(
-        [editor, *(strips[outcome.name] for outcome in shown)],
-        ["the editor", *(f"{outcome.name}\n{outcome_line(outcome)}" for outcome in shown)],
+        [editor, *(strips[row.first.name] for row in shown)],
+        ["the editor", *(f"{row.first.name}\n{row_line(row)}" for row in shown)],
         [column_heading(*column) for column in columns],
         title,
         caption,
     )
 
 
-def _row(outcome: Outcome) -> tuple[str, ...]:
-    if outcome.failed:
-        return (outcome.name, outcome.what, *("–" for _ in range(2 + len(BETWEEN) + 5)))
-    between = outcome.between or {}
-    return (
-        outcome.name,
-        outcome.what,
-        f"{outcome.psnr:.1f}",
-        f"{outcome.lpips:.4f}",
-        *(f"{between[f'{s:g}']:.1f}" if f"{s:g}" in between else "–" for s in BETWEEN),
-        f"{outcome.uniformity:.2f}",
-        f"{outcome.t50:.2f}",
-        f"{outcome.t90:.2f}",
-        f"{outcome.bytes_per_member:.0f}",
-        f"{outcome.seconds:.1f}",
-    )
-
-
-def outcome_line(outcome: Outcome) -> str:
+def row_line(row: Row) -> str:
     """In short: the two figures that say most: how good the end is, how good the way."""
-    between = list((outcome.between or {}).values())
-    way = f", between {sum(between) / len(between):.1f}" if between else ""
-    return f"end {outcome.psnr:.1f}{way} dB"
+    end, way = (figure.text(row, spread=False) for figure in FIGURES[:2])
+    return f"end {end}" + (f", between {way}" if way != "–" else "") + " dB"

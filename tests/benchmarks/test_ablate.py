@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -16,8 +16,16 @@ from benchmarks.__main__ import ablate as ablate_command
 from benchmarks.ablation.ablate import ablate
 from benchmarks.ablation.options import AblateOptions
 from benchmarks.ablation.setup import run_plan
-from benchmarks.ablation.table import Outcome, table_of
-from benchmarks.ablation.variants import choose_variants, differing_variants
+from benchmarks.ablation.table import Ablation, Outcome, Row, table_of
+from benchmarks.ablation.variants import (
+    _BY_NAME,
+    VARIANTS,
+    Variant,
+    choose_variants,
+    differing_variants,
+    is_seeded,
+    plan_values,
+)
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
@@ -29,6 +37,7 @@ from trainer.optimize.settings import Optimization
 from trainer.options import TrainOptions
 from trainer.pipeline.reopen import reopen_run
 from trainer.plan import make_plan
+from trainer.presets import Refinements, apply_preset
 from trainer.store.run_folder import RunFolder
 
 ONLY = "base,2-keyframes,one-target,slider-time"
@@ -48,7 +57,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
 @pytest.fixture(scope="module")
 def run(options: TrainOptions) -> Path:
     """The folder of that run, with an ablation of four variants in it."""
-    ablate(AblateOptions(options.out, only=ONLY, threads=1), quiet=True)
+    ablate(AblateOptions((options.out,), only=ONLY, threads=1), quiet=True)
     return options.out
 
 
@@ -62,19 +71,65 @@ def _names(options: TrainOptions, *about: object) -> set[str]:
 
 def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
     color = _names(options, "color", 4, 1)
-    assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "paper"} <= color
-    assert "no-lpips" not in color, "colors are solved for, without LPIPS"
-    assert "no-lpips" in _names(replace(options, perceptual_weight=0.1), "color", 4, 1)
+    assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "descent", "paper"} <= color
     assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & color
+    descended = _names(replace(options, perceptual_weight=0.1), "color", 4, 1)
+    assert "no-lpips" in descended
+    assert not {"descent", "descent-one-target", "descent-plain-clamps"} & descended, "it descends anyway"
     style = _names(options, "style", 4, 1)
     assert "sharpness-off" in style
-    assert "sharpness-hinge" not in style
-    assert "no-groups" in _names(options, "geometry", 4, 1)
+    assert not {"sharpness-hinge", "no-propagation"} & style
+    geometry = _names(options, "geometry", 4, 1)
+    assert "no-groups" in geometry
+    assert not {"no-sizing", "no-interpolation"} & geometry
     assert not {"one-target", "slider-stages"} & _names(options, "color", 1, 1)
     assert "no-sh" not in _names(options, "color", 4, 0)
     without = replace(options, perceptual_weight=0.0, progressive="warmup")
     assert "no-lpips" not in _names(without, "style", 4, 1)
     assert "progressive-off" in _names(without, "color", 4, 1)
+    pinned = replace(options, slider="stages")
+    assert "equal-strengths" not in _names(pinned, "color", 4, 1), "where no strengths are chosen"
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
+def test_a_variant_differs_from_another_in_one_value_of_the_plan(
+    variant: Variant, options: TrainOptions
+) -> None:
+    """The paper's preset alone differs in many: it is the preset, but for scene, views and steps."""
+    own = replace(options, sh="auto", progressive="decay", perceptual_weight=0.1)
+    other = next(one for one in VARIANTS if one.name == variant.of)
+    now, then = plan_values(variant.plan(make_plan(own))), plan_values(other.plan(make_plan(own)))
+    differ = {path for path in now if now[path] != then[path]}
+    if variant.name == "paper":
+        preset = plan_values(make_plan(apply_preset(own, "paper")))
+        parts = ("optimization.", "slider", "field.")
+        assert {path for path in now if path.startswith(parts) and now[path] != preset[path]} == {
+            "optimization.steps"
+        }
+        assert now["field.network.size"] == "paper"
+        assert now["optimization.steps"] == round(1500 / 800 * then["optimization.steps"])
+    elif variant.name in ("base", "2-keyframes"):
+        assert not differ
+    else:
+        assert differ <= set(variant.changes), "only what it says"
+        assert len(variant.changes) == 1
+
+
+@pytest.mark.parametrize("part", [entry.name for entry in fields(Refinements)])
+def test_every_refinement_has_a_variant_without_it(part: str) -> None:
+    path = f"optimization.refinements.{part}"
+    assert any(variant.changes == {path: False} for variant in VARIANTS)
+
+
+def test_a_seed_reaches_what_descends_and_the_network_and_nothing_that_is_solved_for(
+    options: TrainOptions,
+) -> None:
+    plan = make_plan(options)
+    seeded = {v.name for v in differing_variants(plan, "color", 4, 1) if is_seeded(v, plan, "color")}
+    assert {"descent", "no-lpips", "paper", "paper-pgs"} <= seeded
+    assert not {"base", "one-target", "no-sh", "plain-clamps", "equal-strengths"} & seeded
+    later = plan_values(next(v for v in VARIANTS if v.name == "paper").plan(plan, 2))
+    assert (later["optimization.seed"], later["field.network.seed"], later["editor.seed"]) == (2, 2, 0)
 
 
 def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
@@ -95,7 +150,7 @@ def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
     (copy / "ablation").touch()
     with pytest.raises(ProgdfError, match="ablation is a file; give the name of a folder"):
-        ablate(AblateOptions(copy, threads=1), quiet=True)
+        ablate(AblateOptions((copy,), threads=1), quiet=True)
 
 
 def test_the_plan_of_a_run_is_read_back_as_it_was(options: TrainOptions) -> None:
@@ -143,8 +198,8 @@ def test_what_is_done_is_not_done_again_until_the_edited_views_change(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", _nothing_trains)
-    again = ablate(AblateOptions(run, only="base,one-target", threads=1), quiet=True)
-    assert [outcome.name for outcome in again.outcomes] == ONLY.split(",")
+    (again,) = ablate(AblateOptions((run,), only="base,one-target", threads=1), quiet=True)
+    assert [row.first.name for row in again.rows] == ONLY.split(",")
     name = reopen_run(run).record.held_out[0]
     path = RunFolder(run).view("edited", name)
     kept = path.read_bytes()
@@ -152,7 +207,7 @@ def test_what_is_done_is_not_done_again_until_the_edited_views_change(
         with Image.open(path) as opened:
             Image.new("RGB", opened.size, "red").save(path)
         with pytest.raises(AssertionError, match="trains again"):
-            ablate(AblateOptions(run, only="base", threads=1), quiet=True)
+            ablate(AblateOptions((run,), only="base", threads=1), quiet=True)
     finally:
         path.write_bytes(kept)
 
@@ -167,10 +222,10 @@ def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
 
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"1 of 2 variants are done and kept in .*; give the same"):
-        ablate(AblateOptions(run, only="base,no-sh", threads=1), quiet=True)
+        ablate(AblateOptions((run,), only="base,no-sh", threads=1), quiet=True)
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", real)
-    done = ablate(AblateOptions(run, only="base,no-sh", threads=1), quiet=True)
-    assert "no-sh" in [outcome.name for outcome in done.outcomes]
+    (done,) = ablate(AblateOptions((run,), only="base,no-sh", threads=1), quiet=True)
+    assert "no-sh" in [row.first.name for row in done.rows]
 
 
 def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,8 +233,8 @@ def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch
         raise ProgdfError("training failed") from FloatingPointError("the loss is nan at step 7")
 
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", broken)
-    done = ablate(AblateOptions(run, only="paper", threads=1), quiet=True)
-    assert done.outcomes[-1].failed == "the loss is nan at step 7"
+    (done,) = ablate(AblateOptions((run,), only="paper", threads=1), quiet=True)
+    assert done.rows[-1].failed == "the loss is nan at step 7"
     markdown = (run / "ablation" / "ablation.md").read_text(encoding="utf-8")
     assert "paper: the loss is nan at step 7." in markdown
 
@@ -203,8 +258,9 @@ def test_the_command_prints_a_table_that_fits_a_terminal(
 
 
 def test_a_failure_has_dashes_for_figures_and_its_reason_below() -> None:
-    table = table_of([Outcome("paper", "as printed", failed="the loss is nan")], "title", "LPIPS")
-    assert set(table.rows[0][2:]) == {"–"}
+    rows = [Row([Outcome("paper", "as printed", "base", failed="the loss is nan")])]
+    table = table_of([Ablation("robot", "title", "note", rows, "LPIPS")], "title")
+    assert set(table.rows[0][4:]) == {"–"}
     assert len(table.rows[0]) == len(table.columns)
     assert "paper: the loss is nan." in table.note
 
@@ -216,12 +272,73 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
     asked: list[Optimization] = []
 
-    def noted(wanted: Optimization, *_: object) -> object:
+    def noted(wanted: Optimization, *_: object, **__: object) -> object:
         asked.append(wanted)
         raise ProgdfError("enough") from FloatingPointError("enough")
 
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", noted)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STEPS", 40)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STAGES", 2)
-    ablate(AblateOptions(copy, only="base", quick=True, threads=1), quiet=True)
+    ablate(AblateOptions((copy,), only="base", quick=True, threads=1), quiet=True)
     assert (asked[0].steps, asked[0].stages) == (40, 2)
+
+
+def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_one_row_for_all(
+    options: TrainOptions, tmp_path: Path
+) -> None:
+    copy, picture, page = tmp_path / "run", tmp_path / "all.png", tmp_path / "page.md"
+    shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
+    page.write_text("<!-- bench ablation -->\n<!-- end ablation -->\n", encoding="utf-8")
+    only = "base,equal-strengths,no-propagation,descent"
+    asked = AblateOptions((copy,), only=only, seeds=2, markdown=page, plot=picture, threads=1)
+    (done,) = ablate(asked, quiet=True)
+    assert [len(row.outcomes) for row in done.rows] == [1, 1, 1, 2]
+    base, equal, alone, descent = (row.outcomes for row in done.rows)
+    assert base[0].psnr == alone[0].psnr, "every member is seen"
+    assert base[0].between != equal[0].between
+    assert descent[0].psnr != descent[1].psnr
+    written = page.read_text(encoding="utf-8")
+    assert "| descent | base | view by view, where colors are solved for | 2 | " in written
+    assert " ± " in written
+    with Image.open(picture) as opened:
+        assert opened.width > 800
+
+
+def test_a_network_is_trained_beside_the_members_and_shipped(
+    options: TrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
+    paper = next(variant for variant in VARIANTS if variant.name == "paper")
+    small = replace(paper, changes={**paper.changes, "field.network.size": "tiny"})
+    monkeypatch.setitem(_BY_NAME, "paper", small)
+    monkeypatch.setattr(
+        "benchmarks.ablation.variants.VARIANTS",
+        tuple(small if variant is paper else variant for variant in VARIANTS),
+    )
+    (done,) = ablate(AblateOptions((copy,), only="paper,paper-gdf-no-sharpness", threads=1), quiet=True)
+    first, second = (row.first for row in done.rows)
+    assert first.objective == second.objective
+    assert first.psnr == second.psnr, "the end is the recorded one"
+    gdfs = [
+        load_gdf(copy / "ablation" / name / f"{name}.gdf", load_ply(options.scene))
+        for name in ("paper", "paper-gdf-no-sharpness")
+    ]
+    networks = [gdf.field.origin.network for gdf in gdfs if gdf.field.origin is not None]
+    assert [network.shape.inputs for network in networks] == ["position", "position"]
+    weights = [network.tensors["heads.weight"] for network in networks]
+    assert bool(weights[0].any())
+    assert not torch.equal(*weights)
+
+
+def test_what_cannot_be_met_is_told_before_anything_is_trained(run: Path, tmp_path: Path) -> None:
+    for asked, told in (
+        (AblateOptions(()), "ablate needs a run"),
+        (AblateOptions((run,), seeds=0), "--seeds must be at least 1, got 0"),
+        (AblateOptions((run, run)), "a run is given twice"),
+        (AblateOptions((run, tmp_path), scene=run), "--scene is of one run"),
+        (AblateOptions((run,), markdown=tmp_path / "page.md"), "does not exist"),
+        (AblateOptions((run,), plot=tmp_path / "no" / "all.png"), "does not exist; create it first"),
+    ):
+        with pytest.raises(ProgdfError, match=told):
+            ablate(asked, quiet=True)
