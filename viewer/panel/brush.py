@@ -21,6 +21,7 @@ NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
 WHOLE = (
     ("Clear", "paint_clear", "Set all weights to 0 (Backspace)"),
     ("Fill", "paint_fill", "Set all weights to 1 (Shift+Backspace)"),
+    ("Invert", "paint_invert", "Swap what is painted and what is not (Ctrl+I)"),
     ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more (Shift+X)"),
 )
 """Buttons for all of a layer's paint: name, action of `controls.KEYS`, tip."""
@@ -54,27 +55,42 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     label("Softness", column)
     softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", Brush.softness, ui)
     tip("Brush softness (Shift+[ and ])")
-    brush = replace(brush, radius=radius, softness=softness)
+    label("Flow", column)
+    flow = value_slider("##flow", brush.flow, (0.0, 1.0), "%.2f", Brush.flow, ui)
+    tip("How far one stroke goes; strokes over each other go further")
+    label("Value", column)
+    imgui.begin_disabled(brush.mode != "add")
+    value = value_slider("##value", brush.value, (0.0, 1.0), "%.2f", Brush.value, ui)
+    imgui.end_disabled()
+    tip("The share of the edit that Add paints")
+    brush = replace(brush, radius=radius, softness=softness, flow=flow, value=value)
     label("Depth", column)
     depth = choice("depth", ("Front", "Through"), int(brush.through), ui)
     tip("Paint only the front surface, or everything under the brush (Shift+B)")
     if depth is not None:
         brush = replace(brush, through=bool(depth))
     label("Weights", column)
-    colors = choice("weights", ("Shown", "Hidden"), int(not brush.weights), ui)
-    tip("Show the weights as colors, from blue (0) to yellow (1) (C)")
+    colors = choice("weights", ("Tint", "Colors"), int(brush.weights), ui)
+    tip(
+        "Tint lightly what has less than all of the edit, or show all weights from blue (0) to yellow (1) (C)"
+    )
     if colors is not None:
-        brush = replace(brush, weights=not colors)
+        brush = replace(brush, weights=bool(colors))
     if brush.weights:
         _legend(column, ui)
     label("Layer", column)
     imgui.begin_disabled(focus is None or view.layers[focus].locked)
-    each = (imgui.get_content_region_avail().x - 12.0 * ui.scale) / 3
-    for text, asks, keys in WHOLE:
-        if imgui.button(f"{text}##{asks}", imgui.ImVec2(each, 0.0)):
+    texts = [imgui.calc_text_size(text).x for text, *_ in WHOLE]
+    spare = imgui.get_content_region_avail().x - 4.0 * (len(WHOLE) - 1) * ui.scale - sum(texts)
+    imgui.push_style_var(
+        imgui.StyleVar_.frame_padding.value, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y)
+    )
+    for wide, (text, asks, keys) in zip(texts, WHOLE, strict=True):
+        if imgui.button(f"{text}##{asks}", imgui.ImVec2(wide + spare / len(WHOLE), 0.0)):
             action = asks
         tip(keys)
-        imgui.same_line(0.0, 6.0 * ui.scale)
+        imgui.same_line(0.0, 4.0 * ui.scale)
+    imgui.pop_style_var()
     imgui.end_disabled()
     imgui.new_line()
     return replace(view, brush=brush), action

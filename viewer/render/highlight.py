@@ -20,6 +20,9 @@ from viewer.state.workspace import Pointed
 SHARE = 0.75
 """Of a member's color that the ramp takes, so that the rest still tells its shape."""
 
+THIN = 0.2
+"""The same of a member without the edit, where the result is what one looks at; 0 where it has all of it."""
+
 RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1.0, 0xF9E558))
 """Weights and their colors, rgb; lightness rises with the weight, so that also gray tells them apart."""
 
@@ -41,6 +44,7 @@ class Highlight:
         gdf: an edit whose members show their weights, as `LayerState.gdf` counts; None for none
         paint: its weights, as `paint.encode` writes them
         others: edits of which to show, in place of weights, the members that they share with this one
+        thin: only a tint over what has less than all of the edit
         tinted: packed masks and their colors, later ones over earlier ones
         region: an edit whose members are tinted as one, or None
         hidden: packed mask of what is not drawn
@@ -49,6 +53,7 @@ class Highlight:
     gdf: int | None = None
     paint: str = paint.FULL
     others: tuple[int, ...] = ()
+    thin: bool = False
     tinted: tuple[tuple[bytes, Color], ...] = ()
     region: int | None = None
     hidden: bytes = NOBODY
@@ -75,9 +80,11 @@ def requested_highlight(
     state, kind, index = view.selection, *(pointed or ("", 0))
     if kind == "layer" and index < len(view.layers):
         return Highlight(region=view.layers[index].gdf)
-    if view.brush.active and view.brush.weights:
+    if view.brush.active:
         layer = None if focus is None or focus >= len(view.layers) else view.layers[focus]
-        return Highlight(layer.gdf, layer.paint) if layer in stack.visible_layers(view) and layer else None
+        if layer is None or layer not in stack.visible_layers(view):
+            return None
+        return Highlight(layer.gdf, layer.paint, thin=not view.brush.weights)
     tinted = [
         (region.members, region.color)
         for i, region in enumerate(state.regions)
@@ -123,11 +130,13 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
             others = np.concatenate([gdfs[i].region.members.numpy() for i in highlight.others])
             members = members[np.isin(members, others)]
             colors[members, :3] = np.round(255.0 * np.array(rgba(SHARED)[:3]))
+            colors[members, 3] = round(255 * SHARE)
         else:
             found = paint.decode(highlight.paint, len(members))
             weights = np.ones(len(members), np.float32) if found is None else found.numpy()
             colors[members, :3] = ramp_colors(weights)
-        colors[members, 3] = round(255 * SHARE)
+            shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)
+            colors[members, 3] = np.round(255.0 * shares)
     if highlight.hidden != NOBODY:
         colors[unpack(highlight.hidden, total), 3] = HIDDEN
     return colors

@@ -45,6 +45,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return _fill_paint(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
     if name == "paint_feather":
         return _feather(workspace, facts)
+    if name == "paint_invert":
+        return _invert_paint(workspace, facts)
     if name == "next_slider":
         return _select_slider(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
@@ -151,6 +153,16 @@ def _fill_paint(workspace: Workspace, facts: SceneFacts, weight: float) -> Works
         return stack.with_paint(view, index, paint.encode(np.full(count, weight, np.float32)))
 
     return _change_focused(workspace, fill)
+
+
+def _invert_paint(workspace: Workspace, facts: SceneFacts) -> Workspace:
+    """What is painted of the focused layer, and what is not, swapped."""
+
+    def swap(view: ViewState, index: int) -> ViewState:
+        layer = view.layers[index]
+        return stack.with_paint(view, index, paint.invert(layer.paint, facts.rows[layer.gdf].count))
+
+    return _change_focused(workspace, swap)
 
 
 def _feather(workspace: Workspace, facts: SceneFacts) -> Workspace:

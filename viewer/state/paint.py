@@ -166,18 +166,29 @@ def extend_stroke(stroke: Stroke, x: float, y: float, brush: Brush, density: flo
 
 
 def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
-    """The paint that the stroke has made so far: to 1, to 0, or to the mean of neighbors under the brush.
+    """The paint that the stroke has made so far: to the brush's value, to 0, or to the mean of neighbors
+    under the brush, as far as its flow goes.
 
     Args:
         stroke: under way
         brush, density: as for `extend_stroke`; smoothing reaches as far as half the brush
     """
-    goal = np.full_like(stroke.before, 1.0 if stroke.mode == "add" else 0.0)
+    goal = np.full_like(stroke.before, brush.value if stroke.mode == "add" else 0.0)
     if stroke.mode == "smooth":
         under = np.flatnonzero(stroke.reached)
         width = 0.5 * brush.radius * density
         goal[under] = near_mean(stroke.places[under], stroke.before[under], width)
-    return encode(stroke.before + (goal - stroke.before) * stroke.reached)
+    return encode(stroke.before + (goal - stroke.before) * stroke.reached * np.float32(brush.flow))
+
+
+def invert(paint: str, members: int) -> str:
+    """The paint with each weight w replaced by 1 − w.
+
+    Raises:
+        ProgdfError: see `decode`.
+    """
+    weights = decode(paint, members)
+    return encode(np.zeros(members, np.float32) if weights is None else (1.0 - weights).numpy())
 
 
 def feather(paint: str, points: Floats, width: float) -> str:

@@ -71,7 +71,10 @@ class Brush:
         softness: the part of the radius over which its touch fades, 0..1
         mode: of `BRUSH_MODES`
         through: also behind the front surface
-        weights: the members of the focused layer show their weights as colors meanwhile
+        weights: the members of the focused layer show their weights as colors meanwhile; else only a thin
+            tint lies over those that have less than all of the edit
+        flow: how far one stroke goes towards what it gives, 0..1
+        value: the weight that "add" gives, 0..1
     """
 
     active: bool = False
@@ -79,7 +82,9 @@ class Brush:
     softness: Share = 0.5
     mode: Annotated[str, one_of(BRUSH_MODES)] = "erase"
     through: bool = False
-    weights: bool = True
+    weights: bool = False
+    flow: Share = 1.0
+    value: Share = 1.0
 
 
 @dataclass(frozen=True)

@@ -225,7 +225,7 @@ def test_the_real_mouse_paints_and_undo_takes_the_stroke_away(desktop: Desktop) 
     desktop.point(*slider(0, 0.5))  # where the brush's ring is not over the picture
     desktop.xdotool("key", "2")  # the lower card: the scarf
     clean = desktop.shot()
-    desktop.xdotool("key", "b")
+    desktop.xdotool("key", "b", "c")
     colors = desktop.rest()
     assert changed(clean, colors) > 200, "the weights are shown"
     x, y = scarf_on_screen()

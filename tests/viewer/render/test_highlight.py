@@ -67,6 +67,17 @@ def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colors() -> None:
     assert lightness[-1] - lightness[0] > 120
 
 
+def test_a_thin_tint_leaves_what_has_all_of_the_edit_as_it_is() -> None:
+    members, total = bear().gdfs[SCARF].region.members.numpy(), len(bear().scene)
+    colors, tint = (
+        highlight.highlight_colors(Highlight(SCARF, half_painted(), thin=thin), bear().gdfs, total)[members]
+        for thin in (False, True)
+    )
+    assert (tint[:, :3] == colors[:, :3]).all()
+    assert tint[:, 3].min() == 0
+    assert 0 < tint[:, 3].max() < 0.5 * colors[:, 3].max()
+
+
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
 def test_what_is_shown_is_the_scene_with_mixed_colors(ctx: moderngl.Context, draw: str) -> None:
@@ -192,10 +203,11 @@ def test_a_stroke_draws_only_the_part_of_the_picture_that_it_touched(ctx: modern
 
 def test_weights_are_wanted_while_the_brush_is_out_over_a_layer_that_shows() -> None:
     out = replace(view(), brush=Brush(active=True))
-    assert highlight.requested_highlight(out, 0) == Highlight(0, paint.FULL)
+    assert highlight.requested_highlight(out, 0) == Highlight(0, paint.FULL, thin=True)
+    colors = replace(out, brush=Brush(active=True, weights=True))
+    assert highlight.requested_highlight(colors, 0) == Highlight(0, paint.FULL)
     for without in (
         view(),
-        replace(out, brush=Brush(active=True, weights=False)),
         replace(out, compare=Comparison("split")),
         replace(out, layers=(replace(out.layers[0], enabled=False), *out.layers[1:])),
     ):
@@ -205,17 +217,18 @@ def test_weights_are_wanted_while_the_brush_is_out_over_a_layer_that_shows() -> 
 
 
 @pytest.mark.gl
-def test_c_hides_the_weights_and_saved_pictures_never_show_them() -> None:
+def test_c_shows_all_weights_and_saved_pictures_never_show_them() -> None:
     with rig(replace(first_view(bear(), 1.0, 1.0), brush=Brush(active=True)), (700, 640)) as hand:
-        weights = hand.picture().astype(int)
-        saved = hand.main_view.canvas.image(hand.main_view.work.view, (400, 640))
-        hand.key("C")
-        assert not hand.main_view.work.view.brush.weights
         plain = hand.picture().astype(int)
-        assert np.abs(weights - plain).max() > 60
+        saved = hand.main_view.canvas.image(hand.main_view.work.view, (400, 640))
         assert np.abs(np.clip(saved, 0, 1) * 255 - plain)[100:].max() < 1.0, "below the brush's ring"
         hand.key("C")
-        assert (hand.picture() == weights).all()
+        assert hand.main_view.work.view.brush.weights
+        assert np.abs(hand.picture().astype(int) - plain).max() > 60
+        again = hand.main_view.canvas.image(hand.main_view.work.view, (400, 640))
+        assert (again == saved).all()
+        hand.key("C")
+        assert (hand.picture() == plain).all()
         assert hand.main_view.work.past.past == (), "looking is no edit"
 
 

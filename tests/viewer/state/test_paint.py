@@ -97,6 +97,30 @@ def test_erase_and_add_go_to_none_and_to_all_as_far_as_the_brush_touched() -> No
     assert result(stroke, mode="add").tolist() == pytest.approx([1.0, 1.0, 0.75, 0.25, 0.75], abs=0.003)
 
 
+def test_flow_goes_part_of_the_way_and_value_is_what_add_gives() -> None:
+    before = np.full(5, 0.5, np.float32)
+    stroke = replace(LINE, before=before, reached=np.ones(5, np.float32))
+    added = result(stroke, Brush(flow=0.5, value=0.9), "add")
+    assert added.tolist() == pytest.approx([0.7] * 5, abs=0.003)
+    erased = result(stroke, Brush(flow=0.5, value=0.9), "erase")
+    assert erased.tolist() == pytest.approx([0.25] * 5, abs=0.003)
+
+
+def test_inverted_paint_is_swapped_and_twice_is_the_paint_again() -> None:
+    some = paint.encode(np.array([0.0, 0.2, 1.0], np.float32))
+    assert paint.decode(paint.invert(some, 3), 3).tolist() == pytest.approx([1.0, 0.8, 0.0], abs=0.003)
+    assert paint.invert(paint.invert(some, 3), 3) == some
+    assert paint.invert(paint.invert(paint.FULL, 3), 3) == paint.FULL
+
+
+def test_ctrl_i_inverts_the_paint_of_the_layer_as_one_undo_entry(hand: Rig) -> None:
+    hand.key("Ctrl+I")
+    assert weights(hand).max() == 0.0
+    assert len(hand.main_view.work.past.past) == 1
+    hand.key("Ctrl+Z")
+    assert weights(hand).min() == 1.0
+
+
 def step_under_a_brush(behind: float = 0.0) -> Stroke:
     """A row of weights 0 | 1 along x under a brush that touches all; `behind`: how much deeper 1 lies."""
     x = np.arange(-40, 40, dtype=np.float32)
