@@ -1,7 +1,8 @@
-"""A .npy file of numbers, mapped: a header that claims more than the file has allocates nothing."""
+"""A .npy file of numbers: written whole; read mapped, so that a header that lies allocates nothing."""
 
 from __future__ import annotations
 
+import io
 import os
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 
-from .atomic import check_regular, open_error
+from .atomic import atomic_write, check_regular, open_error
 
 
 def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any]:
@@ -35,3 +36,15 @@ def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any
     if array.dtype.kind not in "fiub":
         raise ProgdfError(f"{path} holds {array.dtype.name}, not {what}; save them with numpy.save")
     return array
+
+
+def save_npy(path: str | os.PathLike[str], array: NDArray[Any]) -> None:
+    """Write an array, whole or not at all.
+
+    Raises:
+        ProgdfError: see `atomic_write`.
+    """
+    stored = io.BytesIO()
+    np.save(stored, array)
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_bytes(stored.getvalue())

@@ -124,8 +124,10 @@ def grow_along_surface(
     Args:
         neighborhood: of the scene
         colors: of its Gaussians, OKLab. [N,3]
-        seeds: rows to begin at; those that are not alike do not count. [M]
+        seeds: rows to begin at, also where they are not alike themselves. [M]
         color: what others are compared with, OKLab. [3]
         tolerance: how far a color may be from it
     """
-    return neighborhood.connected_part(alike_in_color(colors, color, tolerance), seeds)
+    alike = alike_in_color(colors, color, tolerance)
+    alike[seeds] = True
+    return neighborhood.connected_part(alike, seeds)

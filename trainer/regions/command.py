@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,9 +16,9 @@ from progdf.errors import ProgdfError
 from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import atomic_write
 from progdf.io.cameras import load_cameras, read_camera
 from progdf.io.images import write_image
+from progdf.io.npy import save_npy
 from progdf.region import Region
 from progdf.scene.bounds import front_direction
 from progdf.scene.region_spec import parse_region
@@ -65,10 +63,7 @@ def show(options: RegionOptions) -> str:
         )  # fmt: skip
         region = parse_region(options.spec, scene, kinds=region_kinds(settings))
     if suffix == ".npy":
-        stored = io.BytesIO()
-        np.save(stored, region.members.numpy())
-        with atomic_write(options.out) as temporary_file:
-            temporary_file.write_bytes(stored.getvalue())
+        save_npy(options.out, region.members.numpy())
     else:
         given = [] if options.cameras is None else load_cameras(options.cameras)
         up = find_up(scene, given, options.up).direction

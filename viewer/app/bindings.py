@@ -27,16 +27,17 @@ MOUSE_HELP = (
 )
 
 TOPICS = (
+    ("Layers", "focus:1"),
     ("View", "fly"),
     ("Edits", "blend"),
-    ("Layers", "focus:1"),
     ("Brush", "brush"),
+    ("Select", "select_tool:box"),
     ("Timeline", "play"),
     ("Window and files", "help"),
 )
 """Each with the action of its first key in `controls.KEYS`; it goes on to the next one's first."""
 
-_ROW, _BETWEEN = 1.38, 0.8  # in sizes of the small text: from row to row, and above a heading
+_ROW, _BETWEEN = 1.34, 0.8  # in sizes of the small text: from row to row, and above a heading
 COLUMN_PX, _MARGIN_PX = 322.0, 14.0  # at 1×
 _MOST_COLUMNS = 3
 
@@ -143,6 +144,9 @@ _NAMES = {
     "Escape": "Esc",
     "Alt+Down": "Alt+↑ ↓",
     "]": "[ ]",
+    "R": "R L P U",
+    "J": "Shift+R J I",
+    "Ctrl+]": "Ctrl+[ ]",
     ".": ", .",
     "Shift+.": "Shift+, .",
 }

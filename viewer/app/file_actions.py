@@ -15,7 +15,7 @@ from viewer.camera.up_axis import up_of
 from viewer.camera.view_camera import first_camera
 from viewer.files import autosave as autosaves
 from viewer.files import document as documents
-from viewer.files import recent, session
+from viewer.files import recent, regions, session
 from viewer.files.autosave import SessionAutosave
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path, session_file
@@ -80,6 +80,10 @@ class FileActions:
         elif name == "replace_by":
             index, _, path = argument.partition(":")
             self._report_errors(lambda: self._replace_edit(index, parse_path(path)))
+        elif name == "save_region":
+            self._report_errors(lambda: self._keep_region(argument))
+        elif name == "rename_region":
+            self._report_errors(lambda: self._rename_region(*argument.split(":", 1)))
         elif name == "quit":
             self._leave()
 
@@ -226,6 +230,23 @@ class FileActions:
     def _replace_edit(self, index: str, path: Path) -> None:
         self._edits.replace(self._edits.layer(index), path)
         self._app.main_view.recent = self._remember(path)
+
+    def _keep_region(self, name: str) -> None:
+        main_view, opened = self._app.main_view, self._app.document
+        if self.path is None and opened.path is None:
+            raise ProgdfError(f"{opened.title} was not opened from a file; save the scene first")
+        folder = (self.path or opened.path or Path()).resolve().parent
+        view, total = main_view.work.view, len(opened.scene)
+        kept = regions.keep(view.selection, name, folder, total)
+        main_view.change(replace(view, selection=kept))
+        main_view.show_message(
+            f"Saved {kept.regions[-1].path}; train it with --region file:{kept.regions[-1].path.name}"
+        )
+
+    def _rename_region(self, index: str, name: str) -> None:
+        view, total = self._app.main_view.work.view, len(self._app.document.scene)
+        renamed = regions.rename(view.selection, int(index), name, total)
+        self._app.main_view.change(replace(view, selection=renamed))
 
     def _write(self, path: Path) -> None:
         session.save(path, self._session())

@@ -11,14 +11,16 @@ from imgui_bundle import imgui
 from viewer.panel import brush, panel, timeline_bar
 from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_labels import Labels
+from viewer.select import outline
 from viewer.state import workspace
 from viewer.state.actions import perform
 from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
+from viewer.ui.pointer import PointerContext
 
 from . import bindings, compare_overlay, dialogs, mouse
-from .mouse import MouseTool, PointerContext
+from .mouse import MouseTool
 
 
 def panels(
@@ -46,7 +48,7 @@ def panels(
     )
     result = panel.draw(work.view, shown, pointer.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
-    work = replace(work, overlap=result.overlap)
+    work = replace(work, overlap=result.overlap, pointed=result.pointed)
     work = _perform(work, result.actions, pointer)
     if work.player.shown:
         work = _perform(
@@ -74,6 +76,7 @@ def over_picture(
     area, ui, view = pointer.area, pointer.ui, work.view
     if view.brush.active and not imgui.get_io().want_capture_mouse:
         brush.ring(view, ui)
+    outline.draw(held.gesture, view, ui)
     if original:
         overlay.banner("Original", area, ui)
     else:

@@ -21,6 +21,7 @@ from viewer.gl.screen import read_rgb
 from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size
+from viewer.select import hand
 from viewer.state import playback, workspace
 from viewer.state.actions import perform
 from viewer.state.snapshots import SliderSnapshot
@@ -29,10 +30,11 @@ from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.frame_pacer import FramePacer
+from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse
 from .canvas import Canvas
-from .mouse import MouseTool, PointerContext
+from .mouse import MouseTool
 from .pending_keys import PendingKeys
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
@@ -197,6 +199,10 @@ class MainView:
         off = inputs.cancels_drag(self._keys, self._tool.drag)
         if off:
             self._cancel_drag()
+        gesture, self.work, self._keys = hand.take_keys(
+            self._tool.gesture, self.work, self._pointer(), self._keys
+        )
+        self._tool = replace(self._tool, gesture=gesture)
         asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
         for action in inputs.requested_actions(self._keys):
             if not asks or action in ("picture", "window_picture"):

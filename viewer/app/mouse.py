@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from progdf.camera import Camera
 from viewer.camera import controls, inputs
-from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.camera.view_camera import ViewCamera
 from viewer.panel import brush
-from viewer.render.engine import ViewEngine
 from viewer.render.picking import layer_at, seen_at, surface_point
+from viewer.select import hand
+from viewer.select.gesture import Gesture
 from viewer.state import layers as stack
 from viewer.state import paint, workspace
 from viewer.state.paint import Stroke
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import SceneFacts, Workspace
+from viewer.state.workspace import Workspace
 from viewer.ui.context import UiContext
-from viewer.ui.overlay import Area
+from viewer.ui.pointer import PointerContext
 
 from . import compare_overlay
 
@@ -30,51 +30,17 @@ class MouseTool:
     """What the mouse holds.
 
     Args:
-        drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER` or `brush.DRAG`; None while it holds nothing
+        drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER`, `brush.DRAG` or `hand.DRAG`; None while it
+            holds nothing
         stroke: of the brush, from its first drag on
+        gesture: of the tool that selects; of a polygon also between its clicks
         divider: where that of a split stood when it was gripped, share of the picture's width
     """
 
     drag: str | None = None
     stroke: Stroke | None = None
+    gesture: Gesture | None = None
     divider: float = 0.5
-
-
-@dataclass(frozen=True)
-class PointerContext:
-    """What lies under the mouse in one frame.
-
-    Args:
-        engine: draws the picture
-        facts: of the open scene
-        shown: what the picture shows: the state, or the original while its key is held
-        area: the part of the window that shows it
-        ui: fonts and scale
-        now: seconds on the main view's clock
-    """
-
-    engine: ViewEngine
-    facts: SceneFacts
-    shown: ViewState
-    area: Area
-    ui: UiContext
-    now: float
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """The picture's width and height in framebuffer pixels."""
-        density = imgui.get_io().display_framebuffer_scale
-        return max(round(self.area.width * density.x), 1), max(round(self.area.height * density.y), 1)
-
-    @property
-    def cursor(self) -> tuple[float, float]:
-        """Where the mouse is, in pixels of the picture."""
-        mouse, density = imgui.get_io().mouse_pos, imgui.get_io().display_framebuffer_scale
-        return mouse.x * density.x, mouse.y * density.y
-
-    def camera(self, camera: ViewCamera) -> Camera:
-        """`camera` as it takes the picture."""
-        return to_camera(camera, *self.size)
 
 
 def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
@@ -83,6 +49,9 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     tool, work = _drag(tool, work, pointer)
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
+    if tool.drag == hand.DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
+        gesture, work = hand.release(tool.gesture, work, pointer)
+        tool = replace(tool, gesture=gesture)
     if not inputs.any_button_down():
         tool = replace(tool, drag=None)
     if io.want_capture_mouse:
@@ -93,6 +62,9 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
             return MouseTool(compare_overlay.DIVIDER, divider=work.view.compare.divider), work
     if work.view.brush.active and imgui.is_mouse_clicked(0):
         return _begin_stroke(tool, work, pointer)
+    if work.view.select.tool and imgui.is_mouse_clicked(0):
+        gesture, work = hand.press(tool.gesture, work, pointer)
+        return replace(tool, drag=hand.DRAG, gesture=gesture), work
     camera = work.view.camera
     if imgui.is_mouse_double_clicked(0):
         return tool, workspace.with_camera(work, _pick_pivot(camera, pointer))
@@ -126,6 +98,11 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
         return tool, replace(work, view=compare_overlay.move_divider(work.view, pointer.area))
     if tool.drag == brush.DRAG:
         return _paint(tool, work, pointer)
+    if tool.drag == hand.DRAG:
+        if tool.gesture is None:
+            return tool, work
+        gesture, work = hand.follow(tool.gesture, work, pointer)
+        return replace(tool, gesture=gesture), work
     if tool.drag and (dx or dy):
         # also where the button went up within this frame: a slow frame must not lose the end of a drag
         height, radius = pointer.area.height / scale, pointer.facts.bounds.radius
@@ -169,7 +146,7 @@ def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
     """A click on the picture: the layer there, if there is one, is focused."""
     engine, view = pointer.engine, pointer.shown
     camera = pointer.camera(work.view.camera)
-    seen = seen_at(engine.gaussians(view), camera, *pointer.cursor, engine.near)
+    seen = seen_at(pointer.scene, camera, *pointer.cursor, engine.near)
     layer = None if seen is None else layer_at(view, engine.gdfs, seen)
     return work if layer is None else workspace.focus_layer(work, layer)
 
@@ -177,6 +154,5 @@ def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
 def _pick_pivot(camera: ViewCamera, pointer: PointerContext) -> ViewCamera:
     """A double click: what lies under the cursor becomes the pivot."""
     engine = pointer.engine
-    scene = engine.gaussians(pointer.shown)
-    point = surface_point(scene, pointer.camera(camera), *pointer.cursor, engine.near)
+    point = surface_point(pointer.scene, pointer.camera(camera), *pointer.cursor, engine.near)
     return camera if point is None else controls.pivot_on(camera, point, pointer.facts.bounds.radius)

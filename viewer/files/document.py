@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
+from progdf.scene.neighborhood import Neighborhood
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import bounds_of, first_camera, fit_all
 from viewer.render.threads import all_threads
@@ -45,6 +47,7 @@ class Document:
             rows=rows,
             recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, scene, aspect),
+            neighborhood=cache(lambda: Neighborhood(scene)),
             home=lambda camera, aspect: replace(
                 first_camera(scene, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),

@@ -33,7 +33,7 @@ def obstacle(view: ViewState, focus: int | None) -> str:
         return "no layer is selected; click one, or press 1–9"
     layer = view.layers[focus]
     if layer.locked:
-        return f"{layer.name} is locked; press L to unlock it"
+        return f"{layer.name} is locked; press Shift+L to unlock it"
     if layer not in stack.visible_layers(view):
         return f"{layer.name} is hidden; press H to show it"
     return ""

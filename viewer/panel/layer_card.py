@@ -64,6 +64,7 @@ class CardResult:
     renaming: bool = False
     drag: str = ""
     overlap: bool = False
+    pointed: bool = False
     action: str = ""
 
 
@@ -169,7 +170,7 @@ def _head(
     imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
         strength_slider.start_typing("##strength")
-    tip("Locked (L)" if layer.locked else "Click to type a value")
+    tip("Locked (Shift+L)" if layer.locked else "Click to type a value")
     return card
 
 
@@ -193,6 +194,8 @@ def _name(
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     color = PALETTE.text if active else PALETTE.dim
     imgui.get_window_draw_list().add_text(at, u32(color), elide(layer.name, room))
+    if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
+        card = replace(card, pointed=True)  # the picture shows its region
     tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename (Enter)")
     if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
         return replace(card, renaming=True, touched=True)
@@ -235,7 +238,7 @@ def _foot(card: CardResult, index: int, row: LayerRow, ui: UiContext) -> CardRes
     imgui.same_line(right - 3 * wide)
     if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
         state = stack.change_layer(state, index, lambda old: replace(old, locked=not old.locked))
-    tip("Lock strength, gains and paint (L)")
+    tip("Lock strength, gains and paint (Shift+L)")
     imgui.same_line(right - 2 * wide)
     if small_toggle("fold", Icon.GAINS, layer.gdf in state.unfolded, wide, ui):
         state = stack.toggle_details(state, index)

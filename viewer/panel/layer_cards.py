@@ -14,6 +14,7 @@ from progdf.compose.reference import BLENDS
 from viewer.panel.layer_card import Cards, draw_card
 from viewer.state import layers as stack
 from viewer.state.view_state import OVERSHOOT, ViewState
+from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.widgets import (
     right_edge,
@@ -30,7 +31,7 @@ BLEND_HELP = {
 
 @dataclass(frozen=True)
 class CardsResult:
-    """What became of the state: the focused layer, the one being renamed, the one asked about.
+    """What became of the state: the focused layer, the one being renamed, those asked about.
 
     `actions`: those of the cards' menus, as in `actions.perform`.
     """
@@ -39,6 +40,7 @@ class CardsResult:
     focus: int | None
     renaming: int | None = None
     overlap: int | None = None
+    pointed: Pointed | None = None
     actions: tuple[str, ...] = ()
 
 
@@ -90,6 +92,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> CardsResult:
         imgui.text_disabled("No edits loaded. Drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
     focus, renaming, overlap = cards.focus, None, None
+    pointed: Pointed | None = None
     actions: list[str] = []
     dragged: int | None = None  # rows, as seen: the top layer, which is the last one, is row 0
     dropped = False
@@ -105,6 +108,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> CardsResult:
         focus = i if card.touched else focus
         renaming = i if card.renaming else renaming
         overlap = i if card.overlap else overlap
+        pointed = ("layer", i) if card.pointed else pointed
         actions += [card.action] if card.action else []
         if card.drag:
             dragged, dropped = at, card.drag == "dropped"
@@ -115,7 +119,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext) -> CardsResult:
             state = stack.move_layer(state, was, focus)
         else:
             _show_place(dragged, to, spans, ui)
-    return CardsResult(state, focus, renaming, overlap, tuple(actions))
+    return CardsResult(state, focus, renaming, overlap, pointed, tuple(actions))
 
 
 def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:

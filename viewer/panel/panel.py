@@ -12,6 +12,7 @@ from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import ViewCamera
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
+from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.widgets import (
     choice,
@@ -26,7 +27,7 @@ from viewer.ui.widgets import (
     tip,
 )
 
-from . import brush, layer_card, layer_cards, snapshot_cards
+from . import brush, layer_card, layer_cards, region_rows, selection_section, snapshot_cards
 from .snapshot_cards import SnapshotCard
 
 WIDTH_PX = 300.0  # at 1×
@@ -73,7 +74,8 @@ class PanelInput:
 class PanelResult:
     """The changed state, the focused layer, the one being renamed, and the actions asked for.
 
-    `overlap`: the layer of which to show what it shares with the others, while the mouse rests on that line.
+    `overlap`: the layer of which to show what it shares with the others, while the mouse rests on that line;
+    `pointed`: what else it rests on that the picture shows.
     Actions are named as in `controls.KEYS`.
     """
 
@@ -82,6 +84,7 @@ class PanelResult:
     actions: tuple[str, ...] = ()
     renaming: int | None = None
     overlap: int | None = None
+    pointed: Pointed | None = None
 
 
 def width(ui: UiContext) -> float:
@@ -117,12 +120,16 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     if state.brush.active:
         state, asked = brush.section(state, focus, ui)
         actions += [asked] if asked else []
+    state, selected = selection_section.draw(state, ui, actions)
+    region = region_rows.draw(state.selection.regions, ui, actions)
     state = _view(state, shown.unrecorded, ui, actions)
     snapshot_cards.draw(shown.snapshots, ui, actions)
     _end_body()
     _footer(state, shown, ui, actions)
     imgui.end()
-    return PanelResult(state, focus, tuple(actions), drawn.renaming, drawn.overlap)
+    return PanelResult(
+        state, focus, tuple(actions), drawn.renaming, drawn.overlap, drawn.pointed or selected or region
+    )
 
 
 def _begin_body(footer: float) -> None:

@@ -15,7 +15,7 @@ from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
 from viewer.state import comparison as compare
-from viewer.state import history, paint, playback, snapshots
+from viewer.state import history, paint, playback, selection, snapshots
 from viewer.state import layers as stack
 from viewer.state.history import History
 from viewer.state.view_state import ViewState, next_resolution_mode
@@ -37,6 +37,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         KeyError: there is no such action.
     """
     name, _, argument = action.partition(":")
+    if name == "invert":
+        name = "paint_invert" if workspace.view.brush.active else "select_invert"
     if name in REQUESTS:
         return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
@@ -47,6 +49,10 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return _feather(workspace, facts)
     if name == "paint_invert":
         return _invert_paint(workspace, facts)
+    if name in selection.CHANGES:
+        state = workspace.view.selection
+        changed = selection.change(state, name, argument, facts.count, facts.neighborhood)
+        return replace(workspace, view=replace(workspace.view, selection=changed))
     if name == "next_slider":
         return _select_slider(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
@@ -177,6 +183,46 @@ def _feather(workspace: Workspace, facts: SceneFacts) -> Workspace:
     return _change_focused(workspace, soften)
 
 
+def _take_tool(workspace: Workspace, tool: str) -> Workspace:
+    """A tool that selects; the brush is put down, and a tool that is held too."""
+    view = workspace.view
+    held = "" if view.select.tool == tool else tool
+    return replace(
+        workspace,
+        view=replace(view, select=replace(view.select, tool=held), brush=replace(view.brush, active=False)),
+    )
+
+
+def _take_brush(workspace: Workspace, _: str) -> Workspace:
+    view = replace(workspace.view, select=replace(workspace.view.select, tool=""))
+    return _change_brush(replace(workspace, view=view), active=not view.brush.active)
+
+
+def _resize(workspace: Workspace, times: str) -> Workspace:
+    """The brush, or what the tool that selects has in its place."""
+    view = workspace.view
+    if not view.select.tool:
+        return _change_brush(workspace, radius=paint.radius(view.brush.radius * float(times)))
+    if view.select.tool in ("flood", "color"):
+        tolerance = min(1.0, max(0.01, round(view.select.tolerance * float(times), 3)))
+        return replace(workspace, view=replace(view, select=replace(view.select, tolerance=tolerance)))
+    radius = paint.radius(view.select.radius * float(times))
+    return replace(workspace, view=replace(view, select=replace(view.select, radius=radius)))
+
+
+def _step_back(workspace: Workspace, _: str) -> Workspace:
+    """The list of bindings goes, or the tool that selects, or the focus."""
+    if workspace.help:
+        return replace(workspace, help=False)
+    tool = workspace.view.select.tool
+    return _take_tool(workspace, tool) if tool else replace(workspace, focus=None)
+
+
+def _show_all(workspace: Workspace, _: str) -> Workspace:
+    view = stack.show_all(workspace.view)
+    return replace(workspace, view=replace(view, selection=selection.show_all(view.selection)))
+
+
 def _blend(workspace: Workspace, _: str) -> Workspace:
     after = BLENDS[(BLENDS.index(workspace.view.blend) + 1) % len(BLENDS)]
     return replace(workspace, view=replace(workspace.view, blend=after))
@@ -258,29 +304,35 @@ REQUESTS = (
     *("picture", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
+    *("save_region", "rename_region"),
 )
 """What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
 afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
-layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`."""
+layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`;
+`save_region:NAME`, `rename_region:INDEX:NAME`."""
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
-    "unfocus": lambda w, _: replace(w, help=False) if w.help else replace(w, focus=None),
+    "unfocus": _step_back,
     "toggle": _toggle,
     "hide": _hide,
     "nudge": _nudge,
     "move": _move,
     "solo": lambda workspace, _: _change_focused(workspace, stack.toggle_solo),
-    "show_all": lambda w, _: replace(w, view=stack.show_all(w.view)),
+    "show_all": _show_all,
     "lock": _lock,
     "fold": lambda workspace, _: _change_focused(workspace, stack.toggle_details),
     "rename": _rename,
     "remove": _remove,
     "blend": _blend,
-    "brush": lambda w, _: _change_brush(w, active=not w.view.brush.active),
+    "select_tool": _take_tool,
+    "select_through": lambda w, _: replace(
+        w, view=replace(w.view, select=replace(w.view.select, through=not w.view.select.through))
+    ),
+    "brush": _take_brush,
     "brush_mode": lambda w, _: _change_brush(w, mode=paint.next_mode(w.view.brush.mode)),
     "brush_weights": lambda w, _: _change_brush(w, weights=not w.view.brush.weights),
     "brush_through": lambda w, _: _change_brush(w, through=not w.view.brush.through),
-    "brush_radius": lambda w, by: _change_brush(w, radius=paint.radius(w.view.brush.radius * float(by))),
+    "brush_radius": _resize,
     "brush_softness": lambda w, by: _change_brush(
         w, softness=paint.softness(w.view.brush.softness + float(by))
     ),

@@ -7,7 +7,7 @@ compare, undo and are saved as values.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,9 +15,10 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
+from progdf.scene.neighborhood import Neighborhood
+from progdf.scene.selection import Mask, combine
 
 SUFFIX = ".region.npy"
 """How the file of a region is called after its name."""
@@ -26,7 +27,6 @@ LONGEST_NAME = 60
 NOBODY = b""
 """The packed mask without a member."""
 
-Mask = NDArray[np.bool_]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Color = tuple[Share, Share, Share]
 
@@ -112,6 +112,11 @@ def select(state: SelectionState, mask: Mask) -> SelectionState:
     return replace(state, members=pack(mask), count=int(np.count_nonzero(mask)))
 
 
+def select_none(state: SelectionState) -> SelectionState:
+    """With nothing selected."""
+    return replace(state, members=NOBODY, count=0)
+
+
 def hide(state: SelectionState, total: int) -> SelectionState:
     """What is selected is not drawn any more, and no longer selected."""
     hidden = unpack(state.hidden, total) | unpack(state.members, total)
@@ -126,6 +131,61 @@ def isolate(state: SelectionState, total: int) -> SelectionState:
 def show_all(state: SelectionState) -> SelectionState:
     """Everything is drawn."""
     return replace(state, hidden=NOBODY)
+
+
+def change(
+    state: SelectionState, name: str, argument: str, total: int, neighborhood: Callable[[], Neighborhood]
+) -> SelectionState:
+    """After one of `CHANGES`.
+
+    Args:
+        argument: of a region its index, and a mode of `combine` after a colon
+        total: Gaussians in the scene
+        neighborhood: of the scene, made when it is first asked for
+    """
+    mask = unpack(state.members, total)
+    match name:
+        case "select_all":
+            return select(state, np.ones(total, bool))
+        case "select_none":
+            return select_none(state)
+        case "select_invert":
+            return select(state, ~mask)
+        case "hide_selected":
+            return hide(state, total)
+        case "isolate":
+            return isolate(state, total)
+        case "show_hidden":
+            return show_all(state)
+        case "region" | "show_region" | "forget_region":
+            return _change_region(state, name, argument, mask)
+    return select(state, CHANGES_BY_NEIGHBORS[name](neighborhood(), mask)) if state.count else state
+
+
+def _change_region(state: SelectionState, name: str, argument: str, mask: Mask) -> SelectionState:
+    """A region is selected, tinted or not, or forgotten; its file stays. As it was where there is none."""
+    index, _, mode = argument.partition(":")
+    if not 0 <= int(index) < len(state.regions):
+        return state
+    region = state.regions[int(index)]
+    if name == "region":
+        return select(state, combine(mask, unpack(region.members, len(mask)), mode or "new"))
+    shown = replace(region, visible=not region.visible)
+    return change_region(state, int(index), shown if name == "show_region" else None)
+
+
+CHANGES_BY_NEIGHBORS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
+    "select_grow": Neighborhood.grow,
+    "select_shrink": Neighborhood.shrink,
+    "select_smooth": Neighborhood.smooth,
+    "select_largest": Neighborhood.largest_part,
+}
+CHANGES = (
+    *("select_all", "select_none", "select_invert", "hide_selected", "isolate", "show_hidden"),
+    *("region", "show_region", "forget_region"),
+    *CHANGES_BY_NEIGHBORS,
+)
+"""Actions on the selection, and `region:INDEX[:MODE]`, `show_region:INDEX`, `forget_region:INDEX`."""
 
 
 def free_name(state: SelectionState, wanted: str) -> str:

@@ -6,9 +6,10 @@ full screen) is left in `requests` for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from progdf.scene.neighborhood import Neighborhood
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
 
@@ -26,6 +27,10 @@ UNSAVED = "• "
 """Before the scene's name where there are unsaved changes."""
 
 
+def _unknown() -> Neighborhood:
+    raise ValueError("nothing is known of this scene's neighborhood")
+
+
 @dataclass(frozen=True)
 class SceneFacts:
     """What does not change while a scene is open.
@@ -38,6 +43,7 @@ class SceneFacts:
         recordings: where each .gdf was recorded, in the same order
         fit: gives the camera that `frame` takes with no layer focused
         home: gives the first camera for another up axis, which is the given camera's
+        neighborhood: of the scene's Gaussians, made when it is first asked for
     """
 
     title: str
@@ -47,6 +53,7 @@ class SceneFacts:
     recordings: Sequence[RecordingFile] = ()
     fit: Fit = keep_camera
     home: Fit = keep_camera
+    neighborhood: Callable[[], Neighborhood] = _unknown
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from viewer.camera.inputs import Keys
 from viewer.panel import panel
 from viewer.render.headless import headless_context, is_software
 from viewer.render.timings import FrameTimings
+from viewer.state import selection
+from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, LayerState, ViewState
 from viewer.state.workspace import Dialog
 
@@ -166,6 +168,25 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
         hand.main_view.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())
+
+
+def test_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:
+    mask = bear().demo.labels.numpy() == 1
+    kept = selection.add_region(selection.select(SelectionState(), mask), "scarf", Path("scarf.region.npy"))
+    with rig(replace(first_view(bear(), 0.7, 0.5), selection=kept), SMALLEST) as hand:
+        hand.key("L")
+        way = ((250, 130), (330, 100), (450, 120), (480, 230), (420, 330), (300, 320), (240, 240))
+        hand.move(*way[0])
+        hand.press()
+        for place in way[1:]:
+            hand.move(*place)
+        hand.release()
+        hand.modifier(imgui.Key.mod_ctrl)
+        hand.move(300, 380)
+        hand.press()
+        for place in ((360, 300), (430, 360), (400, 430)):
+            hand.move(*place)
+        screenshot("ui_select", hand.image())
 
 
 def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:

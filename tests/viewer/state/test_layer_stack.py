@@ -133,12 +133,12 @@ def test_without_overshoot_nothing_stands_beyond_one() -> None:
 
 def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     hand.key("1")
-    for chord, field in (("Shift+H", "solo"), ("L", "locked")):
+    for chord, field in (("Shift+H", "solo"), ("Shift+L", "locked")):
         hand.key(chord)
         assert [getattr(layer, field) for layer in layers(hand)] == [False, True]
     hand.key("Right")
     assert hand.strengths == [0.5, 0.5], "locked"
-    hand.key("L")
+    hand.key("Shift+L")
     hand.key("Right")
     assert hand.strengths == pytest.approx([0.5, 0.51])
     hand.key("H")
@@ -177,7 +177,7 @@ def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None
 
 def test_every_change_of_a_layer_is_one_undo_entry_and_comes_back(hand: Rig) -> None:
     before = hand.picture()
-    for i, chord in enumerate(("Shift+H", "L", "Alt+Down", "O"), 1):
+    for i, chord in enumerate(("Shift+H", "Shift+L", "Alt+Down", "O"), 1):
         hand.key(chord)
         assert len(hand.main_view.work.past.past) == i
     assert not np.array_equal(hand.picture(), before)
@@ -454,7 +454,7 @@ def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
     hand.double_click(*hand.slider(1, 0.5))
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.main_view.work.past.past) == 1, "on the handle it is one step"
-    lens = (LEFT + 210, 396.0)
+    lens = (LEFT + 210, 437.0)
     hand.frame(30)
     click(hand, *lens)
     assert hand.main_view.work.view.camera.fov_y != 45.0

@@ -54,7 +54,7 @@ def drawn(view: ViewState, recorded: tuple[bool, bool]) -> np.ndarray:
 @pytest.fixture
 def hand(runs: list[Path]) -> Iterator[Rig]:
     drawn(first_view(bear(), 1.0, 1.0), (True, True))
-    with rig(first_view(bear(), AT, AT), gdf_paths=runs[1:]) as made:
+    with rig(first_view(bear(), AT, AT), (640, 600), gdf_paths=runs[1:]) as made:
         yield made
 
 
@@ -218,7 +218,7 @@ def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it
     place = recorded_button(hand)
     hand.click(*place)
     assert hand.main_view.work.view.compare.against == "recorded"
-    with rig(first_view(bear(), AT, AT)) as bare:
+    with rig(first_view(bear(), AT, AT), (640, 600)) as bare:
         bare.key("Y")
         bare.click(*place)
         assert bare.main_view.work.view.compare.against == "original"

@@ -1,0 +1,264 @@
+"""Selecting in the picture with a scripted mouse: every tool, its modes, its undo, what the panel does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+
+from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera.view_camera import to_camera
+from viewer.state.selection import unpack
+from viewer.state.view_state import SelectTool
+
+pytestmark = pytest.mark.gl
+WINDOW = (700, 640)
+MIDDLE = (200.0, 320.0)
+LASSO = ((120.0, 200.0), (300.0, 220.0), (290.0, 400.0), (210.0, 330.0), (110.0, 390.0))
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    view = replace(first_view(bear(), 0.0, 0.0), select=SelectTool(through=True))
+    with rig(view, WINDOW) as made:
+        yield made
+
+
+def selected(hand: Rig) -> np.ndarray:
+    return unpack(hand.main_view.work.view.selection.members, len(bear().scene))
+
+
+def points(hand: Rig) -> np.ndarray:
+    """Where the picture shows the centers."""
+    work = hand.main_view.work
+    return project_centers(bear().scene, to_camera(work.view.camera, *hand.main_view.picture_size)).points
+
+
+def drag_along(hand: Rig, path: Sequence[tuple[float, float]]) -> None:
+    hand.move(*path[0])
+    hand.press()
+    for place in path[1:]:
+        hand.move(*place)
+    hand.release()
+
+
+def undos(hand: Rig) -> int:
+    return len(hand.main_view.work.past.past)
+
+
+def test_a_box_selects_what_is_in_it_and_leaves_the_camera_alone(hand: Rig) -> None:
+    camera = hand.main_view.work.view.camera
+    hand.key("R")
+    hand.drag((120, 200), (260, 330))
+    assert (selected(hand) == inside_rectangle(points(hand), (120, 200), (260, 330))).all()
+    assert 0 < selected(hand).sum() == hand.main_view.work.view.selection.count
+    assert hand.main_view.work.view.camera == camera
+    assert undos(hand) == 1
+
+
+def test_a_lasso_selects_what_it_encloses(hand: Rig) -> None:
+    hand.key("L")
+    drag_along(hand, LASSO)
+    assert (selected(hand) == inside_polygon(points(hand), LASSO)).all()
+    assert undos(hand) == 1
+    hand.key("Ctrl+Z")
+    assert not selected(hand).any()
+
+
+@pytest.mark.parametrize("how", ["Enter", "double click", "first corner"])
+def test_a_polygon_is_clicked_and_closed(hand: Rig, how: str) -> None:
+    hand.key("P")
+    for corner in LASSO:
+        hand.click(*corner)
+        hand.rest(1.0)
+    assert not selected(hand).any()
+    if how == "Enter":
+        hand.key("Enter")
+        assert hand.main_view.work.renaming is None
+    elif how == "double click":
+        hand.double_click(*LASSO[-1])
+    else:
+        hand.click(LASSO[0][0] + 3, LASSO[0][1])
+    assert (selected(hand) == inside_polygon(points(hand), LASSO)).all()
+    assert undos(hand) == 1
+
+
+def test_escape_drops_a_polygon_first_and_then_the_tool(hand: Rig) -> None:
+    hand.key("P")
+    for corner in LASSO:
+        hand.click(*corner)
+    hand.key("Escape")
+    assert hand.main_view.work.view.select.tool == "polygon"
+    hand.click(300, 420)
+    hand.key("Enter")
+    assert not selected(hand).any()
+    hand.key("Escape")
+    assert hand.main_view.work.view.select.tool == ""
+    assert hand.main_view.work.focus is not None
+    hand.key("Escape")
+    assert hand.main_view.work.focus is None
+
+
+def test_escape_takes_a_lasso_back_while_it_is_drawn(hand: Rig) -> None:
+    hand.key("U")
+    hand.move(*MIDDLE)
+    hand.press()
+    hand.move(MIDDLE[0] + 40, MIDDLE[1])
+    assert selected(hand).any(), "a brush selects at once"
+    hand.key("Escape")
+    assert not selected(hand).any()
+    hand.release()
+    assert not selected(hand).any()
+    assert undos(hand) == 0
+
+
+def test_a_brush_selects_what_it_touches(hand: Rig) -> None:
+    hand.key("U")
+    path = [(150.0, 250.0), (200.0, 320.0), (260.0, 330.0)]
+    drag_along(hand, path)
+    assert (selected(hand) == inside_stroke(points(hand), path, SelectTool.radius)).all()
+    assert undos(hand) == 1
+
+
+def test_a_sphere_is_drawn_from_its_center(hand: Rig) -> None:
+    hand.key("Shift+R")
+    hand.drag(MIDDLE, (MIDDLE[0] + 60, MIDDLE[1]))
+    means = bear().scene.means.numpy()[selected(hand)]
+    assert 5 < len(means) < len(bear().scene)
+    assert (np.hypot(*(points(hand)[selected(hand)] - MIDDLE).T) < 75).all()
+    assert undos(hand) == 1
+
+
+def test_a_click_selects_what_is_connected_and_alike_and_another_tool_all_that_is_alike(hand: Rig) -> None:
+    hand.key("J")
+    hand.click(*MIDDLE)
+    flooded = selected(hand).copy()
+    assert flooded.any()
+    assert undos(hand) == 1
+    hand.key("I")
+    hand.click(*MIDDLE)
+    assert (selected(hand) | ~flooded).all()
+    assert selected(hand).sum() >= flooded.sum()
+    hand.key("]")
+    hand.key("]")
+    assert hand.main_view.work.view.select.tolerance > SelectTool.tolerance
+
+
+def test_shift_adds_ctrl_subtracts_and_both_intersect(hand: Rig) -> None:
+    def box(*keys: imgui.Key, by: float = 0.0) -> np.ndarray:
+        for key in keys:
+            hand.modifier(key)
+        hand.drag((120 + by, 200), (220 + by, 330))
+        for key in keys:
+            hand.modifier(key, False)
+        return inside_rectangle(points(hand), (120 + by, 200), (220 + by, 330))
+
+    hand.key("R")
+    first = box()
+    second = box(imgui.Key.mod_shift, by=60)
+    assert (selected(hand) == first | second).all()
+    third = box(imgui.Key.mod_ctrl, by=30)
+    assert (selected(hand) == (first | second) & ~third).all()
+    fourth = box(imgui.Key.mod_ctrl, imgui.Key.mod_shift, by=-20)
+    assert (selected(hand) == (first | second) & ~third & fourth).all()
+    assert undos(hand) == 4
+
+
+def test_only_the_front_surface_is_selected_unless_n_says_through(hand: Rig) -> None:
+    hand.key("R")
+    hand.drag((100, 150), (300, 400))
+    through = selected(hand).sum()
+    hand.key("N")
+    hand.drag((100, 150), (300, 400))
+    assert 0 < selected(hand).sum() < 0.8 * through
+
+
+def test_a_click_beside_selects_nothing_and_with_shift_keeps_what_there_was(hand: Rig) -> None:
+    hand.key("R")
+    hand.drag((120, 200), (260, 330))
+    kept = selected(hand).copy()
+    hand.modifier(imgui.Key.mod_shift)
+    hand.click(5, 5)
+    hand.modifier(imgui.Key.mod_shift, False)
+    assert (selected(hand) == kept).all()
+    hand.click(5, 5)
+    assert not selected(hand).any()
+
+
+def test_middle_and_right_drags_still_move_the_camera(hand: Rig) -> None:
+    hand.key("L")
+    before = hand.main_view.work.view.camera
+    hand.drag(MIDDLE, (MIDDLE[0] + 30, MIDDLE[1]), 2)
+    assert hand.main_view.work.view.camera.azimuth != before.azimuth
+    hand.drag(MIDDLE, (MIDDLE[0] + 30, MIDDLE[1]), 1)
+    assert hand.main_view.work.view.camera.pivot != before.pivot
+    assert not selected(hand).any()
+
+
+def test_a_tool_and_the_brush_take_turns(hand: Rig) -> None:
+    hand.key("B")
+    hand.key("L")
+    view = hand.main_view.work.view
+    assert (view.brush.active, view.select.tool) == (False, "lasso")
+    hand.key("B")
+    view = hand.main_view.work.view
+    assert (view.brush.active, view.select.tool) == (True, "")
+    hand.key("L")
+    hand.key("L")
+    assert hand.main_view.work.view.select.tool == "", "its key puts it down again"
+
+
+def test_what_is_hidden_is_neither_seen_nor_selected(hand: Rig) -> None:
+    plain = hand.picture().astype(int)
+    hand.key("R")
+    hand.drag((120, 200), (260, 330))
+    was = selected(hand).copy()
+    hand.key("Ctrl+H")
+    assert hand.main_view.work.view.selection.count == 0
+    assert np.abs(hand.picture().astype(int) - plain).max() > 60
+    hand.drag((120, 200), (260, 330))
+    assert not selected(hand).any()
+    hand.key("Alt+H")
+    hand.drag((120, 200), (260, 330))
+    assert (selected(hand) == was).all()
+    hand.key("Ctrl+Shift+H")
+    hand.key("Escape")
+    alone = hand.picture()
+    assert (alone[:150] == alone[0, 0]).mean() > 0.9
+    for _ in range(5):
+        hand.key("Ctrl+Z")
+    assert not hand.main_view.work.view.selection.hidden
+
+
+def test_keys_change_the_selection_as_a_whole(hand: Rig) -> None:
+    hand.key("Ctrl+A")
+    assert selected(hand).all()
+    hand.key("Ctrl+Shift+A")
+    assert not selected(hand).any()
+    hand.key("R")
+    hand.drag((120, 200), (260, 330))
+    few = selected(hand).copy()
+    hand.key("Ctrl+]")
+    assert selected(hand).sum() > few.sum()
+    hand.key("Ctrl+[")
+    hand.key("Ctrl+Z")
+    hand.key("Ctrl+Z")
+    assert (selected(hand) == few).all()
+    hand.key("Ctrl+I")
+    assert (selected(hand) == ~few).all()
+
+
+def test_the_mouse_on_the_name_of_a_layer_shows_its_region(hand: Rig) -> None:
+    before = hand.picture().astype(int)
+    hand.move(WINDOW[0] - 300 + 90, 112.0)
+    hand.frame(60)
+    assert hand.main_view.work.pointed == ("layer", 1)
+    assert np.abs(hand.picture() - before).max() > 30
+    hand.move(*MIDDLE)
+    hand.frame(3)
+    assert hand.main_view.work.pointed is None
+    assert (hand.picture() == before).all()
