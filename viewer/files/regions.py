@@ -71,8 +71,8 @@ def write(region: NamedRegion, total: int) -> None:
 
 def _free_path(state: SelectionState, name: str, folder: Path, own: Path | None = None) -> Path:
     """A file in `folder` that no region and no other file has."""
-    free, number = selection.free_name(state, name), 2
-    wanted = free
-    while (path := folder / f"{free}{SUFFIX}") != own and path.exists():
-        free, number = selection.free_name(state, f"{wanted}-{number}"), number + 1
-    return path
+
+    def path(free: str) -> Path:
+        return folder / f"{free}{SUFFIX}"
+
+    return path(selection.free_name(state, name, lambda free: path(free) != own and path(free).exists()))

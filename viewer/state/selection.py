@@ -188,12 +188,14 @@ CHANGES = (
 """Actions on the selection, and `region:INDEX[:MODE]`, `show_region:INDEX`, `forget_region:INDEX`."""
 
 
-def free_name(state: SelectionState, wanted: str) -> str:
-    """A name on one line, for a file too, with a number where a region has it already."""
+def free_name(
+    state: SelectionState, wanted: str, is_taken: Callable[[str], bool] = lambda name: False
+) -> str:
+    """A name on one line, for a file too, with a number where a region has it already, or it is taken."""
     kept = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(wanted.split()))
     name = kept.strip(" .")[:LONGEST_NAME] or "region"
     taken, free, number = {region.name.lower() for region in state.regions}, name, 2
-    while free.lower() in taken:
+    while free.lower() in taken or is_taken(free):
         free, number = f"{name}-{number}", number + 1
     return free
 
