@@ -26,7 +26,9 @@ Floats = NDArray[np.float32]
 MODES = ("new", "add", "subtract", "intersect")
 
 _COARSE = 4  # the front surface is looked up in a picture so many times smaller
-_BEHIND = 0.01  # of the depth: what lies no further behind the surface still belongs to it
+# Of the depth, and of its own longest axis: what lies no further behind the surface still belongs to it. Gloss
+# is made of Gaussians beneath it: with one axis a jacket's lasso has .85 of what one sees, with three .94.
+_BEHIND, _OWN = 0.01, 3.0
 _COVERED = 0.05  # less than this in all counts as background
 _MOST_CELLS = 1024  # a side, of the grid into which a polygon is filled
 
@@ -147,7 +149,7 @@ def front_surface(
 ) -> Mask:
     """Which Gaussians lie on what one sees, and not behind it.
 
-    A Gaussian belongs to the surface up to its own size behind the depth that the picture has there.
+    A Gaussian belongs to the surface as far behind the depth that the picture has there as it reaches itself.
 
     Args:
         scene: as it is on screen
@@ -175,7 +177,7 @@ def front_surface(
     depth = np.where(covered > _COVERED, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
     surface = depth[cells[:, 1] - y0, cells[:, 0] - x0]
     size = np.exp(scene.log_scales.numpy()[part].max(axis=1))
-    return np.asarray(shown & (depths <= surface * (1.0 + _BEHIND) + size))
+    return np.asarray(shown & (depths <= surface * (1.0 + _BEHIND) + _OWN * size))
 
 
 _OUTSIDE, _INSIDE, _EDGE = 0, 1, 2

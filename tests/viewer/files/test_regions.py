@@ -53,7 +53,7 @@ def test_a_renamed_region_takes_its_file_along_and_is_written_again_after_undo(
     assert np.load(kept.regions[0].path).tolist() == np.flatnonzero(MASK).tolist()
 
 
-def test_nothing_selected_and_a_folder_that_is_gone_are_one_line(chosen: SelectionState, tmp_path: Path) -> None:
+def test_nothing_selected_and_no_folder_are_one_line(chosen: SelectionState, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="nothing is selected"):
         regions.keep(SelectionState(), "jacket", tmp_path, TOTAL)
     with pytest.raises(ProgdfError, match="does not exist"):
