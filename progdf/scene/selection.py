@@ -26,7 +26,7 @@ Floats = NDArray[np.float32]
 MODES = ("new", "add", "subtract", "intersect")
 
 _COARSE = 4  # the front surface is looked up in a picture so many times smaller
-# Of the depth, and of its own longest axis: what lies no further behind the surface still belongs to it. Gloss
+# Of the depth, and of its own longest axis: what is no further behind the surface still belongs to it. Gloss
 # is made of Gaussians beneath it: with one axis a jacket's lasso has .85 of what one sees, with three .94.
 _BEHIND, _OWN = 0.01, 3.0
 _COVERED = 0.05  # less than this in all counts as background
