@@ -37,6 +37,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("progdf.cli.check:main", "report what a scene holds and what had to be repaired"),
     "info": ("progdf.cli.info:main", "tell what a scene or a .gdf holds, with its error report"),
 }
+HIDDEN = {"preview": "trainer.preview:serve"}
+"""Commands that the window runs, and nobody types."""
 
 
 def _usage() -> str:
@@ -92,9 +94,10 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(f"progdf {__version__}")
         return 0
-    if arguments[0] not in COMMANDS:
+    places = {name: place for name, (place, _) in COMMANDS.items()} | HIDDEN
+    if arguments[0] not in places:
         raise ProgdfError(f"unknown command '{arguments[0]}'; use one of {', '.join(COMMANDS)}")
-    module, function = COMMANDS[arguments[0]][0].split(":")
+    module, function = places[arguments[0]].split(":")
     return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
 
 

@@ -29,8 +29,8 @@ ORDER = {
     "progdf": """gaussians lens sh terminal errors region camera interpolation color metrics demo_scenes io
         rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
-        motion optimize fit report plan pipeline evaluate cli""",
-    "viewer": "__init__ camera gl state render files pictures ui panel select app commands",
+        motion optimize fit report plan preview pipeline evaluate cli""",
+    "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",
     "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer
         recorded_runs viewer field_plot field edits networks warps __main__""",
 }

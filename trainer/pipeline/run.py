@@ -91,7 +91,7 @@ def train(plan: Plan, out: Path, threads: int = 0, resume: bool = False, quiet: 
     folder = open_run_folder(out, plan.edit)
     with interrupt_on_signals(), lock_folder(folder), explain_stop(folder):
         session = decide_resume(folder, plan, region, wanted_threads(threads), resume)
-        log = RunLog(folder.log, quiet)
+        log = RunLog(folder.log, quiet, progress=folder.progress)
         try:
             for note in (*session.notes, *notes):
                 log.say(note)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -17,6 +18,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from progdf.errors import ProgdfError
+from progdf.io.atomic import atomic_write
 from progdf.terminal import escape_text
 
 from .memory import PeakMemory
@@ -26,6 +29,7 @@ Advance = Callable[[int, str], None]
 """Steps done so far, and a short word about them (the loss)."""
 
 _EVERY_S = 5.0
+_FILE_EVERY_S = 0.4
 
 
 class RunLog:
@@ -38,12 +42,17 @@ class RunLog:
         path: log.txt; what is in it stays
         quiet: the file only
         refits: a later command on a finished run, whose own time counts apart
+        progress: a file for programs that wait for the run: what it does, how many steps of how many are
+            done, and the short word, as JSON, rewritten a few times a second; None writes none
     """
 
-    def __init__(self, path: Path, quiet: bool = False, refits: bool = False) -> None:
+    def __init__(
+        self, path: Path, quiet: bool = False, refits: bool = False, progress: Path | None = None
+    ) -> None:
         self.seconds: dict[str, float] = {}
         self.refits = refits
         self._earlier = 0.0
+        self._progress, self._written = progress, 0.0
         self._running: dict[str, float] = {}
         self.memory = PeakMemory()
         self._start = time.perf_counter()
@@ -110,12 +119,18 @@ class RunLog:
             )
             with Progress(*columns, console=self._console, transient=True) as progress:
                 task = progress.add_task(what, total=total, word="")
-                yield lambda done, word: progress.update(task, completed=done, word=word)
+
+                def move_bar(done: int, word: str) -> None:
+                    progress.update(task, completed=done, word=word)
+                    self._write_progress(what, done, total, word)
+
+                yield move_bar
             return
         begun = last = time.perf_counter()
 
         def advance(done: int, word: str) -> None:
             nonlocal last
+            self._write_progress(what, done, total, word)
             now = time.perf_counter()
             if now - last >= _EVERY_S and done < total:
                 last = now
@@ -141,6 +156,16 @@ class RunLog:
         """End the file."""
         with suppress(OSError):  # a full disk, which has been reported already
             self._file.close()
+
+    def _write_progress(self, what: str, done: int, total: int, word: str) -> None:
+        """Rewrite the progress file, not too often; who cannot write it goes on all the same."""
+        now = time.perf_counter()
+        if self._progress is None or (now - self._written < _FILE_EVERY_S and done < total):
+            return
+        self._written = now
+        state = {"doing": what, "done": done, "total": total, "note": word}
+        with suppress(OSError, ProgdfError), atomic_write(self._progress) as temporary_file:
+            temporary_file.write_text(json.dumps(state, ensure_ascii=False), encoding="utf-8")
 
     def _total(self) -> float:
         return self._earlier + time.perf_counter() - self._start

@@ -71,6 +71,11 @@ class RunFolder:
         return self.root / "log.txt"
 
     @property
+    def progress(self) -> Path:
+        """How far a run has come, JSON, for programs that wait for it; gone with the state when it ends."""
+        return self.root / "state" / "progress.json"
+
+    @property
     def state(self) -> StateFolder:
         """What a stopped run needs to go on."""
         return StateFolder(self.root / "state")

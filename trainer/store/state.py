@@ -31,8 +31,9 @@ from progdf.io.tensors import read_tensors, write_tensors
 
 SHARE = 0.01
 """Of the time, at most, that saving the state may take."""
-SAVE_EVERY = 10.0
-"""Seconds between two saves, more where saving takes long; 0: after every step."""
+SAVE_EVERY = 3.0
+"""Seconds between two saves, more where saving takes long; 0: after every step. A window that waits
+for the run shows the newest recording."""
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,20 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
+from progdf.gdf.file import Gdf
 from viewer.files.document import Document
 from viewer.render.engine import ViewEngine
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.window import Window, interruptible
 
 from .file_actions import FileActions
 from .main_view import MainView
+from .studio.deliver_actions import DeliverActions
+from .studio.preview_actions import PreviewActions
+from .studio.start_actions import StartActions
+from .studio.training_actions import TrainingActions
 
 SIZE = (1280, 800)
 
@@ -85,6 +90,12 @@ class App:
             self.context, self.engine, document.facts(), state, window.ui_scale, pictures
         )
         self.file_actions = FileActions(self, session, memory)
+        self.training = TrainingActions(self, memory)
+        self.deliver = DeliverActions(self)
+        self.start = StartActions(self, self.context, self.deliver.deliveries, memory)
+        self.preview = PreviewActions(
+            self, self.context, lambda form, folder: self.training.region_spec(form, folder, "preview")
+        )
         self.is_closed = False
         self._title = ""
         self.dropped: list[Path] = []
@@ -93,6 +104,11 @@ class App:
         window.listen(self.main_view.wake, self._queue_dropped, self._redraw)
 
     def close(self) -> None:
+        self._keep_picture()
+        self.deliver.close()
+        self.start.close()
+        self.preview.close()
+        self.training.close()
         self.file_actions.release()
         self.main_view.ui.make_current()
         imgui.backends.glfw_shutdown()
@@ -135,13 +151,19 @@ class App:
         for request in self.main_view.take_requests():
             if request == "full_screen":
                 self.window.toggle_full_screen()
-            else:
+            elif not any(part.handle(request) for part in (self.training, self.deliver, self.start)):
                 self.file_actions.handle(request)
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
-        choosing = self.file_actions.poll_dialog()  # first: what was chosen wakes the main view
-        return choosing, self.main_view.next_frame_delay(), self.file_actions.autosave(time.perf_counter())
+        # first: what was chosen, or trained, wakes the main view
+        looks = [part.poll() for part in (self.training, self.preview, self.deliver, self.start)]
+        return (
+            self.file_actions.poll_dialog(),
+            *looks,
+            self.main_view.next_frame_delay(),
+            self.file_actions.autosave(time.perf_counter()),
+        )
 
     def _redraw(self) -> None:
         try:
@@ -161,12 +183,27 @@ class App:
         """A dropped or chosen file, by what it is."""
         self.file_actions.open(path)
 
-    def show(self, document: Document) -> None:
-        """Draw another document from now on; the state is the caller's to change."""
-        engine = self._engine(document)
+    def show(
+        self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
+    ) -> None:
+        """Draw another document from now on; the state is the caller's to change.
+
+        Args:
+            live: what is being trained of its edits
+            layers: that show them on top
+        """
+        facts = self.main_view.facts if document is self.document else document.facts()
+        if document.path != self.document.path:
+            self._keep_picture()
+        engine = self._engine(document, live)
         self.engine.release()
         self.document, self.engine = document, engine
-        self.main_view.set_engine(engine, document.facts())
+        self.main_view.set_engine(engine, facts, layers)
+
+    def _keep_picture(self) -> None:
+        """For the start page, of what is on screen."""
+        view = self.main_view.work.view
+        self.start.keep_picture(self.engine, view, self.document.path, self.file_actions.path)
 
     def _rename(self) -> None:
         """The title bar says what is open, and with a dot that there are unsaved changes."""
@@ -175,8 +212,9 @@ class App:
             self.window.rename(title)
             self._title = title
 
-    def _engine(self, document: Document) -> ViewEngine:
-        return ViewEngine(self.context, document.scene, document.gdfs, self._draw, self._edit_pass)
+    def _engine(self, document: Document, live: tuple[Gdf, ...] = ()) -> ViewEngine:
+        gdfs = (*document.gdfs, *live)
+        return ViewEngine(self.context, document.scene, gdfs, self._draw, self._edit_pass)
 
     def leave(self) -> None:
         """Close the window, without a question."""
@@ -185,4 +223,4 @@ class App:
 
 
 def _window_title(name: str, unsaved: bool = False) -> str:
-    return f"{workspace.UNSAVED * unsaved}{name} – ProGDF Studio"
+    return f"{workspace.UNSAVED * unsaved}{name} – ProGDF Studio" if name else "ProGDF Studio"

@@ -18,8 +18,11 @@ from viewer.ui.context import PALETTE, SMALL_PX, Rgba, UiContext
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, section, small, tip
 
+from .studio import deliver_fields
+
 WIDTH_PX = 520.0  # at 1×
 _POPUP = "##dialog"
+_LOG_CHARACTERS = 20_000
 TITLES = {
     "save": "Save session",
     "open": "Open",
@@ -27,6 +30,12 @@ TITLES = {
     "leave": "Unsaved changes",
     "overwrite": "File already exists",
     "restore": "Recover unsaved work?",
+    "training": "Training is not finished",
+    "log": "Training log",
+    "export": "Export the edited scene",
+    "render_picture": "Render picture",
+    "render_film": "Render film",
+    "about": "About",
 }
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
@@ -35,9 +44,23 @@ _HINTS = {
     "leave": "Save changes to {}?",
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
     "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
+    "training": "{} is being trained. A run that is stopped can go on when the scene is opened again.",
+    "log": "{}",
+    "export": "A plain 3DGS .ply of what the sliders show, which any viewer opens.",
+    "render_picture": "This view at any size.",
+    "render_film": "It is rendered beside your work; the panel shows how far it is.",
+    "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }
-_SUBMIT = {"save": "Save", "open": "Open", "replace": "Replace"}
+_SUBMIT = {
+    "save": "Save",
+    "open": "Open",
+    "replace": "Replace",
+    "export": "Export",
+    "render_picture": "Render",
+    "render_film": "Render",
+}
 """The button of each question that has a path field."""
+_DELIVERS = ("export", "render_picture", "render_film")
 
 
 @dataclass(frozen=True)
@@ -51,6 +74,9 @@ class _Button:
 _CHOICES = {
     "leave": (_Button("Save", ("Enter", "S")), _Button("Discard", ("D",)), _Button("Cancel")),
     "overwrite": (_Button("Rename…", ("Enter", "R")), _Button("Replace"), _Button("Cancel")),
+    "training": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
+    "log": (_Button("Close", ("Enter",)),),
+    "about": (_Button("Close", ("Enter",)),),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }
 
@@ -105,10 +131,17 @@ def _content(
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
+    if dialog.chosen and dialog.kind in _DELIVERS:
+        dialog = replace(dialog, text=dialog.chosen, chosen="")  # there may be more to choose
     if dialog.chosen:
         return _submit(dialog, dialog.chosen)
     if dialog.kind in _CHOICES:
         _is_new(dialog.kind)
+        if dialog.kind == "log":
+            _log(Path(dialog.text), bottom, ui)
+        if dialog.kind == "about":
+            _wrapped_text(dialog.text, PALETTE.text)
+            imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
         imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
@@ -130,7 +163,11 @@ def _content(
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
         _wrapped_text(escape_text(dialog.error), PALETTE.error)
-    if dialog.kind != "save":
+    if dialog.options is not None and dialog.kind in ("render_picture", "render_film"):
+        kind = dialog.kind.removeprefix("render_")
+        text, options = deliver_fields.draw(kind, dialog.text, dialog.options, ui)
+        dialog = replace(dialog, text=text, options=options)
+    if dialog.kind in ("open", "replace"):
         fitting = [path for path in recent if dialog.kind == "open" or path.suffix == ".gdf"]
         chosen = _recent(fitting, bottom, ui)
         if chosen is not None:
@@ -158,6 +195,8 @@ def _submit(dialog: Dialog, path: str) -> Answer:
     """The file that was asked for."""
     if dialog.kind == "save":
         return Answer(replace(dialog, text=path, chosen=""), (f"save_to:{path}",))
+    if dialog.kind in _DELIVERS:
+        return Answer(replace(dialog, text=path), (f"deliver:{dialog.kind}",))
     if dialog.kind == "replace":
         return Answer(None, (f"replace_by:{dialog.then}:{path}",))
     return Answer(None, (f"open_file:{path}",))
@@ -193,6 +232,8 @@ def _answer(dialog: Dialog, button: str) -> Answer:
             return Answer(dialog, (f"overwrite:{path}",))
         case "overwrite", "Rename…":
             return Answer(Dialog("save", path, dialog.then))
+        case "training", "Stop and quit":
+            return Answer(None, ("stop_and_quit",))
         case "restore", "Restore":
             return Answer(None, (f"restore_autosave:{path}",))
         case "restore", "Discard":
@@ -221,6 +262,29 @@ def _recent(recent: Sequence[Path], bottom: float, ui: UiContext) -> Path | None
         imgui.pop_font()
     imgui.end_child()
     return chosen
+
+
+def _log(path: Path, bottom: float, ui: UiContext) -> None:
+    """The end of what a run said."""
+    try:
+        text = path.read_text("utf-8", "replace")[-_LOG_CHARACTERS:]
+    except OSError as error:
+        text = error.strerror or str(error)
+    tall = max(min(260.0 * ui.scale, bottom - imgui.get_cursor_screen_pos().y - 60.0 * ui.scale), 40.0)
+    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.scrim))
+    padded = imgui.ChildFlags_.always_use_window_padding.value
+    imgui.begin_child("log", imgui.ImVec2(0.0, tall), padded)
+    _wrapped_text(_escape_lines(text), PALETTE.text)
+    if imgui.is_window_appearing():
+        imgui.set_scroll_here_y(1.0)
+    imgui.end_child()
+    imgui.pop_style_color()
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+
+
+def _escape_lines(text: str) -> str:
+    """Text whose lines stay lines."""
+    return "\n".join(escape_text(line) for line in text.splitlines())
 
 
 def _buttons(names: Sequence[str], ui: UiContext) -> str | None:

@@ -157,6 +157,8 @@ class FileActions:
         self._browser.close()
 
     def _open(self, path: Path, kind: str) -> None:
+        if self._app.main_view.at_start and kind in ("cameras", "timeline", "gdf"):
+            raise ProgdfError(f"{path.name} belongs to a scene; open that first")
         if kind == "cameras":
             view_actions.look_through(self._app.main_view, path)
             return

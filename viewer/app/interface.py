@@ -9,6 +9,7 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from viewer.panel import brush, panel, timeline_bar
+from viewer.panel.new_edit_form import FormInput
 from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_labels import Labels
 from viewer.select import outline
@@ -24,13 +25,20 @@ from .mouse import MouseTool
 
 
 def panels(
-    work: Workspace, pointer: PointerContext, cards: tuple[SnapshotCard, ...], reveal: bool
+    work: Workspace,
+    pointer: PointerContext,
+    cards: tuple[SnapshotCard, ...],
+    reveal: bool,
+    preview: tuple[str, bool],
+    recent: Sequence[Path] = (),
 ) -> Workspace:
     """The panel and, where it is shown, the timeline.
 
     Args:
         cards: of the snapshots
         reveal: scroll to the focused layer
+        preview: what is said of the picture of a new edit, and whether it failed
+        recent: files opened before, the last one first
     """
     facts, past = pointer.facts, work.past
     shown = panel.PanelInput(
@@ -45,16 +53,29 @@ def panels(
         work.renaming,
         cards,
         obstacle(facts.recordings),
+        work.form if work.form_open else None,
+        _form_input(work, facts.count, preview),
+        work.jobs,
+        work.deliveries,
+        recent,
     )
     result = panel.draw(work.view, shown, pointer.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
-    work = replace(work, overlap=result.overlap, pointed=result.pointed)
+    form = result.form or work.form
+    work = replace(work, overlap=result.overlap, pointed=result.pointed, form=form)
     work = _perform(work, result.actions, pointer)
     if work.player.shown:
         work = _perform(
             work, timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui), pointer
         )
     return work
+
+
+def _form_input(work: Workspace, count: int, preview: tuple[str, bool]) -> FormInput:
+    """What the form of a new edit offers."""
+    selection = work.view.selection
+    regions = tuple((region.name, region.count) for region in selection.regions)
+    return FormInput(count, selection.count, regions, *preview)
 
 
 def over_picture(

@@ -24,8 +24,9 @@ from viewer.render.engine import ViewEngine, drawn_size
 from viewer.select import hand
 from viewer.state import playback, workspace
 from viewer.state.actions import perform
+from viewer.state.recordings import RecordingFile
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
@@ -36,6 +37,8 @@ from . import interface, mouse
 from .canvas import Canvas
 from .mouse import MouseTool
 from .pending_keys import PendingKeys
+from .studio import cover, start_page
+from .studio.cover import Cover
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
 
@@ -64,6 +67,10 @@ class MainView:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
         self.canvas = Canvas(context, engine, facts.recordings)
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
+        self.recent_files: tuple[start_page.RecentFile, ...] = ()  # those of the start page
+        self.cover: Cover | None = None  # what lies over the picture
+        self.preview_said = ("", False)  # of the picture of a new edit, and whether it failed
+        self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self.work = workspace.new_workspace(view)
@@ -90,11 +97,15 @@ class MainView:
         self.ui.close()
         self.canvas.release()
 
-    def set_engine(self, engine: ViewEngine, facts: SceneFacts) -> None:
-        """Draw with another engine from now on (the scene or its edits have changed)."""
+    def set_engine(self, engine: ViewEngine, facts: SceneFacts, live: tuple[LayerState, ...] = ()) -> None:
+        """Draw with another engine from now on (the scene or its edits have changed).
+
+        Args:
+            live: layers of what is being trained; the engine has their edits after those of the facts
+        """
         self.canvas.release()
-        self.engine, self.facts = engine, facts
-        self.canvas = Canvas(self.context, engine, facts.recordings)
+        self.engine, self.facts, self.live = engine, facts, live
+        self.canvas = Canvas(self.context, engine, (*facts.recordings, *(RecordingFile() for _ in live)))
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -132,7 +143,8 @@ class MainView:
         self.ui.make_current()
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
-        overlay.banner(f"Opening {self.facts.title} …", self._area(), self.ui)
+        if not self.at_start:
+            overlay.banner(f"Opening {self.facts.title} …", self._area(), self.ui)
         imgui.render()
         screen.use()
         screen.clear(*self.work.view.background)
@@ -185,6 +197,11 @@ class MainView:
         self._save_files(screen, size)
 
     @property
+    def at_start(self) -> bool:
+        """Whether nothing is open, so that the start page is shown."""
+        return not self.facts.title
+
+    @property
     def opening(self) -> bool:
         """Whether a text field was asked for and has no keyboard yet: what is typed now would be lost."""
         return not self._resting and self._pending.opening
@@ -192,7 +209,7 @@ class MainView:
     def _area(self) -> overlay.Area:
         """The part of the window that shows the picture."""
         display = imgui.get_io().display_size
-        wide = panel.width(self.ui) if self.work.view.panel else 0.0
+        wide = panel.width(self.ui) if self.work.view.panel and not self.at_start else 0.0
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
@@ -205,8 +222,14 @@ class MainView:
         self._tool = replace(self._tool, gesture=gesture)
         asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
         for action in inputs.requested_actions(self._keys):
+            if self.at_start and action not in start_page.KEYS:
+                continue
             if not asks or action in ("picture", "window_picture"):
                 self._perform(action)
+        if self.at_start:
+            for action in start_page.draw(self.recent_files, self.ui):
+                self._perform(action)
+            return
         if inputs.is_flying(self._keys):
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
@@ -215,7 +238,9 @@ class MainView:
             cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
             if missing:
                 self.wake()
-            self.work = interface.panels(self.work, self._pointer(), cards, reveal)
+            self.work = interface.panels(
+                self.work, self._pointer(), cards, reveal, self.preview_said, self.recent
+            )
             self._revealed = self.work.focus
         if not off:  # else the right button has said all it was pressed for
             self._tool, self.work = mouse.handle_mouse(self._tool, self.work, self._pointer())
@@ -235,7 +260,10 @@ class MainView:
         return PointerContext(self.engine, self.facts, self._shown_view(), self._area(), self.ui, self._clock)
 
     def _shown_view(self) -> ViewState:
-        return workspace.original(self.work.view) if inputs.holds_original(self._keys) else self.work.view
+        if inputs.holds_original(self._keys):
+            return workspace.original(self.work.view)
+        view = self.work.view
+        return replace(view, layers=(*view.layers, *self.live)) if self.live else view
 
     def _is_held(self) -> bool:
         """Whether the user holds something that moves the picture, or a film plays."""
@@ -249,6 +277,8 @@ class MainView:
         pressed = [press.chord for press in self._keys.pressed]
         self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
         original = inputs.holds_original(self._keys)
+        if self.cover is not None and not original:
+            cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         said = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(self.work, pointer, self._tool, said, figures, original)

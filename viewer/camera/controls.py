@@ -246,9 +246,13 @@ KEYS = (
     KeyBinding("Shift+F2", "window_picture", "save the whole window as PNG"),
     KeyBinding("F3", "snapshot", "add a snapshot of the sliders"),
     KeyBinding("F4", "camera", "save this view as a camera"),
+    KeyBinding("Ctrl+N", "new_edit", "new edit"),
     KeyBinding("Ctrl+S", "save", "save the session"),
     KeyBinding("Ctrl+Shift+S", "save_as", "save the session as"),
     KeyBinding("Ctrl+O", "open", "open a session, scene or edit"),
+    KeyBinding("Ctrl+E", "export", "export the edited scene as .ply"),
+    KeyBinding("Ctrl+P", "render_picture", "render a picture"),
+    KeyBinding("Ctrl+Shift+P", "render_film", "render a film"),
     KeyBinding("F10", "overlay", "show timings"),
     KeyBinding("Shift+F10", "dynamic_resolution", "dynamic resolution: auto, on, off"),
     KeyBinding("F11", "full_screen", "full screen"),
@@ -257,7 +261,7 @@ KEYS = (
 )
 
 
-OPENS_TEXT = ("rename", "save", "save_as", "open")
+OPENS_TEXT = ("rename", "save", "save_as", "open", "export", "render_picture", "render_film")
 """Actions after which one types."""
 
 

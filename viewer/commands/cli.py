@@ -17,12 +17,14 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.io.atomic import atomic_write
 from progdf.terminal import print_line
 from viewer.camera.view_camera import first_camera
+from viewer.files.document import empty
 from viewer.render.threads import one_thread
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
+from viewer.state.view_state import ViewState
 
 from . import arguments, opening
-from .options import ExportOptions, ViewOptions
+from .options import NO_SCENE, ExportOptions, ViewOptions
 
 
 @one_thread()
@@ -31,11 +33,13 @@ def view(argv: Sequence[str]) -> int:
     options = parse_options(
         ViewOptions, arguments.join_arguments(opening.drop_option_name(argv)), "progdf view"
     )
-    found = opening.open_stack(options)
+    found = (
+        opening.open_stack(options) if options.scene != NO_SCENE else opening.OpenStack(empty(), ViewState())
+    )
     from viewer.app.app import run  # imgui and glfw, which render and export do without
 
     state = found.view
-    if found.session is None:
+    if found.session is None and options.scene != NO_SCENE:
         state = replace(state, camera=first_camera(found.document.scene, up=found.up))
     return run(
         found.document,

@@ -19,6 +19,9 @@ Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
+NO_SCENE = Path()
+"""What stands for the scene where none is given."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class StackOptions:
@@ -59,7 +62,10 @@ class PictureOptions(StackOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(PictureOptions):
-    """Open the window: the splats, one slider per edit."""
+    """Open the window: the splats, one slider per edit. Without a scene it opens on a start page."""
+
+    scene: Scene = NO_SCENE
+    """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +82,8 @@ class RenderOptions(PictureOptions):
     """What fills the picture: an edit's region, or the whole scene; else what stands in the scene."""
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
     """Pixels; else the camera's own, or 640x480."""
+    alpha: bool = False
+    """A transparent background, in a .png."""
     sweep: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Move this edit's slider from 0 to 1 and back: an animation."""
     sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]|N")] = None

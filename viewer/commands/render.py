@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,6 +22,7 @@ from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
+from viewer.pictures.transparent import transparent_image
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
@@ -31,6 +34,7 @@ from .camera_arguments import choose_camera
 from .opening import OpenStack
 from .options import RenderOptions
 
+_SAY_EVERY_S = 0.5
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 """Options that each say what the picture is; only a timeline goes with a sheet."""
 
@@ -48,12 +52,14 @@ def render(argv: Sequence[str]) -> int:
     arguments.check_not_an_input(options.out, found.files)
     scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
     view = replace(view, compare=_comparison(options, view.compare))
+    if options.alpha and (view.compare.mode != "off" or one_moves or options.timeline is not None):
+        raise ProgdfError("--alpha goes with a single picture; leave out comparisons, sheets and films")
     saved = None if found.session is None else view.camera
     camera = choose_camera(options, scene, gdfs, size, saved, found.up)
     if options.timeline is not None:
         keys, count = _keys(options, found), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
-            print_line(timeline_film.write(options.out, keys, view, camera, engine, count))
+            print_line(timeline_film.write(options.out, keys, view, camera, engine, count, _say_frames()))
         return 0
     swept = _swept_layers(options, found)
     with _engine(scene, gdfs, options) as engine:
@@ -97,6 +103,11 @@ def _render_still(
     options: RenderOptions, found: OpenStack, view: ViewState, camera: Camera, engine: ViewEngine
 ) -> str:
     """One picture, compared as `view` asks; gives what to say about the comparison."""
+    if options.alpha:
+        picture = Image.fromarray(transparent_image(engine, view, camera))
+        with atomic_write(options.out) as temporary_file:
+            picture.save(temporary_file, pnginfo=camera_chunk(camera))
+        return ""
     where = found.document.recordings()
     missing = recordings.obstacle(where)
     if view.compare.mode != "off" and view.compare.against == "recorded" and missing:
@@ -198,6 +209,19 @@ def _describe_engine(engine: ViewEngine) -> str:
     """The engine in words, with its edit pass if that had a part in the picture, or why it had none."""
     edits = engine.edits()
     return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.description}"
+
+
+def _say_frames() -> timeline_film.Advance:
+    """Tells a log, now and then, how far a film is; terminals see the result soon enough."""
+    last = time.monotonic()
+
+    def say(done: int, total: int) -> None:
+        nonlocal last
+        if not sys.stderr.isatty() and time.monotonic() - last >= _SAY_EVERY_S:
+            last = time.monotonic()
+            print(f"frame {done}/{total}", file=sys.stderr, flush=True)
+
+    return say
 
 
 def _check_output(options: RenderOptions) -> None:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import torch
+
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
@@ -24,7 +26,7 @@ class Document:
     """The scene and its edits, in the order of `LayerState.gdf`.
 
     Args:
-        title: the scene's name
+        title: the scene's name; "" where nothing is open
         scene: the original
         gdfs: its edits
         path: the scene's file; None where there is none, and so no session can be saved
@@ -65,6 +67,20 @@ class Document:
         while free in taken:
             free, number = f"{name}-{number}", number + 1
         return free
+
+
+def empty() -> Document:
+    """No document yet: one splat that nothing shows, and no title."""
+    row = torch.zeros(1, 3)
+    unseen = Gaussians(
+        row,
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        row - 5.0,
+        torch.tensor([-20.0]),
+        row,
+        row[:, None, :][:, :0],
+    )
+    return Document("", unseen)
 
 
 def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:

@@ -44,18 +44,23 @@ class CardsResult:
     actions: tuple[str, ...] = ()
 
 
-def heading(state: ViewState, ui: UiContext) -> ViewState:
-    """The heading of the stack: overshoot, and the blend rule where there is something to blend."""
+def heading(state: ViewState, form_open: bool, ui: UiContext) -> tuple[ViewState, str]:
+    """The heading of the stack: a new edit, overshoot, and the blend rule where there is something to blend.
+
+    The action that was asked for comes with the state, "" for none.
+    """
     right = right_edge()
     section("Edits", ui)
+    imgui.same_line(0.0, 8.0 * ui.scale)
+    action = _new_button(form_open)
     if not state.layers:
-        return state
+        return state, action
     combo = 118.0 * ui.scale if len(state.layers) > 1 else 0.0
     wide = 40.0 * ui.scale
     imgui.same_line(right - combo - wide - (6.0 * ui.scale if combo else 0.0))
     state = _overshoot(state, wide)
     if not combo:
-        return state
+        return state, action
     imgui.same_line(right - combo)
     imgui.set_next_item_width(combo)
     if imgui.begin_combo("##blend", state.blend.capitalize()):
@@ -66,7 +71,17 @@ def heading(state: ViewState, ui: UiContext) -> ViewState:
         imgui.end_combo()
     else:
         tip("Where edits overlap (M): " + BLEND_HELP[state.blend])
-    return state
+    return state, action
+
+
+def _new_button(form_open: bool) -> str:
+    imgui.push_style_color(
+        imgui.Col_.button, imgui.ImVec4(*(PALETTE.accent_dark if form_open else PALETTE.field))
+    )
+    pressed = imgui.button("+ New##edit")
+    imgui.pop_style_color()
+    tip("New edit (Ctrl+N): choose a region and an editor, see it, train it")
+    return "new_edit" if pressed else ""
 
 
 def _overshoot(state: ViewState, width: float) -> ViewState:
@@ -85,11 +100,11 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
     return state
 
 
-def draw(state: ViewState, cards: Cards, ui: UiContext) -> CardsResult:
-    """All cards."""
-    if not state.layers:
+def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) -> CardsResult:
+    """All cards. `expected`: layers are about to come."""
+    if not state.layers and not expected:
         imgui.push_text_wrap_pos(0.0)
-        imgui.text_disabled("No edits loaded. Drop a .gdf file on the window.")
+        imgui.text_disabled("No edits yet. Make a new one (Ctrl+N), or drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
     focus, renaming, overlap = cards.focus, None, None
     pointed: Pointed | None = None

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from imgui_bundle import imgui
 
 from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import ViewCamera
+from viewer.jobs.delivery import Delivery
+from viewer.jobs.new_edit import NewEdit
+from viewer.jobs.training_job import TrainingJob
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
 from viewer.state.workspace import Pointed
@@ -27,7 +31,18 @@ from viewer.ui.widgets import (
     tip,
 )
 
-from . import brush, layer_card, layer_cards, region_rows, selection_section, snapshot_cards
+from . import (
+    brush,
+    layer_card,
+    layer_cards,
+    main_menu,
+    new_edit_form,
+    region_rows,
+    selection_section,
+    snapshot_cards,
+    training_cards,
+)
+from .new_edit_form import FormInput
 from .snapshot_cards import SnapshotCard
 
 WIDTH_PX = 300.0  # at 1×
@@ -55,6 +70,11 @@ class PanelInput:
         active_slider: which of `stack.SLIDERS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
         unrecorded: why there is nothing recorded to compare with, "" where there is
+        form: of a new edit; None while it is closed
+        form_input: what that form shows
+        jobs: what is being trained
+        deliveries: what is being exported and rendered
+        recent: files opened before, the last one first
     """
 
     title: str
@@ -68,6 +88,11 @@ class PanelInput:
     renaming: int | None = None
     snapshots: tuple[SnapshotCard, ...] = ()
     unrecorded: str = ""
+    form: NewEdit | None = None
+    form_input: FormInput = FormInput()
+    jobs: Sequence[TrainingJob] = ()
+    deliveries: Sequence[Delivery] = ()
+    recent: Sequence[Path] = ()
 
 
 @dataclass(frozen=True)
@@ -85,6 +110,7 @@ class PanelResult:
     renaming: int | None = None
     overlap: int | None = None
     pointed: Pointed | None = None
+    form: NewEdit | None = None
 
 
 def width(ui: UiContext) -> float:
@@ -109,12 +135,19 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         | flags.no_scroll_with_mouse.value,
     )
     actions: list[str] = []
-    _title(shown, ui)
+    actions += _title(shown, ui)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     _begin_body(footer)
-    state = layer_cards.heading(state, ui)
+    state, asked = layer_cards.heading(state, shown.form is not None, ui)
+    actions += [asked] if asked else []
+    form = shown.form
+    if form is not None:
+        form, asked = new_edit_form.draw(form, shown.form_input, ui)
+        actions += [asked] if asked else []
+    actions += training_cards.draw(shown.jobs, ui)
+    actions += training_cards.draw_deliveries(shown.deliveries, ui)
     cards = layer_card.Cards(shown.rows, shown.focus, shown.reveal, shown.active_slider, shown.renaming)
-    drawn = layer_cards.draw(state, cards, ui)
+    drawn = layer_cards.draw(state, cards, ui, bool(shown.jobs) or form is not None)
     state, focus = drawn.state, drawn.focus
     actions += drawn.actions
     if state.brush.active:
@@ -127,9 +160,8 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     _end_body()
     _footer(state, shown, ui, actions)
     imgui.end()
-    return PanelResult(
-        state, focus, tuple(actions), drawn.renaming, drawn.overlap, drawn.pointed or selected or region
-    )
+    pointed = drawn.pointed or selected or region
+    return PanelResult(state, focus, tuple(actions), drawn.renaming, drawn.overlap, pointed, form)
 
 
 def _begin_body(footer: float) -> None:
@@ -158,13 +190,20 @@ def _end_body() -> None:
     imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
 
 
-def _title(shown: PanelInput, ui: UiContext) -> None:
+def _title(shown: PanelInput, ui: UiContext) -> list[str]:
+    """The scene's name and size, and the menu at the right of both; what was chosen there."""
+    at, side = imgui.get_cursor_pos(), imgui.get_frame_height()
     imgui.push_font(ui.fonts.bold, 0.0)
     room = imgui.get_content_region_avail().x
-    imgui.text(elide(shown.title, room))
+    imgui.text(elide(shown.title, room - side))
     imgui.pop_font()
-    small(f"{group_digits(shown.count)} splats", PALETTE.dim)
+    small(f"{group_digits(shown.count)} splats", PALETTE.dim, room - side)
+    below = imgui.get_cursor_pos()
+    imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
+    actions = main_menu.button(shown.recent, ui)
+    imgui.set_cursor_pos(below)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    return actions
 
 
 def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) -> ViewState:

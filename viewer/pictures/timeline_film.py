@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import torch
@@ -19,6 +19,8 @@ from viewer.state import timeline
 from viewer.state.view_state import Timeline, ViewState
 
 from . import film
+
+Advance = Callable[[int, int], None]
 
 MOST_SHOWN = 100
 """Pictures of a contact sheet."""
@@ -76,9 +78,17 @@ def sheet(shown: Timeline, view: ViewState, still: Camera, engine: ViewEngine, c
 
 
 def write(
-    out: Path, shown: Timeline, view: ViewState, still: Camera, engine: ViewEngine, count: int = 0
+    out: Path,
+    shown: Timeline,
+    view: ViewState,
+    still: Camera,
+    engine: ViewEngine,
+    count: int = 0,
+    advance: Advance | None = None,
 ) -> str:
     """Write the film: .gif, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
+
+    `advance` hears how many frames of how many are drawn.
 
     Returns:
         A line that tells what was written.
@@ -94,11 +104,18 @@ def write(
         count = len(sheet_frames(shown, count))
         return f"wrote {out} ({count} pictures of {size}, drawn by {engine.draws_with})"
     check_output(out)
-    drawn = frames(shown, view, still, engine, timeline.film_frames(shown))
+    total = sum(1 for _ in timeline.film_frames(shown))
+    drawn = _counted(frames(shown, view, still, engine, timeline.film_frames(shown)), total, advance)
     if out.suffix:
         with atomic_write(out) as temporary_file:
             film.write_film(temporary_file, drawn, shown.fps)
     else:
         film.write_sequence(out, drawn)
-    count = sum(1 for _ in timeline.film_frames(shown))
-    return f"wrote {out} ({count} frames of {size}, {shown.fps} a second, drawn by {engine.draws_with})"
+    return f"wrote {out} ({total} frames of {size}, {shown.fps} a second, drawn by {engine.draws_with})"
+
+
+def _counted(drawn: Iterable[film.Pixels], total: int, advance: Advance | None) -> Iterator[film.Pixels]:
+    for done, picture in enumerate(drawn, 1):
+        yield picture
+        if advance is not None:
+            advance(done, total)

@@ -14,6 +14,7 @@ import numpy as np
 from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
+from viewer.jobs.new_edit import ALL, SELECTION, TYPED
 from viewer.state import comparison as compare
 from viewer.state import history, paint, playback, selection, snapshots
 from viewer.state import layers as stack
@@ -300,9 +301,22 @@ def _snapshot(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, snapshots=snapshots.take(workspace.snapshots, workspace.view))
 
 
+def _new_edit(workspace: Workspace, _: str) -> Workspace:
+    """Open the form of a new edit, of what is selected where something is; or close it."""
+    form, selection = workspace.form, workspace.view.selection
+    known = (ALL, TYPED, *(region.name for region in selection.regions))
+    if selection.count:
+        form = replace(form, region=SELECTION)
+    elif form.region not in known:
+        form = replace(form, region=ALL)
+    return replace(workspace, form=replace(form, error=""), form_open=not workspace.form_open)
+
+
 REQUESTS = (
     *("picture", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
+    *("train", "stop_run", "resume_run", "discard_run", "run_log", "stop_and_quit"),
+    *("export", "render_picture", "render_film", "deliver", "stop_delivery", "about", "demo"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
     *("save_region", "rename_region"),
 )
@@ -349,6 +363,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
     "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),
     "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
+    "new_edit": _new_edit,
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
     **{name: _timeline_action(name) for name in playback.ACTIONS},

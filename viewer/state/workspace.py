@@ -12,6 +12,9 @@ from dataclasses import dataclass, replace
 from progdf.scene.neighborhood import Neighborhood
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
+from viewer.jobs.delivery import DeliverOptions, Delivery
+from viewer.jobs.new_edit import NewEdit
+from viewer.jobs.training_job import TrainingJob
 
 from . import history, playback, timeline
 from .history import Edit, History
@@ -77,6 +80,7 @@ class Dialog:
         choosing: that dialog is on screen
         chosen: the file that was chosen in it
         error: why the path did not serve, one line, "" where it was not tried
+        options: of a picture or film that is asked for
     """
 
     kind: str
@@ -86,6 +90,7 @@ class Dialog:
     choosing: bool = False
     chosen: str = ""
     error: str = ""
+    options: DeliverOptions | None = None
 
 
 Pointed = tuple[str, int]
@@ -112,6 +117,10 @@ class Workspace:
         player: the playhead of `view.timeline`
         overlap: the layer of which the panel asks to see what it shares with the others, or None
         pointed: what else the mouse rests on in the panel, to be seen in the picture
+        form: of a new edit, as it was last left
+        form_open: whether it is shown
+        jobs: what is being trained, or waits for that, as the window last looked
+        deliveries: what is being exported and rendered
     """
 
     view: ViewState
@@ -129,6 +138,10 @@ class Workspace:
     player: Player = Player()
     overlap: int | None = None
     pointed: Pointed | None = None
+    form: NewEdit = NewEdit()
+    form_open: bool = False
+    jobs: tuple[TrainingJob, ...] = ()
+    deliveries: tuple[Delivery, ...] = ()
 
 
 def new_workspace(view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> Workspace:

@@ -69,6 +69,11 @@ class Icon:
     SPHERE = icons.ICON_FA_GLOBE
     FLOOD = icons.ICON_FA_WAND_MAGIC_SPARKLES
     COLOR = icons.ICON_FA_EYE_DROPPER
+    CLOSE = icons.ICON_FA_XMARK
+    TRAIN = icons.ICON_FA_PLAY
+    DELETE = icons.ICON_FA_TRASH
+    BARS = icons.ICON_FA_BARS
+    OPEN = icons.ICON_FA_FOLDER_OPEN
 
 
 @dataclass(frozen=True)

@@ -62,11 +62,12 @@ class Browser:
             return replace(dialog, notice=missing)
         self.close()
         path = Path(dialog.text or near).expanduser().absolute()
-        if dialog.kind != "save":
+        if dialog.kind in ("open", "replace"):
             folder = path if path.is_dir() else path.parent
             self._shown = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
         else:
-            self._shown = dialogs.save_file("Save session", escape_text(str(path)), _SAVE)
+            filters = _SAVE if dialog.kind == "save" else ["All files", "*"]
+            self._shown = dialogs.save_file("Save", escape_text(str(path)), filters)
         return replace(
             dialog, choosing=True, notice="Choose a file in the system dialog, or type a path here"
         )

@@ -268,7 +268,7 @@ def test_undo_is_grayed_while_there_is_nothing_to_undo(hand: Hand) -> None:
 
 def test_an_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
-    hand.click(SIZE[0] - 65, 231)
+    hand.click(SIZE[0] - 65, 247)
     assert hand.work.view.camera.up == (0.0, 0.0, -1.0)
     assert hand.work.past.past == (), "where one looks from is not in the undo stack"
     hand.ui.close()
@@ -277,7 +277,7 @@ def test_an_up_axis_button_rolls_the_camera_upright() -> None:
 def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
     before = turntable.axes(hand.work.view.camera)
-    hand.click(SIZE[0] - 30, 231)
+    hand.click(SIZE[0] - 30, 247)
     after = turntable.axes(hand.work.view.camera)
     assert hand.work.view.camera.elevation == pytest.approx(0.0)
     for old, new in ((before.up, after.up), (before.right, after.right)):

@@ -1,0 +1,70 @@
+"""`progdf preview`: an editor's own picture of a view, asked for and answered in lines."""
+
+from __future__ import annotations
+
+import io
+import json
+import queue
+import sys
+from pathlib import Path
+
+import pytest
+
+from progdf.__main__ import main
+from progdf.formats.ply import save_ply
+from tests.helpers.demo_scenes import bear
+from trainer.preview import Previewer, answer, newest_line
+from trainer.store.images import read_picture
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("preview") / "bear.ply"
+    save_ply(path, bear(600).gaussians)
+    return path
+
+
+def request(number: int, out: Path, **changes: object) -> str:
+    camera = bear(600).cameras[0].resize(64, 48)
+    asked = {
+        "number": number,
+        "out": str(out / f"{number}.png"),
+        "region": "all",
+        "editor": "recolor:#3060d0",
+        "strength": 1.0,
+        "background": [1, 1, 1],
+        "viewmat": camera.viewmat.tolist(),
+        "K": camera.K.tolist(),
+        "width": 64,
+        "height": 48,
+    }
+    return json.dumps(asked | changes)
+
+
+def test_strength_0_is_the_original_and_1_is_not(scene: Path, tmp_path: Path) -> None:
+    previewer = Previewer(scene, tmp_path / "kept")
+    for number, strength in enumerate((0.0, 0.5, 1.0)):
+        assert answer(previewer, request(number, tmp_path, strength=strength)).error == ""
+    original, half, edited = (read_picture(tmp_path / f"{number}.png") for number in range(3))
+    change = [(picture - original).abs().mean() for picture in (half, edited)]
+    assert 0.0 < float(change[0]) < float(change[1])
+
+
+def test_what_does_not_work_is_one_line_and_the_next_request_does(scene: Path, tmp_path: Path) -> None:
+    previewer = Previewer(scene, tmp_path / "kept")
+    assert "holds no Gaussian" in answer(previewer, request(1, tmp_path, region="sphere:99,99,99,1")).error
+    assert "unknown editor" in answer(previewer, request(2, tmp_path, editor="paint:1")).error
+    assert answer(previewer, "no JSON").number == -1
+    assert answer(previewer, request(3, tmp_path)).error == ""
+
+
+def test_only_the_last_of_several_requests_is_answered() -> None:
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    for line in ("first", "second", "third"):
+        lines.put(line)
+    assert newest_line(lines) == "third"
+
+
+def test_the_command_ends_with_its_input(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    assert main(["preview", str(scene)]) == 0

@@ -1,0 +1,185 @@
+"""New edits in the window, with a trainer that answers at once."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app import app as application
+from viewer.camera.view_camera import first_camera
+from viewer.files import small_pictures
+from viewer.files.document import empty
+from viewer.jobs import delivery, training_queue
+from viewer.jobs.new_edit import SELECTION, TYPED
+from viewer.state import selection
+from viewer.state.view_state import ViewState
+
+pytestmark = pytest.mark.gl
+
+
+class Trainer:
+    """Stands for a child: it runs until it is told to end, and then leaves an edit."""
+
+    said: Sequence[str] = ()
+    ended: int | None = None
+    line = ""
+    edit: Path | None = None
+
+    def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
+        type(self).said = arguments
+        self.log = log
+
+    @property
+    def status(self) -> int | None:
+        if self.ended == 0 and self.edit is not None:
+            out = Path(next(word for word in self.said if word.startswith("--out=")).removeprefix("--out="))
+            out.mkdir(parents=True, exist_ok=True)
+            shutil.copy(self.edit, out / f"{out.name}.gdf")
+        return self.ended
+
+    def stop(self) -> None:
+        type(self).ended = 130
+
+    def close(self) -> None:
+        pass
+
+    def error(self) -> str:
+        return self.line
+
+
+@pytest.fixture
+def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[application.App]:
+    folder = bear_files(tmp_path)
+    monkeypatch.setattr(training_queue, "Child", Trainer)
+    monkeypatch.setattr(delivery, "Child", Trainer)
+    Trainer.ended, Trainer.line, Trainer.edit = None, "", folder / "edits" / "scarf.gdf"
+    with null_app(replace(opened_document(folder), gdfs=(), gdf_paths=()), first_view(bear()), folder) as app:
+        app.main_view.work = replace(
+            app.main_view.work, form=replace(app.main_view.work.form, preview=False, name="blue")
+        )
+        yield app
+
+
+def turn(app: application.App) -> None:
+    """What the window's loop does in a turn."""
+    app._wait_times()
+    app.draw()
+
+
+def request(app: application.App, text: str) -> None:
+    app.main_view.request(text)
+    app.draw()
+    turn(app)
+
+
+def test_an_edit_is_trained_and_comes_as_a_layer_at_full_strength(window: application.App) -> None:
+    press(window, "Ctrl+N")
+    assert window.main_view.work.form_open
+    request(window, "train")
+    assert not window.main_view.work.form_open
+    (job,) = window.main_view.work.jobs
+    assert (job.status, job.order.name) == ("running", "blue")
+    assert "--editor=recolor:#3061d1" in Trainer.said
+    Trainer.ended = 0
+    turn(window)
+    assert window.main_view.work.jobs == ()
+    (layer,) = window.main_view.work.view.layers
+    assert (layer.name, layer.strength) == ("scarf", 1.0)
+    press(window, "Ctrl+Z")
+    assert window.main_view.work.view.layers == ()
+
+
+def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -> None:
+    view, total = window.main_view.work.view, len(window.document.scene)
+    mask = selection.unpack(selection.NOBODY, total).copy()
+    mask[[3, 7]] = True
+    chosen = selection.select(view.selection, mask)
+    window.main_view.work = replace(window.main_view.work, view=replace(view, selection=chosen))
+    press(window, "Ctrl+N")
+    assert window.main_view.work.form.region == SELECTION
+    request(window, "train")
+    assert any(
+        word.startswith("--region=file:") and word.endswith("blue.region.npy") for word in Trainer.said
+    )
+
+
+def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> None:
+    press(window, "Ctrl+N")
+    form = replace(window.main_view.work.form, region=TYPED, typed_region="cube:1")
+    window.main_view.work = replace(window.main_view.work, form=form)
+    request(window, "train")
+    assert window.main_view.work.form_open
+    assert window.main_view.work.form.error.startswith("unknown region 'cube:1'")
+    assert window.main_view.work.jobs == ()
+
+
+def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
+    request(window, "train")
+    Trainer.ended, Trainer.line = 2, "the disk is full"
+    turn(window)
+    (job,) = window.main_view.work.jobs
+    assert (job.status, job.error) == ("failed", "the disk is full")
+    assert window.main_view.work.message is not None
+    assert "the disk is full" in window.main_view.work.message.text
+    request(window, f"run_log:{job.number}")
+    assert window.main_view.work.dialog is not None
+    assert window.main_view.work.dialog.kind == "log"
+    press(window, "Enter")
+    request(window, f"discard_run:{job.number}")
+    assert window.main_view.work.jobs == ()
+
+
+def test_quitting_asks_while_a_training_runs(window: application.App) -> None:
+    request(window, "train")
+    press(window, "Ctrl+Q")
+    assert window.main_view.work.dialog is not None
+    assert window.main_view.work.dialog.kind == "training"
+    press(window, "Enter")
+    assert not window.is_closed
+    press(window, "Ctrl+Q", "S")
+    for _ in range(3):
+        turn(window)
+    assert window.is_closed
+
+
+def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path: Path) -> None:
+    press(window, "Ctrl+E")
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert asked.text == str(tmp_path / "bear_edited.ply")
+    press(window, "Enter")
+    assert window.main_view.work.dialog is None
+    assert Trainer.said[0] == "export"
+    assert Trainer.said[-1] == f"--out={tmp_path / 'bear_edited.ply'}"
+    assert [shown.status for shown in window.main_view.work.deliveries] == ["running"]
+    Trainer.ended = 0
+    turn(window)
+    assert window.main_view.work.deliveries == ()
+    press(window, "Ctrl+Shift+P")
+    assert window.main_view.work.message is not None
+    assert "nothing to move" in window.main_view.work.message.text
+
+
+def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Path) -> None:
+    folder = bear_files(tmp_path)
+    with null_app(empty(), ViewState(), folder) as app:
+        assert app.main_view.at_start
+        press(app, "Ctrl+N", "V")
+        assert not app.main_view.work.form_open, "keys of a scene do nothing here"
+        app.open(folder / "edits" / "scarf.gdf")
+        assert app.main_view.work.message is not None
+        assert app.main_view.work.message.text == "scarf.gdf belongs to a scene; open that first"
+        app.open(folder / "bear.ply")
+        turn(app)
+        assert not app.main_view.at_start
+        assert app.main_view.work.view.camera.distance == first_camera(app.document.scene).distance
+        press(app, "Ctrl+N")
+        assert app.main_view.work.form_open
+    assert small_pictures.load(folder / "bear.ply", folder / "memory") is not None, "for the next start page"

@@ -1,0 +1,103 @@
+"""What new edits, the menu and the start page look like on a software GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from progdf.errors import ProgdfError
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.app.main_view import MainView
+from viewer.app.studio.start_page import RecentFile
+from viewer.files.document import empty
+from viewer.jobs.delivery import DeliverOptions, Delivery
+from viewer.jobs.new_edit import TYPED, NewEdit
+from viewer.jobs.training_job import EditOrder, Progress, TrainingJob
+from viewer.render.engine import ViewEngine
+from viewer.render.headless import headless_context, is_software
+from viewer.state.view_state import ViewState
+from viewer.state.workspace import Dialog
+
+Compare = Callable[[str, np.ndarray], None]
+SMALLEST = (1024, 640)
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture(scope="module", autouse=True)
+def software_gpu() -> None:
+    """As for the other screenshots of the interface."""
+    try:
+        context = headless_context()
+    except ProgdfError as error:
+        pytest.skip(str(error))
+    software = is_software(context)
+    context.release()
+    if not software:
+        pytest.skip("the goldens were drawn by a software GPU")
+
+
+def test_the_start_page_with_files_that_were_open(screenshot: Compare) -> None:
+    context, document = headless_context(), empty()
+    engine = ViewEngine(context, document.scene, (), "cpu")
+    main_view = MainView(context, engine, document.facts(), ViewState())
+    pixels = np.full((252, 336, 3), (96, 120, 150), np.uint8)
+    texture = context.texture((336, 252), 3, pixels.tobytes(), alignment=1)
+    names = ("bear.ply", "garden.session.json", "a scene with a name that is too long.spz")
+    main_view.recent_files = tuple(
+        RecentFile(Path("/scenes") / name, texture.glo * (i < 2)) for i, name in enumerate(names)
+    )
+    try:
+        screenshot("ui_start_page", Rig(main_view, SMALLEST, 1.0).image())
+    finally:
+        main_view.close()
+        engine.release()
+        context.release()
+
+
+def test_the_menu(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.main_view.recent = (Path("/scenes/bear.ply"),)
+        hand.click(999.0, 20.0)
+        hand.move(880.0, 400.0)
+        hand.frame(3)
+        screenshot("ui_menu", hand.image()[:320, 640:])
+
+
+def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7), SMALLEST) as hand:
+        form = NewEdit(
+            TYPED, "sphere:0,0,0,1", editor=5, name="painted", error="the region holds no Gaussian"
+        )
+        hand.main_view.work = replace(hand.main_view.work, form=form)
+        hand.key("Ctrl+N")
+        screenshot("ui_new_edit", hand.image()[:, 700:])
+
+
+def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
+    order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
+    running = TrainingJob(1, order, "running", Progress(0.45, "optimize", "0.0114"), 20.0)
+    line = "region 'sphere:99,99,99,1' holds no Gaussian"
+    jobs = (
+        running,
+        TrainingJob(2, replace(order, name="gold")),
+        TrainingJob(3, replace(order, name="night"), "stopped", Progress(0.6)),
+        TrainingJob(4, replace(order, name="nowhere"), "failed", error=line),
+    )
+    film = Delivery(1, "Rendering film.mp4", Path("/scenes/film.mp4"), done=30, total=96, seconds=10.0)
+    with rig(first_view(bear(), 0.7), SMALLEST) as hand:
+        hand.main_view.work = replace(hand.main_view.work, jobs=jobs, deliveries=(film,))
+        hand.settle()
+        hand.frame(3)
+        screenshot("ui_training", hand.image()[:, 700:])
+
+
+def test_the_question_about_a_film(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7), SMALLEST) as hand:
+        options = DeliverOptions(1280, 720, moves="scarf", can_move=("scarf",))
+        hand.main_view.ask(Dialog("render_film", "/scenes/bear_edited.mp4", options=options))
+        hand.frame(4)
+        screenshot("ui_film", hand.image()[:420, :720])

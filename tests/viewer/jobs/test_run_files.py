@@ -1,0 +1,83 @@
+"""Where the runs of a scene lie, and what is read of them while they run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from progdf.region import Region
+from tests.helpers.ui_rig import bear
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import RunFolder
+from viewer.jobs import run_files
+from viewer.jobs.training_job import EditOrder, Progress
+
+
+def order(folder: Path, name: str = "blue") -> EditOrder:
+    scene = folder / "bear.ply"
+    scene.touch()
+    home = run_files.edits_folder(scene, folder / "memory")
+    return EditOrder(scene.resolve(), run_files.free_run(home, name), name, "all", "recolor:#3060d0")
+
+
+def test_runs_lie_beside_their_scene_or_where_the_user_may_write(tmp_path: Path) -> None:
+    scene = tmp_path / "there" / "bear.ply"
+    scene.parent.mkdir()
+    scene.touch()
+    assert run_files.edits_folder(scene, tmp_path / "memory") == scene.parent / "bear.edits"
+    scene.parent.chmod(0o555)
+    try:
+        elsewhere = run_files.edits_folder(scene, tmp_path / "memory")
+    finally:
+        scene.parent.chmod(0o755)
+    assert elsewhere.parent == tmp_path / "memory" / "edits"
+    assert elsewhere.name.startswith("bear-")
+
+
+def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    run_files.keep_order(asked)
+    assert [*run_files.stopped_orders(asked.out.parent, asked.scene)] == [], "it has not begun"
+    (asked.out / "state").mkdir(parents=True)
+    (asked.out / "state" / "run.json").write_text("{}")
+    assert [*run_files.stopped_orders(asked.out.parent, asked.scene)] == [asked]
+    assert [*run_files.stopped_orders(asked.out.parent, tmp_path / "other.ply")] == []
+    assert order(tmp_path).out.name == "blue-2", "its name is taken"
+    run_files.discard(asked)
+    assert [*asked.out.parent.iterdir()] == []
+
+
+def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    asked.out.mkdir(parents=True)
+    asked.gdf.touch()
+    run_files.discard(asked)
+    assert asked.gdf.exists()
+
+
+def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_path: Path) -> None:
+    asked, scene = order(tmp_path), bear().scene
+    folder = RunFolder(asked.out)
+    assert run_files.read_progress(asked, Progress(0.1)) == Progress(0.1)
+    assert run_files.newest_recording(asked) is None
+    folder.state.path.mkdir(parents=True)
+    log = RunLog(folder.log, quiet=True, progress=folder.progress)
+    with log.steps("optimize", 10) as advance:
+        advance(10, "loss to the edit 0.5")
+    log.close()
+    assert run_files.read_progress(asked, Progress()).loss == "0.5"
+    members = torch.tensor([1, 5])
+    region = Region("blue", members, torch.zeros(len(scene)).index_fill(0, members, 1.0))
+    folder.state.save("region", {"members": region.members, "score": region.score}, {"name": "blue"})
+    offsets = torch.zeros(2, 14)
+    offsets[:, -3:] = 0.25
+    for index in range(2):
+        folder.state.save("recordings", {"offsets": (offsets * index).half()}, {}, index)
+    newest = run_files.newest_recording(asked)
+    assert newest is not None
+    assert newest.name.startswith("000001")
+    edit = run_files.recorded_edit(asked, newest, scene)
+    assert edit is not None
+    assert torch.equal(edit.field.offsets(1.0), offsets)
+    assert run_files.recorded_edit(asked, newest, scene[:10]) is None, "another scene"

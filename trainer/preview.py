@@ -1,0 +1,177 @@
+"""`progdf preview`: an editor's own pictures of views, for the window, by JSON lines in and out.
+
+    {"number": 3, "out": "3.png", "region": "all", "editor": "recolor:#3060d0", "strength": 0.7,
+     "background": [1, 1, 1], "viewmat": [[…]], "K": [[…]], "width": 640, "height": 480}
+    {"number": 3, "error": ""}
+
+Requests that a later one has overtaken are passed over. It ends when its input does.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import torch
+import tyro
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.cli.options import parse_options
+from progdf.errors import ProgdfError
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import Gaussians
+from progdf.io.images import write_image
+from progdf.region import Region
+from progdf.scene.region_spec import parse_region
+from trainer.editors import EditorSettings, ImageEditor, check_new_editor, make_editor
+from trainer.regions.from_pictures import RegionSettings, region_kinds
+from trainer.views.view import View, make_view, with_near_plane
+
+_Row3 = tuple[float, float, float]
+_Row4 = tuple[float, float, float, float]
+_Side = Annotated[int, msgspec.Meta(ge=1, le=4096)]
+
+
+@dataclass(frozen=True)
+class PreviewOptions:
+    """Serve an editor's own pictures of views; for the window."""
+
+    scene: tyro.conf.Positional[Path]
+    """The scene."""
+
+
+class Request(msgspec.Struct, frozen=True):
+    """A picture that is wanted: where it goes, what is edited how, and from where one looks."""
+
+    number: int
+    out: str
+    region: str
+    editor: str
+    strength: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+    background: _Row3
+    viewmat: tuple[_Row4, _Row4, _Row4, _Row4]
+    K: tuple[_Row3, _Row3, _Row3]
+    width: _Side
+    height: _Side
+
+
+class Answer(msgspec.Struct):
+    """The request's number, and why there is no picture; "" where there is."""
+
+    number: int
+    error: str = ""
+
+
+class Previewer:
+    """Pictures of one scene; what two requests have in common is made once.
+
+    Args:
+        path: the scene's file
+        kept: folder for what a learned editor painted
+    """
+
+    def __init__(self, path: Path, kept: Path) -> None:
+        self._path, self._scene = path, load_scene(path)
+        self._settings = EditorSettings(kept=kept)
+        self._region = lru_cache(maxsize=4)(self._find_region)
+        self._view = lru_cache(maxsize=2)(self._make_view)
+        self._editor = lru_cache(maxsize=2)(self._make_editor)
+
+    def picture(self, asked: Request) -> Tensor:
+        """The view as the editor makes it. [H,W,3] 0..1
+
+        Raises:
+            ProgdfError: region or editor do not work, or the view shows nothing of the region.
+        """
+        seen = (asked.region, asked.viewmat, asked.K, (asked.width, asked.height), asked.background)
+        view = self._view(*seen)
+        if not bool((view.mask > 0.0).any()):
+            return view.image
+        return self._editor(asked.editor, *seen).edit(view, asked.strength)
+
+    def _find_region(self, spec: str) -> Region:
+        kinds = region_kinds(RegionSettings(None, 30, _no_masks, quiet=True, scene=self._path))
+        return parse_region(spec, self._scene, kinds=kinds)
+
+    def _make_view(
+        self,
+        region: str,
+        viewmat: tuple[_Row4, ...],
+        K: tuple[_Row3, ...],
+        size: tuple[int, int],
+        background: _Row3,
+    ) -> View:
+        camera = Camera(torch.tensor(viewmat), torch.tensor(K), *size, name="view")
+        camera = with_near_plane([camera], self._scene)[0]
+        return make_view(self._scene, self._region(region), camera, torch.tensor(background))
+
+    def _make_editor(
+        self,
+        editor: str,
+        region: str,
+        viewmat: tuple[_Row4, ...],
+        K: tuple[_Row3, ...],
+        size: tuple[int, int],
+        background: _Row3,
+    ) -> ImageEditor:
+        check_new_editor(editor, self._settings)
+        view = self._view(region, viewmat, K, size, background)
+        return make_editor(editor, self._scene, self._region(region), [view], self._settings)
+
+    @property
+    def scene(self) -> Gaussians:
+        """The original."""
+        return self._scene
+
+
+def serve(argv: Sequence[str]) -> int:
+    """Run `progdf preview`; 0 when its input has ended. Raises ProgdfError for a scene that does not work."""
+    options = parse_options(PreviewOptions, argv, "progdf preview")
+    with tempfile.TemporaryDirectory(prefix="progdf-preview-") as kept:
+        previewer = Previewer(options.scene, Path(kept))
+        lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
+        while line := newest_line(lines):
+            sys.stdout.write(msgspec.json.encode(answer(previewer, line)).decode() + "\n")
+            sys.stdout.flush()
+    return 0
+
+
+def answer(previewer: Previewer, line: str) -> Answer:
+    """Write the picture that a line asks for; what went wrong is in the answer."""
+    try:
+        asked = msgspec.json.decode(line, type=Request)
+    except msgspec.MsgspecError as error:
+        return Answer(-1, f"the request cannot be read: {error}")
+    try:
+        write_image(Path(asked.out), previewer.picture(asked))
+    except (ProgdfError, OSError) as error:
+        return Answer(asked.number, " ".join(str(error).split()))
+    return Answer(asked.number)
+
+
+def _read_lines(lines: queue.SimpleQueue[str]) -> None:
+    for line in sys.stdin:
+        lines.put(line)
+    lines.put("")
+
+
+def newest_line(lines: queue.SimpleQueue[str]) -> str:
+    """The last line that has come, "" at the end of the input; waits where none has."""
+    line = lines.get()
+    while line and not lines.empty():
+        line = lines.get()
+    return line
+
+
+def _no_masks() -> Path:
+    raise ProgdfError("this region takes a while to find; it has no picture in advance")

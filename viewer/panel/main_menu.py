@@ -1,0 +1,58 @@
+"""The menu of the window (☰): files, new edits, what is delivered, help."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from imgui_bundle import imgui
+
+from progdf.terminal import escape_text
+from viewer.ui.context import Icon, UiContext
+from viewer.ui.widgets import elide, icon_button, menu, tip
+
+NAME = "main menu"
+MOST_PX = 360.0
+_FILES = (("Open…", "Ctrl+O", "open"),)
+_SAVES = (("Save", "Ctrl+S", "save"), ("Save as…", "Ctrl+Shift+S", "save_as"))
+_MAKES = (
+    ("New edit", "Ctrl+N", "new_edit"),
+    ("Export .ply…", "Ctrl+E", "export"),
+    ("Render picture…", "Ctrl+P", "render_picture"),
+    ("Render film…", "Ctrl+Shift+P", "render_film"),
+)
+_HELP = (("Shortcuts", "F1", "help"), ("About", "", "about"), ("Quit", "Ctrl+Q", "quit"))
+
+
+def button(recent: Sequence[Path], ui: UiContext) -> list[str]:
+    """The button at the right of the present line, and its menu while it is open; what was chosen."""
+    if icon_button("menu", Icon.BARS, ui):
+        imgui.open_popup(NAME)
+    tip("Menu")
+    actions: list[str] = []
+    with menu(NAME, ui) as is_open:
+        if is_open:
+            actions += _items(_FILES)
+            actions += _recent(recent, ui)
+            actions += _items(_SAVES)
+            imgui.separator()
+            actions += _items(_MAKES)
+            imgui.separator()
+            actions += _items(_HELP)
+    return actions
+
+
+def _items(items: Sequence[tuple[str, str, str]]) -> list[str]:
+    return [action for name, keys, action in items if imgui.menu_item(name, keys, False)[0]]
+
+
+def _recent(recent: Sequence[Path], ui: UiContext) -> list[str]:
+    actions: list[str] = []
+    if imgui.begin_menu("Recent", bool(recent)):
+        for i, path in enumerate(recent):
+            name = elide(escape_text(path.name), MOST_PX * ui.scale)
+            if imgui.menu_item(f"{name}##{i}", "", False)[0]:
+                actions.append(f"open_file:{path}")
+            tip(escape_text(str(path)))
+        imgui.end_menu()
+    return actions

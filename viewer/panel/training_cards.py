@@ -1,0 +1,176 @@
+"""Runs of the trainer in the panel: a card each, with its progress, and what can be done with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from imgui_bundle import imgui
+
+from viewer.jobs.delivery import Delivery
+from viewer.jobs.training_job import TrainingJob, duration
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.widgets import elide, right_edge, small, small_toggle, tip
+
+BAR_PX = 5.0
+
+
+def draw(jobs: Sequence[TrainingJob], ui: UiContext) -> list[str]:
+    """One card a run, the next one at the bottom; the actions that were asked for."""
+    actions: list[str] = []
+    for job in jobs:
+        if job.status != "done":
+            imgui.push_id(job.number)
+            actions += _card(_job_row(job), job.number, ui)
+            imgui.pop_id()
+    return actions
+
+
+def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
+    """The same for what is being exported and rendered."""
+    actions: list[str] = []
+    for delivery in deliveries:
+        share = delivery.done / delivery.total if delivery.total else 0.0
+        left = delivery.seconds_left
+        said = [f"frame {delivery.done} of {delivery.total}"] if delivery.total else ["Starting"]
+        said += [f"{duration(left)} left"] if left is not None else []
+        failed = delivery.status == "failed"
+        line = (
+            delivery.error if failed else "Stopping" if delivery.status == "stopping" else "  ·  ".join(said)
+        )
+        stop = ("Close", "stop_delivery", "") if failed else ("Stop", "stop_delivery", "Nothing is written")
+        word = "Failed" if failed else f"{100 * share:.0f} %" if share else ""
+        imgui.push_id(f"delivery {delivery.number}")
+        row = _Row(delivery.title, str(delivery.out), word, share, line, failed, not failed, (stop,))
+        actions += _card(row, delivery.number, ui)
+        imgui.pop_id()
+    return actions
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A card: its name and tip, the word at the right, the bar, the line below and its buttons."""
+
+    name: str
+    tip: str
+    word: str
+    share: float
+    said: str
+    failed: bool
+    runs: bool
+    buttons: tuple[tuple[str, str, str], ...]
+
+
+def _job_row(job: TrainingJob) -> _Row:
+    order, failed = job.order, job.status == "failed"
+    about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
+    said = job.error if failed else _said(job)
+    runs = job.status == "running"
+    return _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
+
+
+def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
+    scale = ui.scale
+    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.card))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * scale, 8 * scale))
+    child = imgui.ChildFlags_
+    flags = child.auto_resize_y.value | child.always_use_window_padding.value
+    imgui.begin_child("card", imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
+    right = right_edge()
+    wide = imgui.calc_text_size(row.word).x
+    imgui.align_text_to_frame_padding()
+    imgui.text(elide(row.name, right - wide - 16.0 * scale))
+    tip(row.tip)
+    imgui.same_line(right - wide)
+    imgui.text_colored(imgui.ImVec4(*(PALETTE.error if row.failed else PALETTE.dim)), row.word)
+    _bar(row, ui)
+    actions = [f"{action}:{number}" for action in _foot(row, right, ui)]
+    imgui.end_child()
+    imgui.pop_style_var()
+    imgui.pop_style_color()
+    return actions
+
+
+def _status(job: TrainingJob) -> str:
+    match job.status:
+        case "running":
+            return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
+        case "queued":
+            return "Queued"
+        case "stopping":
+            return "Stopping"
+        case "stopped":
+            return "Stopped"
+        case "failed":
+            return "Failed"
+    return ""
+
+
+def _bar(row: _Row, ui: UiContext) -> None:
+    """How far it is."""
+    x, y = imgui.get_cursor_screen_pos()
+    wide, tall = imgui.get_content_region_avail().x, BAR_PX * ui.scale
+    imgui.dummy(imgui.ImVec2(wide, tall))
+    canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(x + wide, y + tall)
+    canvas.add_rect_filled(imgui.ImVec2(x, y), end, u32(PALETTE.field), tall / 2)
+    color = PALETTE.error if row.failed else PALETTE.accent if row.runs else PALETTE.faint
+    if row.share:
+        reached = imgui.ImVec2(x + max(row.share * wide, tall), y + tall)
+        canvas.add_rect_filled(imgui.ImVec2(x, y), reached, u32(color), tall / 2)
+
+
+def _foot(row: _Row, right: float, ui: UiContext) -> list[str]:
+    """What it does, or why it failed; at the right its buttons."""
+    imgui.push_font(None, SMALL_PX)
+    widths = [imgui.calc_text_size(text).x + 12.0 * ui.scale for text, _, _ in row.buttons]
+    imgui.pop_font()
+    if row.failed:
+        imgui.push_text_wrap_pos(0.0)
+        imgui.text_colored(imgui.ImVec4(*PALETTE.error), row.said)
+        imgui.pop_text_wrap_pos()
+        small(" ", PALETTE.dim)
+    else:
+        small(row.said, PALETTE.dim, right - imgui.get_cursor_pos_x() - sum(widths) - 6.0 * ui.scale)
+        tip(row.said)
+    actions: list[str] = []
+    x = right - sum(widths)
+    for (text, action, help_), wide in zip(row.buttons, widths, strict=True):
+        imgui.same_line(x)
+        if small_toggle(action, text, False, wide, ui):
+            actions.append(action)
+        if help_:
+            tip(help_)
+        x += wide
+    return actions
+
+
+def _said(job: TrainingJob) -> str:
+    progress = job.progress
+    match job.status:
+        case "running":
+            left = job.seconds_left
+            words = [progress.said]
+            words += [f"{duration(left)} left"] if left is not None else []
+            words += [f"loss {progress.loss}"] if progress.loss and progress.doing == "optimize" else []
+            return "  ·  ".join(words)
+        case "queued":
+            return "Waits for the one before"
+        case "stopping":
+            return "Saving what is done"
+    return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
+
+
+def _buttons(job: TrainingJob) -> tuple[tuple[str, str, str], ...]:
+    """Text, action and help."""
+    log = ("Log", "run_log", "What the trainer said")
+    discard = (Icon.DELETE, "discard_run", "Discard: removes what was trained so far")
+    match job.status:
+        case "running":
+            return log, ("Stop", "stop_run", "Stop; it can be resumed, also another day")
+        case "queued":
+            return (("Cancel", "stop_run", "Take it off the queue"),)
+        case "stopping":
+            return (log,)
+        case "stopped":
+            return log, ("Resume", "resume_run", "Go on where it was stopped"), discard
+    return log, ("Retry", "resume_run", "Try again"), discard
