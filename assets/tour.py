@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from imgui_bundle import imgui
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -22,6 +23,7 @@ from tests.helpers.ui_rig import Rig, rig
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import load_edits
 from viewer.panel import panel
+from viewer.state import selection
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
@@ -118,9 +120,27 @@ def painted(hand: Rig) -> None:
         hand.drag((x, top), (x, bottom))
 
 
+def selected(hand: Rig) -> None:
+    """The head in a lasso and kept as a region, a second lasso under way that takes some of it back."""
+    hand.key("L")
+    for corners in (((330, 90), (640, 60), (680, 330), (330, 340)), ((480, 180), (600, 190), (560, 280))):
+        hand.move(*corners[0])
+        hand.press()
+        for corner in corners[1:]:
+            hand.move(*corner)
+        if corners[0] == (480, 180):
+            break
+        hand.release()
+        view = hand.main_view.work.view
+        kept = selection.add_region(view.selection, "head", Path("head.region.npy"))
+        hand.main_view.change(replace(view, selection=kept))
+        hand.modifier(imgui.Key.mod_ctrl)
+
+
 SHOTS: dict[str, Callable[[Rig], None]] = {
     "layers": layers,
     "paint": painted,
+    "select": selected,
     "compare": compare,
     "difference": difference,
     "recorded": recorded,

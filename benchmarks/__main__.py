@@ -30,6 +30,7 @@ BENCHES: dict[str, str] = {
     "edits": "benchmarks.edits:tables",
     "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",
+    "select": "benchmarks.viewer.selection:tables",
     "frames": "benchmarks.viewer.frames:tables",
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.warps:tables",
@@ -43,12 +44,13 @@ class BenchOptions:
     """Measure speed against error; each benchmark interleaves what it compares in one process.
 
     Args:
-        what: rasterize, field, edits, networks, viewer, frames, window, warps; all of them when none is named
+        what: rasterize, field, edits, networks, viewer, select, frames, window, warps; none
+            named is all
         json: also write the tables to this JSON file
         markdown: also put the tables between their markers in this Markdown file
         runs: finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits
         plot: `field` also draws its errors into this PNG file
-        scenes: .ply files that viewer, frames and window take in place of the bears, warps beside the bear
+        scenes: .ply files that viewer, select, frames and window take in place of the bears, warps beside
         seconds: how long `window` drags its slider; 60 where not said
     """
 
@@ -74,7 +76,7 @@ def main(argv: Sequence[str]) -> int:
     trained = ("field", "edits", "networks")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
-    drawing = ("viewer", "frames", "window", "warps")
+    drawing = ("viewer", "select", "frames", "window", "warps")
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks {drawing[0]}")
     if options.seconds is not None and options.what and "window" not in options.what:

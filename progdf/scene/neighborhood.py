@@ -1,7 +1,7 @@
 """Selections over the neighborhood of Gaussians: grown, shrunk, smoothed, connected parts.
 
 Two Gaussians are connected where they are near neighbors and touch: their centers are no farther apart than
-twice the sum of their longest axes.
+the sum of their longest axes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .selection import Floats, Mask, alike_in_color
 
 _RING, _AROUND, _LINKS = 8, 24, 8  # neighbors: of a step, of a vote, of a connection
 _REACH = 3.0  # times how far neighbors commonly are; what is farther is none, also where none is nearer
-_TOUCH = 2.0
+_TOUCH = 1.0
 
 
 class Neighborhood:

@@ -103,7 +103,7 @@ class SelectTool:
     mode: Annotated[str, one_of(SELECT_MODES)] = "new"
     through: bool = False
     radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 30.0
-    tolerance: Share = 0.1
+    tolerance: Share = 0.08
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ def test_shapes_are_drawn_over_the_picture_of_a_camera(scene: Gaussians, tmp_pat
 
 def test_a_color_and_a_flood_take_a_tolerance(scene: Gaussians) -> None:
     assert len(members("color:#808080,0.1", scene)) < len(members("color:#808080,.2", scene)) < COUNT
-    assert members("color:#808080", scene) == members("color:#808080,0.1", scene)
+    assert members("color:#808080", scene) == members("color:#808080,0.08", scene)
     x, y, z = scene.means[7].tolist()
     assert 7 in members(f"flood:{x},{y},{z},0.3", scene)
     assert members(f"flood:{x},{y},{z},0.3", scene) <= members(f"flood:{x},{y},{z},1", scene)

@@ -1,0 +1,83 @@
+"""`python -m benchmarks select`: what a selection by hand takes, on scenes up to a million."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.table import Table, machine
+from progdf.gaussians import Gaussians
+from progdf.scene import selection as shapes
+from progdf.scene.neighborhood import Neighborhood, grow_along_surface
+from viewer.camera.view_camera import first_camera, to_camera
+from viewer.state import selection
+
+from .scenes import copies, scenes_of
+
+SIZE, TIMES = (980, 800), 5
+CORNERS = 400
+"""Of the lasso: as many as a hand leaves in a few seconds."""
+
+
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """Measure, for docs/benchmarks.md.
+
+    Args:
+        scenes: .ply files that take the place of the bears
+
+    Raises:
+        ProgdfError: a file is missing or broken.
+    """
+    opened = scenes_of(scenes)
+    opened.append(copies(opened[-1], -(-1_000_000 // len(opened[-1]))))
+    columns = [measure(scene) for scene in opened]
+    rows = tuple((name, *(f"{times[name]:.0f}" for times in columns)) for name in columns[0])
+    heads = tuple(f"{len(scene):,}".replace(",", " ") for scene in opened)
+    note = f"Processor time in ms, median of {TIMES}, picture of {SIZE[0]}×{SIZE[1]}. {machine()}."
+    return [Table("select", "A selection by hand", ("of Gaussians", *heads), rows, note)]
+
+
+def measure(scene: Gaussians) -> dict[str, float]:
+    """Milliseconds of the processor that each thing takes."""
+    camera = to_camera(first_camera(scene), *SIZE)
+    turn = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
+    reach = 300.0 * (1.0 + 0.2 * np.sin(7.0 * turn))
+    outline = np.stack([SIZE[0] / 2 + reach * np.cos(turn), SIZE[1] / 2 + reach * np.sin(turn)], axis=1)
+    centers = shapes.project_centers(scene, camera)
+    ball = shapes.inside_ball(scene, scene.means.median(0).values.numpy(), 0.3)
+    colors, near = shapes.base_colors(scene), Neighborhood(scene)
+    seed = int(np.flatnonzero(ball)[0])
+
+    def lasso(through: bool) -> bytes:
+        """From the mouse's release to the state: seen, enclosed, in front, packed."""
+        seen = shapes.project_centers(scene, camera)
+        mask = shapes.inside_polygon(seen.points, outline)
+        if not through:
+            rows = np.flatnonzero(mask)
+            mask[rows] = shapes.front_surface(scene, camera, seen, rows)
+        return selection.pack(mask)
+
+    works: dict[str, Callable[[], object]] = {
+        "lasso, through": lambda: lasso(True),
+        "lasso, front surface": lambda: lasso(False),
+        "a step of the brush": lambda: shapes.inside_stroke(centers.points, outline[:2], 40.0),
+        "colors": lambda: shapes.base_colors(scene),
+        "flood": lambda: grow_along_surface(near, colors, np.array([seed]), colors[seed], 0.08),
+        "neighborhood, once": lambda: Neighborhood(scene),
+        "grow": lambda: near.grow(ball),
+    }
+    return {name: _median(work) for name, work in works.items()}
+
+
+def _median(work: Callable[[], object]) -> float:
+    work()
+    taken = []
+    for _ in range(TIMES):
+        before = time.process_time()
+        work()
+        taken.append(1e3 * (time.process_time() - before))
+    return statistics.median(taken)
