@@ -152,7 +152,7 @@ def slider_table(opened: Sequence[OpenedRun]) -> Table:
 def far_evaluator(run: OpenedRun) -> Evaluator:
     """Views from elsewhere, beside the editor's pictures of them where it can make any."""
     scene, region, setup = run.setup.scene, run.setup.region, run.setup
-    _, reporting = split_held_out(setup.held_out)
+    _, reporting = split_held_out(setup.judging)
     center = scene.means[region.members].mean(dim=0)
     up = setup.up.direction if setup.up is not None else torch.tensor([0.0, 1.0, 0.0])
     cameras = [far for view in reporting for far in far_cameras(view.camera, center, up)]
@@ -162,7 +162,7 @@ def far_evaluator(run: OpenedRun) -> Evaluator:
     plan = run.run.record.plan
     if plan.editor.family not in VIEW_BY_VIEW:
         settings = plan.editor.settings(run.run.folder.painted)
-        editor = make_editor(plan.editor.editor, scene, region, [*setup.train, *setup.held_out], settings)
+        editor = make_editor(plan.editor.editor, scene, region, setup.views, settings)
         edited = {s: [editor.edit(view, s) for view in views] for s in run.trajectory.strengths}
     channels = run.trajectory.end.shape[1]
     return make_evaluator(scene, region, views, edited, setup.background, channels)

@@ -27,7 +27,7 @@ def recorded_edit(root: Path) -> KnownEdit:
     run = reopen_run(root)
     setup, trajectory = render_run_views(run), run.trajectory
     few = setup.train[:: max(1, len(setup.train) // LOOKED)][:LOOKED]
-    choosing, reporting = split_held_out(setup.held_out)
+    choosing, reporting = split_held_out(setup.judging)
     look, chooser, judge = (
         load_evaluator(run.folder, setup, views, trajectory).counted_pixels
         for views in (few, choosing[:JUDGED], reporting[:JUDGED])

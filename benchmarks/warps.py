@@ -186,7 +186,7 @@ def _bear_cases(plan: Plan) -> list[WarpCase]:
     found.append(_case(plan, "bear: smile", scene, head, smile_warp(corners, demo.up, 0.08, 0.07)))
     setup = _setup(plan, scene, body)
     try:
-        editor = make_editor(_STYLE, scene, setup.region, [*setup.train, *setup.held_out])
+        editor = make_editor(_STYLE, scene, setup.region, setup.views)
     except ProgdfError:  # its weights are an extra
         return found
     return [*found, WarpCase(f"bear's body: {_STYLE}", setup, lambda v: quantize_image(editor.edit(v, 1.0)))]

@@ -68,8 +68,8 @@ class TrainOptions:
     camera), photomasks:DIR (of photographs), text:"the man's shirt"; join by + -."""
     editor: str
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
-    photographs:EDITED,ORIGINALS (of what the cameras took), style:N (a painting, N from 0 to 25),
-    instruct:"turn him into Batman"."""
+    photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in
+    any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
     lift_rule: LiftRule = "share"
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""

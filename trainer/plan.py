@@ -8,12 +8,13 @@ the scene is looked at. A plan is all that the bits of a result depend on, but f
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from trainer.editors import GIVEN, UNTOLD, VIEW_BY_VIEW
 from trainer.editors.base import EditKind, EditorSettings
+from trainer.editors.pictures import picture_paths
 from trainer.fit.network import NetworkPlan
 from trainer.optimize.objective import LossWeights, Sharpness
 from trainer.optimize.settings import Optimization
@@ -120,6 +121,7 @@ class OptimizationPlan:
         reedit_every: steps between two edits of the current renders; 0: none
         rates, perceptual_every, sharpness, raw, whole, joint, refinements: see `Constants`
         seed: order of the views
+        few: the views are a handful of changed pictures, see `picture_solver`
     """
 
     kind: EditKind | None
@@ -139,6 +141,7 @@ class OptimizationPlan:
     joint: bool
     seed: int
     refinements: Refinements = Refinements()
+    few: bool = False
 
 
 @dataclass(frozen=True)
@@ -229,6 +232,7 @@ def make_plan(options: TrainOptions) -> Plan:
             views or None,
             options.image_size or None,
             dense=not quick and family not in VIEW_BY_VIEW,
+            pictures=picture_paths(what) if family == "pictures" else (),
         ),
         OptimizationPlan(
             None if options.kind == "auto" else options.kind,
@@ -248,6 +252,7 @@ def make_plan(options: TrainOptions) -> Plan:
             joint,
             options.seed,
             constants.refinements,
+            few=family == "pictures",
         ),
         "even" if options.slider == "auto" and family not in GIVEN else options.slider,
         FieldPlan(
@@ -293,6 +298,18 @@ def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int)
         asked.progressive_norm,
     )
     most = STAGES[kind]
+    solves_colors = (
+        kind == "color"  # colors alone change, and nothing is asked for that only a descent view by view has
+        and asked.refinements.solves
+        and asked.rates == "kind"
+        and asked.progressive == "off"
+        and sharpness == "off"
+        and not asked.perceptual_weight
+        and not asked.raw
+        and not asked.joint
+        and not asked.reedit_every
+    )
+    few = asked.few and solves_colors
     return Optimization(
         kind,
         asked.steps,
@@ -303,18 +320,11 @@ def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int)
         weights,
         asked.rates,
         asked.raw,
-        asked.refinements,
-        # colors alone change, and nothing is asked for that only a descent view by view has
-        solves_colors=kind == "color"
-        and asked.refinements.solves
-        and asked.rates == "kind"
-        and asked.progressive == "off"
-        and sharpness == "off"
-        and not asked.perceptual_weight
-        and not asked.raw
-        and not asked.joint
-        and not asked.reedit_every,
+        # by their own pictures alone nothing but colors would pay
+        replace(asked.refinements, prunes=False, propagates=False) if few else asked.refinements,
+        solves_colors=solves_colors,
         seed=asked.seed,
+        few=few,
     )
 
 

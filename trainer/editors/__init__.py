@@ -13,6 +13,7 @@ from trainer.views.view import View
 from .base import EditorSettings, ImageEditor, RepaintingEditor
 from .folder import folder, folder_of, photograph_folders, photographs
 from .instruct import check_instruct, instruct
+from .pictures import picture_paths, pictures
 from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
 from .style import check_style, style
 
@@ -26,6 +27,7 @@ EDITORS: dict[str, Factory] = {
     "night": night,
     "folder": folder,
     "photographs": photographs,
+    "pictures": pictures,
     "style": style,
     "instruct": instruct,
 }
@@ -35,7 +37,7 @@ and the settings of learned editors."""
 VIEW_BY_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
 
-GIVEN = ("folder", "photographs")
+GIVEN = ("folder", "photographs", "pictures")
 """Kinds whose pictures were made elsewhere, at the strengths that they were made at."""
 
 UNTOLD = ("folder", "photographs", "instruct")
@@ -52,6 +54,7 @@ EXAMPLES = (
     "night",
     "folder:DIR",
     "photographs:EDITED,ORIGINALS",
+    "pictures:A.png,B.png",
     "style:14",
 )
 
@@ -64,6 +67,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "night": partial(stops_of, editor="night"),
     "folder": folder_of,
     "photographs": photograph_folders,
+    "pictures": picture_paths,
     "style": check_style,
 }
 """Kind of editor → the check of the text after the colon, by itself."""

@@ -52,7 +52,9 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
         return None, str(error)
-    path = camera_path([view.camera for view in opened.setup.held_out])
+    if len(opened.setup.judging) < 2:
+        return None, "there is one view alone, which is no path"
+    path = camera_path([view.camera for view in opened.setup.judging])
     before, after = (
         clip.pictures([render_view(scene, camera, opened.setup.background) for camera in path])
         for scene in (opened.run.scene, finished_scene(opened))

@@ -14,7 +14,7 @@ from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Perceptual
 from trainer.views.view import crop, make_view, render_view
 
-from .opened import OpenedRun, held_out_pictures
+from .opened import OpenedRun, judging_pictures
 from .warp import SeenDepth, see_depth, warp_view
 
 EDITED, EDITOR, UNEDITED = "slider", "the editor", "unedited"
@@ -64,11 +64,11 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
     Compared are the pixels that count (see `Evaluator`) and whose surface both views see, before the edit and
     after it; the others are taken from the target, so that they differ in nothing.
     """
-    scene, views, background = opened.run.scene, opened.setup.held_out, opened.setup.background
+    scene, views, background = opened.run.scene, opened.setup.judging, opened.setup.background
     edited = finished_scene(opened)
     whole = {
         EDITED: [render_view(edited, view.camera, background).clamp(0, 1) for view in views],
-        EDITOR: held_out_pictures(opened, "edited"),
+        EDITOR: judging_pictures(opened, "edited"),
         UNEDITED: [view.image for view in views],
     }
     seen = {
@@ -101,7 +101,7 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
 def outside_change(opened: OpenedRun) -> dict[str, float]:
     """Mean absolute change of the pixels in the held-out boxes that show the region neither before the edit
     nor after it, 0..1: of the finished edit, and of what the editor made."""
-    views, evaluator = opened.setup.held_out, opened.evaluator
+    views, evaluator = opened.setup.judging, opened.evaluator
     edited = finished_scene(opened)
     after = [make_view(edited, opened.run.region, view.camera, opened.setup.background) for view in views]
     boxes = [scene.box for scene in evaluator.crops]

@@ -132,7 +132,7 @@ def _consistency_rows(found: Consistency, lpips: str) -> list[Row]:
 
 
 def _clip_rows(opened: OpenedRun, texts: Texts) -> list[Row]:
-    course = clip_curve(opened.evaluator, opened.setup.held_out, opened.gdf.field, texts)
+    course = clip_curve(opened.evaluator, opened.setup.judging, opened.gdf.field, texts)
     along, missing = clip_consistency(opened)
     direction = course.similarity[-1] if course.similarity else None
     return [

@@ -36,7 +36,7 @@ class OpenedRun:
         run: see `FinishedRun`
         report: its report.json
         setup: its views; the boxes of the training views hold what the edit changes
-        evaluator: its held-out views, beside what the editor made of them
+        evaluator: its judging views, beside what the editor made of them
         gdf: the edit as it is shipped
         trajectory: what was recorded, on the shipped slider
         keyframes: the end alone, see `KEYFRAMES`
@@ -89,8 +89,8 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
         raise ProgdfError(f"{run.folder.report} is damaged ({error}); run progdf fit {root}") from error
     gdf = load_gdf(run.folder.gdf(run.record.plan.name), run.scene)
     setup = render_run_views(run)
-    if not setup.held_out:
-        raise ProgdfError(f"{root} has no held-out views to measure with; train it again")
+    if not setup.train:
+        raise ProgdfError(f"{root} has no views to measure with; train it again")
     names = [view.camera.name for view in setup.train]
     edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
     setup = widen_views(setup, edited)
@@ -98,7 +98,7 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
     if shown_at.shape != run.trajectory.s.shape:
         raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")
     trajectory = replace(run.trajectory, s=shown_at)
-    evaluator = load_evaluator(run.folder, setup, setup.held_out, run.trajectory)
+    evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory)
     return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(run, setup, report))
 
 
@@ -109,6 +109,6 @@ def _two_keyframes(run: FinishedRun, setup: TrainingSetup, report: Mapping[str, 
     return equalize_slider(field, setup)[0] if even else field
 
 
-def held_out_pictures(opened: OpenedRun, kind: str) -> Sequence[Tensor]:
-    """The held-out views' whole pictures of the run folder: "edited", "final". [H,W,3] each"""
-    return read_views(opened.run.folder, kind, [view.camera.name for view in opened.setup.held_out])
+def judging_pictures(opened: OpenedRun, kind: str) -> Sequence[Tensor]:
+    """The judging views' whole pictures of the run folder: "edited", "final". [H,W,3] each"""
+    return read_views(opened.run.folder, kind, [view.camera.name for view in opened.setup.judging])

@@ -188,7 +188,7 @@ def _write_truth(folder: Path, plan: Plan, scene: Gaussians, edit: AnalyticEdit)
     setup = make_training_setup(plan.views, scene, region)
     for strength in ((i + 1) / ASKED for i in range(ASKED)):
         edited = edit.apply(scene, region.members, strength)
-        for view in (*setup.train, *setup.held_out):
+        for view in setup.views:
             picture = render_view(edited, view.camera, setup.background)
             write_image(folder / f"{strength:g}" / f"{view.camera.name}.png", picture)
 
@@ -198,17 +198,17 @@ def _truth(case: SliderCase, opened: OpenedRun, scene: DemoScene) -> Pictures:
     setup = opened.setup
     boxes = [shown.box for shown in opened.evaluator.crops]
     if case.editor:
-        views = [*setup.train, *setup.held_out]
+        views = setup.views
         editor = make_editor(case.editor, setup.scene, setup.region, views)
 
         def pictures(s: float) -> list[Tensor]:
-            return [editor.edit(view, s) for view in setup.held_out]
+            return [editor.edit(view, s) for view in setup.judging]
 
     else:
         edit, members = _analytic(case, scene), setup.region.members
 
         def pictures(s: float) -> list[Tensor]:
             edited = edit.apply(setup.scene, members, s)
-            return [render_view(edited, view.camera, setup.background).clamp(0, 1) for view in setup.held_out]
+            return [render_view(edited, view.camera, setup.background).clamp(0, 1) for view in setup.judging]
 
     return lambda s: [crop(picture, box) for picture, box in zip(pictures(s), boxes, strict=True)]

@@ -58,7 +58,7 @@ def choose_path(
     if not in_parts and (editor is None or editor.stages):
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
-    views = split_held_out(setup.held_out)[0][:_VIEWS]
+    views = split_held_out(setup.judging)[0][:_VIEWS]
     halves = {}
     if editor is not None and not in_parts:
         halves = {0.5: [editor.edit(view, 0.5) for view in views]}

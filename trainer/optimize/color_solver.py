@@ -235,7 +235,7 @@ def solve(
     Raises:
         FloatingPointError: the loss or where it leads is not finite; the state is that of the step before.
     """
-    columns = _columns(original.shape[1], solver.weights.shape[1])
+    columns = color_columns(original.shape[1], solver.weights.shape[1])
     finished = stages[-1].targets
     for index in range(state.stage, len(stages)):
         stage = stages[index]
@@ -261,7 +261,7 @@ def solve(
         state.stage, state.local = index + 1, 0
 
 
-def _columns(channels: int, bands: int) -> Tensor:
+def color_columns(channels: int, bands: int) -> Tensor:
     """Where DC and the trained bands are in a packed row. [3·B] int64"""
     slices = attribute_slices(channels)
     dc = torch.arange(channels)[slices["sh0"]]

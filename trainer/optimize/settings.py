@@ -33,6 +33,7 @@ class Optimization:
         rates, raw, refinements: see `trainer.presets.Constants`
         solves_colors: the edit is solved for, all views at once (`color_solver`)
         seed: order of the views
+        few: colors are solved for with neighbors tied, see `picture_solver`
     """
 
     kind: EditKind
@@ -46,9 +47,12 @@ class Optimization:
     refinements: Refinements
     solves_colors: bool
     seed: int
+    few: bool = False
 
     def objective(self, perceptual: str) -> str:
         """What is minimized, for log and report. `perceptual`: the name of the distance that is used."""
+        if self.few:
+            return "squared error, all pictures at once, neighbors tied"
         if self.solves_colors:
             return "squared error, all views at once"
         return self.weights.description(perceptual)

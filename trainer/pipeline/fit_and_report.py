@@ -84,10 +84,12 @@ def finish_run(
     target, budget = plan.field.target_psnr, plan.field.bytes_budget
     scene, region = setup.scene, setup.region
     with log.stage("fit"):
-        evaluator = load_evaluator(folder, setup, setup.held_out, trajectory)
+        evaluator = load_evaluator(folder, setup, setup.judging, trajectory)
         choosing, reporting = evaluator.halves()
         if len(setup.held_out) == 1:
             log.say("one view alone is held out: the field is chosen and reported on it")
+        if not setup.held_out:
+            log.say("no view is held out: all figures are of the views that were trained on")
         few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
         seen = load_evaluator(folder, setup, few, trajectory)
         with log.looks("weigh the members", len(setup.train)) as looked:
@@ -128,7 +130,7 @@ def finish_run(
         else:
             log.say(f"no field reached --target-psnr {target:g}; the best was kept")
     with log.stage("report"):
-        clip = clip_curve(evaluator, setup.held_out, field, plan.texts)
+        clip = clip_curve(evaluator, setup.judging, field, plan.texts)
         if clip.reason and plan.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
@@ -138,13 +140,14 @@ def finish_run(
         gdf = Gdf(plan.name, region, field, fingerprint(scene), editor, told)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{plan.name}: {editor}"
-        picture = report_picture(evaluator, measured, record.losses, title)
+        picture = report_picture(evaluator, measured, record.losses, title, bool(setup.held_out))
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
     report = {
         **measures,
         "views": {
+            "held_out": bool(setup.held_out),
             "edit": list(evaluator.names),
             "field_chosen": list(choosing.names),
             "field": list(reporting.names),
@@ -181,8 +184,9 @@ def finish_run(
     write_json(folder.report, report)
     write_image(folder.picture, picture)
     edit = report["edit"]
+    judged = "held-out views" if setup.held_out else "the views trained on"
     log.say(
-        f"held-out views: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
+        f"{judged}: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
         + "".join(
             f"; s={float(s):.3g} {e['psnr']} dB (2 keyframes {e['keyframes2']})"
             for s, e in report["between"].items()

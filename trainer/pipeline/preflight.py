@@ -9,6 +9,7 @@ from progdf.io.atomic import check_regular, open_error
 from progdf.io.cameras import load_cameras
 from progdf.scene.region_spec import check_region
 from trainer.editors import check_editor, check_new_editor
+from trainer.editors.pictures import picture_cameras
 from trainer.plan import Plan, segmented_views
 from trainer.regions.from_pictures import RegionSettings, region_checks
 from trainer.store.run_folder import check_folder, open_run_folder
@@ -39,6 +40,9 @@ def check_command(plan: Plan, out: Path, resume: bool) -> None:
             raise open_error(plan.scene, error) from None
     if plan.views.cameras is not None and not resume:
         load_cameras(plan.views.cameras)
+    if plan.views.pictures:
+        given = [] if plan.views.cameras is None else load_cameras(plan.views.cameras)
+        picture_cameras(plan.views.pictures, given)
     if not resume or load_region(out) is None:
         check_region(plan.region.region, region_checks(region_settings(plan, out, quiet=True)))
     if not folder.root.is_dir() or not any(folder.root.iterdir()):

@@ -80,8 +80,7 @@ def reedit(
     """
     if not every:
         return None
-    views = [*setup.train, *setup.held_out]
-    made = make_editor(editor.editor, setup.scene, setup.region, views, editor.settings(folder.painted))
+    made = make_editor(editor.editor, setup.scene, setup.region, setup.views, editor.settings(folder.painted))
     if not isinstance(made, RepaintingEditor):
         raise ProgdfError(f"--reedit-every does not apply to {editor.editor}; leave it out")
     return Reedit(made, setup, every, confines_edit(made, kind), log)

@@ -116,11 +116,7 @@ def _run_training(plan: Plan, scene: Gaussians, region: Region, folder: RunFolde
         log.say(warning)
     with log.stage("views"):
         setup = _render_originals(plan, scene, region, folder)
-    views = [*setup.train, *setup.held_out]
-    log.say(
-        f"{len(scene)} Gaussians, {len(region)} in the region; {len(setup.train)} views to train on and "
-        f"{len(setup.held_out)} to measure with, {views[0].camera.width}x{views[0].camera.height} pixels"
-    )
+    log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
     with log.stage("edit"):
@@ -142,10 +138,20 @@ def _run_training(plan: Plan, scene: Gaussians, region: Region, folder: RunFolde
     return finish_run(folder, setup, trajectory, convert_json(about, RunRecord), perceptual, log, begun)
 
 
+def _describe_views(setup: TrainingSetup) -> str:
+    """How many views there are, for what, and of how many pixels."""
+    cameras = [view.camera for view in setup.views]
+    sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)
+    use = f"{len(setup.train)} views to train on and {len(setup.held_out)} to measure with"
+    if not setup.held_out:
+        use = f"{len(setup.train)} views to train on, by which the edit is measured too"
+    return f"{use}, {', '.join(sizes)} pixels"
+
+
 def _render_originals(plan: Plan, scene: Gaussians, region: Region, folder: RunFolder) -> TrainingSetup:
     """The views, rendered and on disk."""
     setup = make_training_setup(plan.views, scene, region)
-    views = [*setup.train, *setup.held_out]
+    views = setup.views
     remove_stale_views(folder, [view.camera.name for view in views])
     write_views(folder, "original", {view.camera.name: view.image for view in views})
     masks = {view.camera.name: view.mask[..., None].expand(-1, -1, 3) for view in views}
@@ -160,7 +166,7 @@ def _edit_views(
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
     what a trial of that found.
     """
-    views = [*setup.train, *setup.held_out]
+    views = setup.views
     names = [view.camera.name for view in views]
     done = folder.state.load("edited")
     if done is not None:
@@ -202,7 +208,7 @@ def _agreement(
     if kind == "geometry" or plan.editor.family not in VIEW_BY_VIEW:
         return None
     count = len(setup.train)
-    found = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:])
+    found = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
     log.say(found.line(plan.editor.family))
     return found
 
@@ -245,14 +251,15 @@ def _record(
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
-            choosing, _ = load_evaluator(folder, setup, setup.held_out, trajectory).halves()
+            choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
             trajectory, costs = drop_idle_attributes(trajectory, choosing, optimization.refinements.prunes)
         recorded = len(trajectory)
         way = ""
-        if not optimization.raw and plan.field.field != "neural" and len(edited) == 1:
+        of_one_end = len(edited) == 1 and not optimization.few  # whose solver lays the way
+        if not optimization.raw and plan.field.field != "neural" and of_one_end:
             editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
             if plan.editor.family not in GIVEN:
-                views, settings = [*setup.train, *setup.held_out], plan.editor.settings(folder.painted)
+                views, settings = setup.views, plan.editor.settings(folder.painted)
                 editor = make_editor(plan.editor.editor, scene, region, views, settings)
             trajectory, way = choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)
         else:
@@ -281,7 +288,7 @@ def _record(
     save_trajectory(folder.trajectory, trajectory, extra, plain(record))
     with log.stage("final"):
         edited_scene = scene.replace_rows(region.members, end_rows(setup, trajectory))
-        views = [*setup.train, *setup.held_out]
+        views = setup.views
         finals = {}
         with log.looks("picture the edit", len(views)) as looked:
             for view in views:

@@ -20,6 +20,7 @@ from trainer.optimize.losses import Perceptual, erode
 from trainer.optimize.objective import Losses, Objective, loss_table
 from trainer.optimize.optimizer_state import PgsState
 from trainer.optimize.pgs import Renewal, TargetStage, learning_rates, optimize
+from trainer.optimize.picture_solver import RECORDINGS, make_picture_solver, solve_pictures
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.settings import Optimization, pgs_settings, resolve_slider
 from trainer.optimize.unseen import UnseenMembers
@@ -92,7 +93,7 @@ def optimize_members(
         KeyboardInterrupt: interrupted; the state is saved.
     """
     scene, members, kind = setup.scene, setup.region.members, optimization.kind
-    bands = _trains_bands(optimization, setup, log)
+    bands = optimization.sh != "off" if optimization.few else _trains_bands(optimization, setup, log)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     rates = learning_rates(kind, original.shape[1], 1.0, optimization.rates)
     still = not moving_attributes(rates[None], GEOMETRY)
@@ -100,6 +101,8 @@ def optimize_members(
     crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still, back) for v in setup.train]
     steps = iterations(optimization.steps) if optimization.solves_colors else optimization.steps
     steps = max(steps, len(edited) + 1)  # each stage is to have one
+    if optimization.few:
+        steps = max(RECORDINGS, 2 * len(edited))
     stages = [
         TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
@@ -112,8 +115,12 @@ def optimize_members(
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
     inside = [erode(crop(view.mask, view.box)) for view in setup.train]
     objective = Objective(perceptual, optimization.weights, inside)
-    solver = None
-    if optimization.solves_colors:
+    solver = pictures = None
+    if optimization.few:
+        with log.stage("weights"):
+            pictures = make_picture_solver(scene, members, crops, original, bands)
+        log.say(f"{pictures.unseen} members that no picture shows follow their own surface")
+    elif optimization.solves_colors:
         with log.stage("weights"):
             solver = make_solver(crops, original, bands and original.shape[1] > BASE_CHANNELS)
 
@@ -140,13 +147,14 @@ def optimize_members(
                 raise KeyboardInterrupt
             kept.step_done()
 
-        way_there = (
-            solve(original, solver, stages, state, step_done, unseen_members)
-            if solver is not None
-            else optimize(
+        if pictures is not None:
+            way_there = solve_pictures(original, pictures, stages, state, step_done)
+        elif solver is not None:
+            way_there = solve(original, solver, stages, state, step_done, unseen_members)
+        else:
+            way_there = optimize(
                 original, crops, probe_views(setup), stages, objective, settings, step_done, state, renewal
             )
-        )
         try:
             for found in way_there:
                 recordings.add(found)

@@ -53,6 +53,12 @@ class Evidence:
     opacities: Tensor
 
 
+def bare_weight(opacities: Tensor) -> Tensor:
+    """The mean α of Gaussians over the ellipse {α ≥ 1/255}, where nothing covers them. [N] -> [N]"""
+    bare = (opacities - ALPHA_MIN) / (opacities / ALPHA_MIN).clamp_min(1.001).log()
+    return bare.clamp_min(1e-6)
+
+
 def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Evidence:
     """Collect the evidence of all views.
 
@@ -64,9 +70,7 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     sums = torch.zeros(len(scene), 4, dtype=torch.float64)
     mean_weight = torch.zeros(len(scene))
     views, views_inside = torch.zeros(len(scene)), torch.zeros(len(scene))
-    # the mean α of a Gaussian of opacity o over the ellipse {α ≥ 1/255}, where nothing covers it
-    bare = (scene.opacities - ALPHA_MIN) / (scene.opacities / ALPHA_MIN).clamp_min(1.001).log()
-    bare = bare.clamp_min(1e-6)
+    bare = bare_weight(scene.opacities)
     for camera, mask in zip(cameras, masks, strict=True):
         found = alpha_weights(scene, camera, mask)
         sums += found

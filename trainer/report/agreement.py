@@ -107,7 +107,7 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
     colors = fit_colors(seen, members)
     lost = change = count = 0.0
     with torch.no_grad():
-        for view, edited in zip(setup.held_out, held_out, strict=True):
+        for view, edited in zip(setup.judging, held_out, strict=True):
             one = view_change(setup, view, edited)
             lost += float((one.change - one.render(colors)).square().sum())
             change += float(one.change.square().sum())

@@ -30,14 +30,17 @@ _THUMBNAIL, _PLOT_HEIGHT = 240, 270
 _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
 
-def report_picture(evaluator: Evaluator, measured: Measured, losses: Losses, title: str) -> Tensor:
+def report_picture(
+    evaluator: Evaluator, measured: Measured, losses: Losses, title: str, held_out: bool = True
+) -> Tensor:
     """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
 
     Args:
-        evaluator: held-out views; the one that shows most of the region is shown
+        evaluator: the views that judge; the one that shows most of the region is shown
         measured: see `Measured`
         losses: mean of every loss term per recording
         title: one line
+        held_out: whether training did not see these views
     """
     chosen, linear = measured.shown, measured.fitted.baselines[COMPARED].field
     columns = columns_of(measured.asked)
@@ -51,7 +54,7 @@ def report_picture(evaluator: Evaluator, measured: Measured, losses: Losses, tit
             ["slider", "the editor", "2 keyframes"],
             [column_heading(*column) for column in columns],
             title,
-            f"held-out view {evaluator.names[best_view(evaluator)]}"
+            f"{'held-out view' if held_out else 'view trained on,'} {evaluator.names[best_view(evaluator)]}"
             + ("; gray: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )

@@ -19,6 +19,9 @@ from trainer.views.view import fit_size
 SIZES = (256, 320, 384)
 """Longer sides that are tried, in pixels."""
 
+PICTURE_SIZE = 512
+"""The longest side at which a changed picture is trained on."""
+
 _WELCOME, _BEARABLE = 0.3, 0.5
 """Share of unresolved members up to which a size will do, and above which it is said."""
 
@@ -34,6 +37,7 @@ class ViewSettings:
         up: the axis of the scene that is up
         views: how many are edited; None: as the members' density asks for
         image_size: longer side in pixels; None: the same
+        pictures: changed pictures, whose cameras are the views, all of them to train on
         dense: dense members get more and larger views; what is painted or given picture by picture stays as
             small as can be, as does a draft
     """
@@ -43,6 +47,7 @@ class ViewSettings:
     views: int | None = None
     image_size: int | None = None
     dense: bool = True
+    pictures: tuple[Path, ...] = ()
 
 
 def unresolved_share(

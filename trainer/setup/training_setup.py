@@ -19,15 +19,25 @@ from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up
 from trainer.editors.base import EditKind, ImageEditor
+from trainer.editors.pictures import picture_cameras
 from trainer.editors.procedural import ColorEditor
 from trainer.store.picture_list import add_pictures
 from trainer.store.progress import Advance
 from trainer.store.run_folder import RunFolder
 from trainer.views.choose import choose_views, split_views
 from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import BACKGROUND, INSIDE, View, fit_size, name_cameras, region_rig, with_near_plane
+from trainer.views.view import (
+    BACKGROUND,
+    INSIDE,
+    View,
+    fit_size,
+    make_view,
+    name_cameras,
+    region_rig,
+    with_near_plane,
+)
 
-from .resolution import ViewSettings, choose_resolution
+from .resolution import PICTURE_SIZE, ViewSettings, choose_resolution
 
 _PROBES = 3
 
@@ -37,7 +47,16 @@ Pictures = Mapping[float, Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class TrainingSetup:
-    """The scene, the region, the views on it, and what is to be said of these."""
+    """The scene, the region, the views on it, and what is to be said of these.
+
+    Args:
+        scene, region: what is edited
+        train: views to train on
+        held_out: views to measure with; none where there are few, see `judging`
+        background: rgb. [3]
+        notes: lines for the log
+        up: the axis that is up
+    """
 
     scene: Gaussians
     region: Region
@@ -47,9 +66,20 @@ class TrainingSetup:
     notes: Sequence[str] = ()
     up: UpAxis | None = None
 
+    @property
+    def views(self) -> list[View]:
+        """All of them."""
+        return [*self.train, *self.held_out]
+
+    @property
+    def judging(self) -> Sequence[View]:
+        """What the edit is measured on: where nothing is held out, the views that it was trained on."""
+        return self.held_out or self.train
+
 
 def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region) -> TrainingSetup:
-    """The views: the best of the given cameras, or of a rig that looks at the region.
+    """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the
+    region.
 
     Raises:
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
@@ -57,6 +87,8 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
     background = torch.tensor(BACKGROUND)
     given = [] if settings.cameras is None else load_cameras(settings.cameras)
     up = find_up(scene, given, settings.up)
+    if settings.pictures:
+        return _picture_setup(settings, scene, region, given, up)
     if settings.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
@@ -79,6 +111,22 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
             "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
         )
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
+
+
+def _picture_setup(
+    settings: ViewSettings, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
+) -> TrainingSetup:
+    """The views of changed pictures. All are trained on: what one shows no other may."""
+    background, size = torch.tensor(BACKGROUND), settings.image_size or PICTURE_SIZE
+    cameras = [fit_size(camera, size) for camera in picture_cameras(settings.pictures, given)]
+    views = [
+        make_view(scene, region, camera, background)
+        for camera in with_near_plane(name_cameras(cameras), scene)
+    ]
+    for view, path in zip(views, settings.pictures, strict=True):
+        if not bool((view.mask > 0).any()):
+            raise ProgdfError(f"{path} does not show the region '{region.name}'; leave it out")
+    return TrainingSetup(scene, region, views, [], background, [f"up is {up.name}, {up.reason}"], up)
 
 
 def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:

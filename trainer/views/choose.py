@@ -126,12 +126,12 @@ def split_held_out(held_out: Sequence[T]) -> tuple[Sequence[T], Sequence[T]]:
 def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[View]]:
     """Views to train with, and up to `held_out` that the others resemble most, spread over all sides.
 
-    At most a third is held out; where that is none, the same views serve for both.
+    At most a third is held out, which of two is none.
     """
     views = choice.views
     held_out = min(held_out, len(views) // 3)
     if held_out <= 0:
-        return list(views), list(views)
+        return list(views), []
     represented = torch.zeros(len(views))
     chosen: list[int] = []
     for _ in range(held_out):

@@ -1,0 +1,131 @@
+"""`pictures:A.png`: what was rendered, changed anywhere and given back, with its camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.io.images import to_picture
+from progdf.io.picture_camera import camera_chunk
+from progdf.region import whole_scene
+from progdf.scene.orbit_rig import orbit_rig
+from tests.helpers.scenes import ball
+from trainer.editors import EditorSettings, check_new_editor, make_editor
+from trainer.editors.pictures import mend_background, picture_cameras, picture_paths, transmittance
+from trainer.views.view import View, make_view, render_view
+
+WHITE = torch.ones(3)
+
+
+def looking(scene: Gaussians, count: int = 2) -> list[Camera]:
+    return orbit_rig(scene, count, 64, 48, up=torch.tensor([0.0, -1.0, 0.0]))
+
+
+def save(path: Path, image: Tensor, camera: Camera | None) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    to_picture(image).save(path, pnginfo=camera_chunk(camera) if camera else None)
+    return path
+
+
+def views_of(scene: Gaussians, *paths: Path) -> list[View]:
+    return [make_view(scene, whole_scene(scene), camera, WHITE) for camera in picture_cameras(paths, ())]
+
+
+def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
+    scene = ball()
+    camera = looking(scene)[0]
+    path = save(tmp_path / "A.png", 1 - 0.5 * render_view(scene, camera, WHITE), camera)
+    (view,) = views_of(scene, path)
+    editor = make_editor(f"pictures:{path}", scene, whole_scene(scene), [view])
+    assert editor.stages == (1.0,)
+    assert editor.kind == "color"
+    assert torch.equal(editor.edit(view, 0.0), view.image)
+    inside = view.mask > 0.99
+    expected = 1 - 0.5 * view.image
+    assert float((editor.edit(view, 1.0) - expected)[inside].abs().max()) < 0.01
+
+
+def test_a_background_of_another_color_is_taken_for_the_run_s() -> None:
+    scene = ball()
+    camera = looking(scene)[0]
+    clear = transmittance(scene, camera)
+    for color in ([0.0, 0.0, 0.0], [0.1, 0.3, 0.8]):
+        picture = render_view(scene, camera, torch.tensor(color)).clamp(0, 1)
+        white = render_view(scene, camera, WHITE).clamp(0, 1)
+        assert float((mend_background(picture, clear) - white).abs().max()) < 0.01
+
+
+def test_a_picture_without_any_background_stays_as_it_is() -> None:
+    picture = torch.rand(8, 8, 3)
+    assert torch.equal(mend_background(picture, torch.zeros(8, 8)), picture)
+
+
+def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
+    scene = ball()
+    cameras = looking(scene)
+    paths = []
+    for name, camera in zip("AB", cameras, strict=True):
+        image = render_view(scene, camera, WHITE)
+        paths.append(save(tmp_path / f"{name}.png", 0.5 * image, camera))
+        save(tmp_path / "0.5" / f"{name}.png", 0.75 * image, None)
+    (tmp_path / "2024").mkdir()  # a folder of something else
+    spec = f"pictures:{paths[0]},{paths[1]}"
+    views = views_of(scene, *paths)
+    editor = make_editor(spec, scene, whole_scene(scene), views)
+    assert editor.stages == (0.5, 1.0)
+    half = editor.edit(views[1], 0.5)
+    assert float((half - 0.75 * views[1].image)[views[1].mask > 0.99].abs().max()) < 0.02
+    (tmp_path / "0.5" / "B.png").unlink()
+    with pytest.raises(ProgdfError, match=r"0\.5/B\.png is missing; every picture needs one"):
+        make_editor(spec, scene, whole_scene(scene), views)
+    (tmp_path / "0.5" / "A.png").rename(tmp_path / "2024" / "A.png")
+    with pytest.raises(ProgdfError, match="not between 0 and 1; name it"):
+        make_editor(spec, scene, whole_scene(scene), views)
+
+
+def test_a_picture_of_another_size_brings_its_camera_along(tmp_path: Path) -> None:
+    scene = ball()
+    camera = looking(scene)[0]
+    path = save(tmp_path / "A.png", render_view(scene, camera.resize(128, 96), WHITE), camera)
+    (found,) = picture_cameras([path], ())
+    assert (found.width, found.height) == (128, 96)
+    assert torch.allclose(found.K, camera.resize(128, 96).K)
+
+
+def test_a_picture_that_was_cropped_is_one_line(tmp_path: Path) -> None:
+    camera = looking(ball())[0]
+    path = save(tmp_path / "A.png", torch.ones(48, 48, 3), camera)
+    with pytest.raises(ProgdfError, match="48x48 pixels, it was rendered with 64x48; keep the proportions"):
+        picture_cameras([path], ())
+
+
+def test_what_is_no_list_of_pictures_is_one_line(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4)).save(tmp_path / "A.png")
+    (tmp_path / "B").mkdir()
+    Image.new("RGB", (4, 4)).save(tmp_path / "B" / "A.jpg")
+    for what, message in (
+        ("", "needs a picture; write"),
+        (f"{tmp_path}/A.png,", "needs a picture; write"),
+        (f"{tmp_path}/C.png", "does not exist; give"),
+        (f"{tmp_path}", "is a folder; give"),
+        (f"{tmp_path}/A.png,{tmp_path}/B/A.jpg", "two pictures are named A; name"),
+    ):
+        with pytest.raises(ProgdfError, match=message):
+            check_new_editor(f"pictures:{what}", EditorSettings())
+    many = [tmp_path / f"{i}.png" for i in range(33)]
+    for path in many:
+        path.touch()
+    with pytest.raises(ProgdfError, match="at most 32 pictures, not 33; give"):
+        picture_paths(",".join(str(path) for path in many))
+
+
+def test_a_comma_in_a_name_is_none_between_two(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4)).save(tmp_path / "a,b.png")
+    assert picture_paths(f"{tmp_path}/a,b.png") == (tmp_path / "a,b.png",)

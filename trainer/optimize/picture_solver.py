@@ -1,0 +1,266 @@
+"""Edits of colors from a handful of pictures: solved for, with the members tied to their neighbors.
+
+A few pictures leave most members undecided: a pixel is a mixture of many, some far behind others, and what
+no picture shows has no pixel at all. Least squares alone spreads the change over all of them. So neighbors on
+one surface are tied (a graph Laplacian over `surface_likeness`): they change alike where the pictures do not
+tell them apart, and a change travels along its surface to where no picture looks. A member behind others is
+not asked by the pixels through which it hardly shines. Colors change with the view as the paint that explains
+the edit says (`trainer.optimize.paint`), which one view cannot tell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix, diags
+from torch import Tensor
+
+from progdf.color.edits import typical_color
+from progdf.color.path import bend_of, interpolate_colors
+from progdf.gaussians import Gaussians, unpack
+from progdf.rasterize.color_maps import ColorMap
+from progdf.sh import C0, sh0_to_rgb
+from trainer.regions.lift import HIDDEN, bare_weight
+from trainer.regions.surface import surface_likeness
+from trainer.views.crops import CropScene
+
+from .color_solver import ColorView, color_columns, color_view
+from .optimizer_state import PgsState
+from .paint import fit_paint
+from .pgs import OnStep, ParameterSnapshot, TargetStage
+
+RECORDINGS = 8
+"""Of the way to the finished edit, straight in OKLab with a bow; of all strengths together."""
+
+_TIES = 0.01
+"""How strongly neighbors are tied, beside what the pictures say of a typical member."""
+
+_RIDGE = 1e-5
+"""The same for being what the paint says, or as they were."""
+
+_ROUNDS, _STEPS, _EXACT = 4, 120, 1e-3
+
+
+@dataclass(frozen=True)
+class PictureSolver:
+    """The pictures and the ties, ready to be solved.
+
+    Args:
+        views: of the pictures; see `ColorView`
+        shown: what the pictures say of each member, Σ w² of all pixels; 0 behind others. [M] float64
+        ties: graph Laplacian, as strong as it is to be
+        ridge: see `_RIDGE`
+        colors: the members' own, of DC. [M,3] float64
+        bands: their own higher bands as far as they follow. [M,B-1,3] float64
+    """
+
+    views: Sequence[ColorView]
+    shown: Tensor
+    ties: csr_matrix
+    ridge: float
+    colors: Tensor
+    bands: Tensor
+
+    @property
+    def unseen(self) -> int:
+        """How many members no picture tells anything of."""
+        return int((self.shown == 0).sum())
+
+    def solve(self, targets: Sequence[Tensor], start: Tensor) -> Tensor:
+        """The offsets of DC and bands that the pictures ask for. [M,B,3] -> [M,B,3]
+
+        Args:
+            targets: the edited boxes
+            start: where to begin
+        """
+        change, bands = start[:, 0].double() * C0, start[:, 1:].double()
+        prior = torch.zeros_like(change)
+        for _ in range(_ROUNDS):
+            asked = self._gradient(self._offsets(change, bands), targets)
+            held = change - prior
+            change = change - self._conjugate_gradients(asked + self._tie(held))
+            paint = fit_paint(self.colors, change, self.shown)
+            # where one function of color is the edit, what no picture shows follows it too
+            prior = paint.full if paint.whole else torch.zeros_like(change)
+            amounts = paint.trust * paint.amounts
+            bands = amounts[:, None, None] * (self.bands @ paint.slope)
+        asked = self._gradient(self._offsets(change, bands), targets)
+        change = change - self._conjugate_gradients(asked + self._tie(change - prior))
+        return self._offsets(change, bands)
+
+    def left(self, offsets: Tensor, targets: Sequence[Tensor]) -> tuple[float, float]:
+        """Mean squared and mean absolute difference from the targets."""
+        squared = absolute = count = 0.0
+        for view, target in zip(self.views, targets, strict=True):
+            apart = view.picture(view.colors(offsets)).clamp(0.0, 1.0) - target
+            squared += float(apart.square().sum())
+            absolute += float(apart.abs().sum())
+            count += target.numel()
+        return squared / max(1.0, count), absolute / max(1.0, count)
+
+    def _offsets(self, change: Tensor, bands: Tensor) -> Tensor:
+        return torch.cat([change[:, None] / C0, bands], dim=1).float()
+
+    def _gradient(self, offsets: Tensor, targets: Sequence[Tensor]) -> Tensor:
+        """Of half the squared error, in the members' colors, pixels pulling back into range. [M,3] float64"""
+        total = torch.zeros(len(self.shown), 3, dtype=torch.float64)
+        for view, target in zip(self.views, targets, strict=True):
+            rendered = view.picture(view.colors(offsets))
+            apart = rendered.clamp(0.0, 1.0) - target
+            passed = ((rendered >= 0.0) | (apart < 0.0)) & ((rendered <= 1.0) | (apart > 0.0))
+            total += view.map.gradient(apart * passed)
+        return total * (self.shown > 0)[:, None]
+
+    def _tie(self, x: Tensor) -> Tensor:
+        return torch.from_numpy(self.ties @ x.numpy()) + self.ridge * x
+
+    def _apply(self, x: Tensor) -> Tensor:
+        asked = (self.shown > 0)[:, None]
+        total = torch.zeros_like(x)
+        for view in self.views:
+            total += view.map.gradient(view.map.picture(x * asked))
+        return total * asked + self._tie(x)
+
+    def _conjugate_gradients(self, b: Tensor) -> Tensor:
+        """The solution x of `_apply(x)` = b, channel by channel, to `_EXACT` of b. [M,3]"""
+        diagonal = (self.shown + torch.from_numpy(self.ties.diagonal()) + self.ridge)[:, None]
+        x, r = torch.zeros_like(b), b.clone()
+        z = r / diagonal
+        p, rz = z.clone(), (r * z).sum(dim=0)
+        enough = _EXACT**2 * rz
+        for _ in range(_STEPS):
+            if bool((rz <= enough).all()):
+                break
+            applied = self._apply(p)
+            length = rz / (p * applied).sum(dim=0).clamp_min(1e-300)
+            x, r = x + length * p, r - length * applied
+            z = r / diagonal
+            after = (r * z).sum(dim=0)
+            p, rz = z + after / rz.clamp_min(1e-300) * p, after
+        return x
+
+
+def make_picture_solver(
+    scene: Gaussians, members: Tensor, crops: Sequence[CropScene], original: Tensor, follow: bool
+) -> PictureSolver:
+    """Prepare.
+
+    Args:
+        scene: the original
+        members: rows of the region. [M] int64
+        crops: the pictures' boxes
+        original: raw member rows, packed. [M,C]
+        follow: the bands beyond DC follow the paint; else they stay as they are
+    """
+    region = unpack(original, crops[0].member_shN)
+    bands = min(region.shN.shape[1], 15) if follow else 0
+    views = [color_view(crop, original, 1 + bands) for crop in crops]
+    told = torch.zeros(len(members), dtype=torch.float64)
+    clear = torch.zeros(len(members), dtype=torch.float64)
+    for view in views:
+        squares, mean = _weights_of(view.map)
+        told += squares
+        clear = torch.maximum(clear, mean)
+    hidden = clear < HIDDEN * bare_weight(scene[members].opacities).double()
+    shown = told.masked_fill(hidden, 0.0)
+    typical = float(shown.square().sum() / shown.sum().clamp_min(1e-30))
+    return PictureSolver(
+        views,
+        shown,
+        _laplacian(scene[members]) * (_TIES * typical),
+        max(_RIDGE * typical, 1e-12),
+        sh0_to_rgb(region.sh0).double(),
+        region.shN[:, :bands].double(),
+    )
+
+
+def solve_pictures(
+    original: Tensor,
+    solver: PictureSolver,
+    stages: Sequence[TargetStage],
+    state: PgsState,
+    on_step: OnStep,
+) -> Iterator[ParameterSnapshot]:
+    """Solve for each stage, and record the way there from the one before: straight in OKLab with the bow.
+
+    Args:
+        original: raw member rows, packed. [M,C]
+        solver: the pictures
+        stages: strengths ascending; their steps are the recordings of each
+        state: where to go on from, changed in place; a step is a recording
+        on_step: progress; here, and only here, the state is whole and may be saved
+
+    Raises:
+        FloatingPointError: a solution is not finite; the state is that of the step before.
+    """
+    columns = color_columns(original.shape[1], 1 + solver.bands.shape[1])
+    finished = stages[-1].targets
+    for index in range(state.stage, len(stages)):
+        stage = stages[index]
+        before = state.previous[:, columns].reshape(len(original), -1, 3)
+        end = solver.solve(stage.targets, before)
+        if not math.isfinite(float(end.sum())):
+            raise FloatingPointError(f"the solution for strength {stage.strength:g} is not finite")
+        way = _color_way(solver, before, end)
+        while state.local < stage.steps:
+            offsets = way((state.local + 1) / stage.steps)
+            squared, state.running = solver.left(offsets, finished)
+            with torch.no_grad():
+                state.moved[:, columns] = offsets.flatten(1)
+            state.means.add({"l2": squared, "left": state.running})
+            state.step, state.local = state.step + 1, state.local + 1
+            state.average.copy_(state.moved.detach())
+            state.recorded += 1
+            last = state.local == stage.steps
+            yield ParameterSnapshot(state.step, index, last, state.average.clone(), state.means.read())
+            if last:
+                state.previous.copy_(state.moved.detach())
+                state.stage, state.local = index + 1, 0
+                on_step(state.step, state.running)
+                break
+            on_step(state.step, state.running)
+
+
+def _color_way(solver: PictureSolver, start: Tensor, end: Tensor) -> Callable[[float], Tensor]:
+    """The members' offsets at each share of the way from one strength's to the next one's. [M,B,3]"""
+    own = solver.colors.float()
+    first, last = own + C0 * start[:, 0], own + C0 * end[:, 0]
+    inside = last.clamp(0.0, 1.0)
+    weights = solver.shown.float() * (last - first).norm(dim=1)
+    bend = bend_of(typical_color(first, weights), typical_color(last, weights))
+
+    def at(share: float) -> Tensor:
+        if share >= 1.0:
+            return end
+        colors = interpolate_colors(first, inside, share, bend) + share * (last - inside)
+        offsets = torch.lerp(start, end, share)
+        offsets[:, 0] = (colors - own) / C0
+        return offsets
+
+    return at
+
+
+def _weights_of(weighed: ColorMap) -> tuple[Tensor, Tensor]:
+    """Of each Gaussian: Σ w² over its pixels, and its mean weight there. [M] float64 each"""
+    runs = weighed.runs
+    rows = np.repeat(runs.rows, np.diff(runs.starts))
+    weights = runs.weights.astype(np.float64)
+    squares = np.bincount(rows, weights**2, weighed.count)
+    mean = np.bincount(rows, weights, weighed.count) / np.bincount(rows, None, weighed.count).clip(1)
+    return torch.from_numpy(squares), torch.from_numpy(mean)
+
+
+def _laplacian(region: Gaussians) -> csr_matrix:
+    """Of the graph of neighbors on one surface, each with ties of 1 on the mean. [M,M]"""
+    count = len(region)
+    if count < 3:
+        return csr_matrix((count, count))
+    near, likeness = surface_likeness(region, torch.arange(count))
+    rows = np.repeat(np.arange(count), near.shape[1])
+    ties = csr_matrix((likeness.double().numpy().ravel(), (rows, near.numpy().ravel())), (count, count))
+    ties = 0.5 * (ties + ties.T)
+    return csr_matrix(diags(np.asarray(ties.sum(axis=1)).ravel()) - ties)
