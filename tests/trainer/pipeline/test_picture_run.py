@@ -1,0 +1,107 @@
+"""A run on one changed picture: `progdf train --editor pictures:A.png`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.compose.reference import Layer, compose_layers
+from progdf.errors import ProgdfError
+from progdf.formats.ply import load_ply
+from progdf.gdf.file import load_gdf
+from progdf.io.images import to_picture
+from progdf.io.picture_camera import camera_chunk
+from progdf.metrics.image import decibels
+from progdf.region import Region
+from progdf.scene.region_spec import parse_region
+from tests.helpers.trained import quick_options, train
+from trainer.editors import make_editor
+from trainer.evaluate.command import evaluate_folder
+from trainer.evaluate.options import EvaluateOptions
+from trainer.pipeline.run import RunResult
+from trainer.setup.resolution import ViewSettings
+from trainer.setup.training_setup import make_training_setup
+from trainer.views.view import View, render_view
+
+SPEC = "recolor:#3060d0"
+
+
+@pytest.fixture(scope="module")
+def views(folder: Path) -> tuple[View, ...]:
+    """Views of the bear's region, the first of which is the picture's."""
+    scene, region = bear(folder)
+    setup = make_training_setup(ViewSettings(views=12, image_size=96), scene, region)
+    return tuple(setup.views)
+
+
+def bear(folder: Path) -> tuple:  # type: ignore[type-arg]
+    scene = load_ply(folder / "scene.ply")
+    return scene, parse_region(quick_options(folder).region, scene)
+
+
+@pytest.fixture(scope="module")
+def picture(folder: Path, views: tuple[View, ...]) -> Path:
+    """The first view, recolored, as a .png that carries its camera."""
+    scene, region = bear(folder)
+    edited = make_editor(SPEC, scene, region, views).edit(views[0], 1.0)
+    to_picture(edited).save(folder / "A.png", pnginfo=camera_chunk(views[0].camera))
+    return folder / "A.png"
+
+
+@pytest.fixture(scope="module")
+def done(folder: Path, picture: Path) -> RunResult:
+    options = replace(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
+    return train(options, quiet=True)
+
+
+def test_other_sides_follow_a_fill_from_one_picture(
+    folder: Path, done: RunResult, views: tuple[View, ...]
+) -> None:
+    scene, region = bear(folder)
+    edited = compose_layers(scene, [Layer(load_gdf(done.gdf, scene), 1.0)])
+    truth = make_editor(SPEC, scene, region, views)
+    for view in views[1:]:
+        shown, counts = render_view(edited, view.camera, torch.ones(3)).clamp(0, 1), view.mask > 0.05
+        error = decibels(float((shown - truth.edit(view, 1.0))[counts].square().mean()))
+        unedited = decibels(float((view.image - truth.edit(view, 1.0))[counts].square().mean()))
+        assert error > unedited + 6.0  # 7.5 at the least when written
+
+
+def test_the_report_says_that_nothing_was_held_out(done: RunResult) -> None:
+    views = done.report["views"]
+    assert views["held_out"] is False
+    assert views["edit"] == ["A"]
+    log = done.folder.log.read_text()
+    assert "no view is held out: all figures are of the views that were trained on" in log
+    assert "the views trained on: " in log
+    assert json.loads(done.folder.report.read_text())["trajectory"]["slider"] == "even"
+
+
+def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
+    assert len(done.trajectory) > 4  # straight in OKLab, not two keyframes
+    assert done.report["slider"]["uniformity"] > 0.7
+
+
+def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluate_folder(EvaluateOptions(done.folder.root))
+    assert "no two held-out views see enough of the same" in capsys.readouterr().out
+
+
+def test_a_picture_without_camera_is_refused_before_the_scene_is_read(folder: Path) -> None:
+    to_picture(torch.ones(8, 8, 3)).save(folder / "bare.png")
+    options = replace(quick_options(folder), out=folder / "bare", editor=f"pictures:{folder / 'bare.png'}")
+    with pytest.raises(ProgdfError, match="does not say from where it was rendered"):
+        train(options, quiet=True)
+    assert not (folder / "bare").exists()
+
+
+def test_a_picture_that_does_not_show_the_region_is_one_line(folder: Path, picture: Path) -> None:
+    scene, region = bear(folder)
+    away = Region("nothing there", region.members, region.score)
+    far = replace(scene, means=scene.means + 1e4)
+    with pytest.raises(ProgdfError, match="does not show the region 'nothing there'; leave it out"):
+        make_training_setup(ViewSettings(pictures=(picture,)), far, away)
