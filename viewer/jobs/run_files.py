@@ -61,7 +61,7 @@ def edits_folder(scene: Path, memory: Path | None = None) -> Path:
     """
     scene = scene.resolve()
     beside = scene.with_name(f"{scene.stem}.edits")
-    if _takes_files(beside if beside.is_dir() else scene.parent):
+    if takes_files(beside if beside.is_dir() else scene.parent):
         return beside
     digest = hashlib.sha256(str(scene).encode("utf-8", "surrogateescape")).hexdigest()[:8]
     return (memory or state_folder()) / "edits" / f"{scene.stem}-{digest}"
@@ -146,7 +146,7 @@ def recorded_edit(order: EditOrder, recording: Path, scene: Gaussians) -> Gdf | 
         return None
 
 
-def _takes_files(folder: Path) -> bool:
+def takes_files(folder: Path) -> bool:
     """Whether a folder is meant to be written to: root may write into folders that are read-only for all."""
     try:
         return bool(folder.stat().st_mode & 0o222) and os.access(folder, os.W_OK)

@@ -105,9 +105,11 @@ def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -
     press(window, "Ctrl+N")
     assert window.main_view.work.form.region == SELECTION
     request(window, "train")
-    assert any(
-        word.startswith("--region=file:") and word.endswith("blue.region.npy") for word in Trainer.said
-    )
+    region = next(word for word in Trainer.said if word.startswith("--region="))
+    assert region.startswith("--region=file:")
+    assert region.endswith("blue.region.npy")
+    after = window.main_view.work.view.selection
+    assert (after.count, [kept.name for kept in after.regions]) == (0, ["blue"]), "it is a region now"
 
 
 def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> None:

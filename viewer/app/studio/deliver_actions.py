@@ -14,6 +14,7 @@ from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path
 from viewer.jobs.delivery import Deliveries, DeliverOptions
+from viewer.jobs.run_files import takes_files
 from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
 from viewer.state.workspace import Dialog
 
@@ -81,7 +82,9 @@ class DeliverActions:
             chosen = moving[0] if keys or focus is None else view.layers[focus].name
             fps = view.timeline.fps if keys else DeliverOptions.fps
             options = replace(options, moves=chosen, can_move=moving, fps=fps, width=1280, height=720)
-        path = _free(document.path.with_name(f"{document.path.stem}_edited{ASKS[name]}"))
+        beside = document.path.resolve().parent
+        folder = beside if takes_files(beside) else Path.cwd()
+        path = _free(folder / f"{document.path.stem}_edited{ASKS[name]}")
         main_view.ask(Dialog(name, str(path), options=options))
 
     def _deliver(self, kind: str) -> None:

@@ -20,7 +20,7 @@ from viewer.jobs import run_files
 from viewer.jobs.new_edit import ALL, SELECTION, TYPED, NewEdit
 from viewer.jobs.training_job import EditOrder, TrainingJob
 from viewer.jobs.training_queue import TrainingQueue, spare_threads
-from viewer.state.selection import SUFFIX, unpack
+from viewer.state.selection import NOBODY, SUFFIX, add_region, free_name, unpack
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog
 
@@ -118,6 +118,16 @@ class TrainingActions:
         region = self.region_spec(form, out.parent, out.name)
         order = EditOrder(scene.resolve(), out, out.name, region, form.spec, form.quick, spare_threads())
         self.queue.add(order)
+        if form.region == SELECTION:
+            self._keep_selection(out)
+
+    def _keep_selection(self, out: Path) -> None:
+        """The selection becomes a region of its own, so that its tint does not hide what is trained."""
+        main_view = self._app.main_view
+        view = main_view.work.view
+        name = free_name(view.selection, out.name)
+        kept = add_region(view.selection, name, out.with_name(f"{out.name}{SUFFIX}"))
+        main_view.change(replace(view, selection=replace(kept, members=NOBODY, count=0)))
 
     def region_spec(self, form: NewEdit, folder: Path, name: str) -> str:
         """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
