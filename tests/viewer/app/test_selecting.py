@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from imgui_bundle import imgui
 from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
-from viewer.state.selection import unpack
+from viewer.state import selection
+from viewer.state.selection import SelectionState, unpack
 from viewer.state.view_state import SelectTool
 
 pytestmark = pytest.mark.gl
@@ -262,3 +264,33 @@ def test_the_mouse_on_the_name_of_a_layer_shows_its_region(hand: Rig) -> None:
     hand.frame(3)
     assert hand.main_view.work.pointed is None
     assert (hand.picture() == before).all()
+
+
+def test_the_panel_selects_shows_and_keeps_regions() -> None:
+    mask = bear().demo.labels.numpy() == 1
+    kept = selection.add_region(selection.select(SelectionState(), mask), "scarf", Path("scarf.region.npy"))
+    some = selection.select(kept, np.arange(len(mask)) < 100)
+    view = replace(first_view(bear(), 0.7, 0.5), selection=some, select=SelectTool("lasso"))
+    with rig(view, (1024, 640)) as hand:
+        row, eye, save = (850.0, 545.0), (748.0, 545.0), (874.0, 475.0)
+        hand.modifier(imgui.Key.mod_shift)
+        hand.click(*row)
+        hand.modifier(imgui.Key.mod_shift, False)
+        assert (selected(hand) == mask | (np.arange(len(mask)) < 100)).all()
+        hand.click(*row)
+        assert (selected(hand) == mask).all()
+        assert undos(hand) == 2
+        plain = hand.picture()
+        hand.click(*eye)
+        assert hand.main_view.work.view.selection.regions[0].visible
+        hand.key("Escape")
+        assert (hand.picture() != plain).any()
+        hand.key("L")
+        hand.click(*save)
+        hand.frame(3)
+        hand.io.add_input_characters_utf8("hat")
+        hand.frame(2)
+        hand.modifier(imgui.Key.enter)
+        hand.modifier(imgui.Key.enter, False)
+        hand.frame(2)
+        assert hand.main_view.take_requests() == ("save_region:hat",)
