@@ -55,6 +55,7 @@ class Delivery:
         out: the file or folder
         status: where it stands
         done, total: frames; 0 of 0 while nothing is known
+        note: what the command said last
         seconds: that it has run
         error: the one line of a failure
     """
@@ -65,6 +66,7 @@ class Delivery:
     status: Status = "running"
     done: int = 0
     total: int = 0
+    note: str = ""
     seconds: float = 0.0
     error: str = ""
 
@@ -120,9 +122,11 @@ class Deliveries:
                 continue
             status = child.status
             if status is None:
-                done, total = _frames(child.log)
+                note = last_line(child.log)
+                found = re.search(r"frame (\d+)/(\d+)", note)
+                done, total = (int(found[1]), int(found[2])) if found else (0, 0)
                 seconds = time.monotonic() - self._began[delivery.number]
-                self._change(replace(delivery, done=done, total=total, seconds=seconds))
+                self._change(replace(delivery, done=done, total=total, note=note, seconds=seconds))
                 continue
             self._children.pop(delivery.number).close()
             if status and delivery.status != "stopping":
@@ -150,9 +154,3 @@ class Deliveries:
     def _change(self, delivery: Delivery) -> Delivery:
         self.shown = tuple(delivery if old.number == delivery.number else old for old in self.shown)
         return delivery
-
-
-def _frames(log: Path) -> tuple[int, int]:
-    """How many frames of how many are drawn, as the last line of a log says."""
-    found = re.search(r"frame (\d+)/(\d+)", last_line(log))
-    return (int(found[1]), int(found[2])) if found else (0, 0)

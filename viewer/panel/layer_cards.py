@@ -104,7 +104,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
     """All cards. `expected`: layers are about to come."""
     if not state.layers and not expected:
         imgui.push_text_wrap_pos(0.0)
-        imgui.text_disabled("No edits yet. Make a new one (Ctrl+N), or drop a .gdf file on the window.")
+        imgui.text_disabled("No edits yet. Make one (Ctrl+N), or drop a .gdf file on the window.")
         imgui.pop_text_wrap_pos()
     focus, renaming, overlap = cards.focus, None, None
     pointed: Pointed | None = None

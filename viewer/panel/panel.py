@@ -147,7 +147,8 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     actions += training_cards.draw(shown.jobs, ui)
     actions += training_cards.draw_deliveries(shown.deliveries, ui)
     cards = layer_card.Cards(shown.rows, shown.focus, shown.reveal, shown.active_slider, shown.renaming)
-    drawn = layer_cards.draw(state, cards, ui, bool(shown.jobs) or form is not None)
+    expected = bool(shown.jobs or shown.deliveries) or form is not None
+    drawn = layer_cards.draw(state, cards, ui, expected)
     state, focus = drawn.state, drawn.focus
     actions += drawn.actions
     if state.brush.active:

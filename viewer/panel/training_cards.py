@@ -32,7 +32,11 @@ def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
     for delivery in deliveries:
         share = delivery.done / delivery.total if delivery.total else 0.0
         left = delivery.seconds_left
-        said = [f"frame {delivery.done} of {delivery.total}"] if delivery.total else ["Starting"]
+        said = (
+            [f"frame {delivery.done} of {delivery.total}"]
+            if delivery.total
+            else [delivery.note or "Starting"]
+        )
         said += [f"{duration(left)} left"] if left is not None else []
         failed = delivery.status == "failed"
         line = (

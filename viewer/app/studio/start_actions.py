@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import moderngl
@@ -19,6 +20,8 @@ from .start_page import RecentFile, shown_files
 from .training_actions import StudioApplication
 
 POLL_S = 0.5
+SKY = (0.749, 0.847, 0.945)
+"""Behind the demo's bear."""
 
 
 class StartActions:
@@ -64,6 +67,9 @@ class StartActions:
             return None
         if own is None and scene.is_file():
             self._app.open(scene)
+            main_view = self._app.main_view
+            view = replace(main_view.work.view, background=SKY)
+            main_view.work = replace(main_view.work, view=view)
         edits = sorted(self._demo.glob("*/*.gdf"), key=lambda path: path.stat().st_mtime)
         for path in edits if self._app.document.path is not None else ():
             if path not in self._added:
