@@ -119,6 +119,8 @@ class FileActions:
         if path != self.path and path.is_file() and kind_of(path) != "session":
             raise ProgdfError(f"{path} is not a session; choose another name")
         self._write(path)
+        for region in self._app.main_view.work.view.selection.regions:
+            regions.region_file(region, len(self._app.document.scene))
         self.session_autosave.drop()
         self.path = path
         main_view = self._app.main_view

@@ -72,6 +72,8 @@ def test_the_window_keeps_a_region_beside_the_scene_and_in_the_session(tmp_path:
         assert [region.name for region in work.view.selection.regions] == ["coat"]
         assert (tmp_path / "coat.region.npy").exists()
         assert app.file_actions.has_unsaved
+        (tmp_path / "coat.region.npy").unlink()
         app.file_actions.save(tmp_path / "work")
+        assert (tmp_path / "coat.region.npy").exists(), "a session that is saved has its regions"
         app.file_actions.open(tmp_path / "work.session.json")
         assert app.main_view.work.view.selection == work.view.selection
