@@ -22,15 +22,12 @@ from progdf.compose.layers import Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.rasterize import render
+from progdf.scene.selection import front_surface, project_centers
 
 from .view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush
 
 FULL = ""
 """The paint of a layer that was never painted: weight 1 everywhere."""
-
-_COARSE = 4  # the depth of the surface is looked up in a picture so many times smaller
-_BEHIND = 0.01  # of the depth: what lies no further behind the surface still belongs to it
 
 Floats = NDArray[np.float32]
 
@@ -128,19 +125,14 @@ def begin_stroke(
     """
     weights, count = decode(paint, len(gdf.region)), len(gdf.region)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()
-    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    depth_of_all = (scene.means @ rotation.T + translation)[:, 2].numpy()
-    members = gdf.region.members
-    local = (scene.means[members] @ rotation.T + translation).numpy()
-    depth = local[:, 2]
+    members = gdf.region.members.numpy()
+    centers = project_centers(scene, camera)
+    points, depths = centers.points[members], centers.depths[members]
     with np.errstate(divide="ignore", invalid="ignore"):
-        places = local[:, :2] / depth[:, None] * camera.K.diagonal()[:2].numpy() + camera.K[:2, 2].numpy()
-        places = np.column_stack([places, float(camera.K[0, 0]) * np.log(depth)])
-    reachable = np.isfinite(places).all(1) & (depth > 0.0)
+        places = np.column_stack([points, float(camera.K[0, 0]) * np.log(depths)])
+    reachable = np.isfinite(places).all(1)
     if not through:
-        size = scene.log_scales[members].amax(1).exp().numpy()
-        surface = _surface(scene, depth_of_all, camera, np.where(reachable[:, None], places, 0.0))
-        reachable &= depth <= surface * (1.0 + _BEHIND) + size
+        reachable &= front_surface(scene, camera, centers, members)
     places = np.where(reachable[:, None], places, np.nan).astype(np.float32)
     return Stroke(before, places, np.zeros(count, np.float32), mode)
 
@@ -208,21 +200,6 @@ def feather(paint: str, points: Floats, width: float) -> str:
     soft, somewhere = weights.numpy().copy(), np.isfinite(points).all(1)
     soft[somewhere] = near_mean(points[somewhere], soft[somewhere], width)
     return encode(soft)
-
-
-def _surface(scene: Gaussians, depths: Floats, camera: Camera, places: Floats) -> Floats:
-    """Depth of the front surface at each place, infinite on the background. [M]"""
-    width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
-    small = camera.resize(width, height)
-    with torch.no_grad():
-        as_colors = torch.from_numpy(depths).float()[:, None].expand(-1, 3).contiguous().nan_to_num()
-        image, clear, _ = render(scene, small, (0.0, 0.0, 0.0), colors=as_colors)
-    covered = 1.0 - clear.reshape(height, width).numpy()
-    depth = np.where(covered > 0.05, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
-    column = np.clip(places[:, 0] / camera.width * width, 0, width - 1).astype(int)
-    row = np.clip(places[:, 1] / camera.height * height, 0, height - 1).astype(int)
-    found: Floats = depth[row, column].astype(np.float32)
-    return found
 
 
 _LEAST = float(np.finfo(np.float64).tiny)  # a corner without a share has no mean, and gives none
