@@ -222,15 +222,20 @@ def _targets(plan: Plan, shared: AblationSetup) -> Pictures:
 
 @contextmanager
 def _count_processor_seconds(state: StateFolder) -> Iterator[None]:
-    """Keep beside a state what processor time it took, all sessions together."""
-    before, begun = _processor_seconds(state), time.process_time()
+    """Keep beside a state what processor time it took, all sessions together; a look at what is done takes
+    none."""
+    saved, begun, done = state.load("processor"), time.process_time(), False
     try:
         yield
+        done = True
     finally:
-        state.save("processor", {}, {"seconds": before + time.process_time() - begun})
+        if saved is None or not saved.values["done"]:
+            spent = _processor_seconds(state) + time.process_time() - begun
+            state.save("processor", {}, {"seconds": spent, "done": done})
 
 
 def _processor_seconds(state: StateFolder) -> float:
+    """Seconds so far."""
     saved = state.load("processor")
     return float(saved.values["seconds"]) if saved is not None else 0.0
 

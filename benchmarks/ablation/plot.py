@@ -11,6 +11,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Drawing
+from matplotlib.ticker import LogLocator, NullLocator
 from torch import Tensor
 
 from trainer.report.plots import GRID, INK, LINES, PALE, PAPER
@@ -50,7 +51,8 @@ def plot_ablations(ablations: Sequence[Ablation]) -> Tensor:
         _draw_panel(panel, figure, lines, [ablation.name for ablation in ablations])
     panels[0].set_yticks(range(len(lines)), [line.name for line in lines], fontsize=8, color=_hex(INK))
     panels[0].set_ylim(len(lines) - 0.4, -0.6)
-    panels[0].legend(loc="lower left", fontsize=8, frameon=False)
+    handles, labels = panels[0].get_legend_handles_labels()
+    drawing.legend(handles, labels, loc="upper left", fontsize=9, frameon=False, ncols=len(labels))
     drawing.tight_layout()
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -67,6 +69,9 @@ def _draw_panel(panel: Axes, figure: Figure, lines: Sequence[_Line], runs: Seque
         spine.set_visible(False)
     if figure.short == "s":
         panel.set_xscale("log")
+        panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_locator(NullLocator())
     for run, name in enumerate(runs):
         color, shift = _hex(LINES[run % len(LINES)]), 0.16 * (2 * run - len(runs) + 1)
         found = {
