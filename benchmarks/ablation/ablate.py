@@ -19,27 +19,18 @@ from torch import Tensor
 
 from benchmarks.table import machine, put_tables
 from progdf.errors import ProgdfError
-from progdf.field import BakedField, fit_keyframes
-from progdf.field.remap import identity_remap
 from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
-from progdf.interpolation import interpolate_at
 from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import write_image
 from progdf.io.json_values import decode_json, plain
-from progdf.metrics.slider import slider_statistics
-from trainer.fit.fit import drop_idle_attributes, fit_field
-from trainer.fit.network import PART as NETWORK
-from trainer.fit.network import fit_network
-from trainer.fit.slider_uniformity import equalize_slider
+from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.settings import resolve_slider
 from trainer.optimize.unseen import unseen_members_of
 from trainer.pipeline.reopen import reopen_run
 from trainer.pipeline.threads import use_threads
 from trainer.pipeline.training import JointNetwork, optimize_members, retime_trajectory
 from trainer.plan import Plan, plan_optimization
-from trainer.report.curves import against_editor
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.setup.training_setup import Pictures, whole_views
 from trainer.store.images import read_picture
@@ -48,6 +39,7 @@ from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json
 from trainer.store.state import StateFolder
 
+from .judge import fit_variant, with_figures
 from .options import AblateOptions
 from .plot import plot_ablations
 from .setup import AblationSetup, digest_of, edit_at_equal_strengths, make_ablation_setup, run_plan
@@ -158,7 +150,7 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     log = RunLog(folder / "log.txt", quiet)
     try:
         trajectory = _record(plan, shared, perceptual, state, log)
-        field, asked = _fit(variant, trajectory, shared, plan, perceptual, state, log)
+        field, asked = fit_variant(variant, trajectory, shared, plan, perceptual, state, log)
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
@@ -167,7 +159,7 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     finally:
         log.close()
     outcome = replace(outcome, seconds=round(_processor_seconds(state), 2))
-    outcome = _evaluate(outcome, field, shared, asked, perceptual_loss()[0])
+    outcome = with_figures(outcome, field, shared, asked, perceptual_loss()[0])
     region, scene = shared.run.region, shared.run.scene
     told = plain(replace(plan, name=variant.name))
     gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, told)
@@ -238,74 +230,6 @@ def _processor_seconds(state: StateFolder) -> float:
     """Seconds so far."""
     saved = state.load("processor")
     return float(saved.values["seconds"]) if saved is not None else 0.0
-
-
-def _fit(
-    variant: Variant,
-    trajectory: Trajectory,
-    shared: AblationSetup,
-    plan: Plan,
-    perceptual: Perceptual,
-    state: StateFolder,
-    log: RunLog,
-) -> tuple[BakedField, Mapping[float, float]]:
-    """The variant's field, and where on its slider it was shown which of the editor's strengths."""
-    if variant.linear:
-        offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-        return fit_keyframes(trajectory.s, offsets, 2), {}
-    evaluator, seen = shared.evaluators(trajectory.offsets)
-    remap, (choosing, reporting) = identity_remap(), evaluator.halves()
-    if plan.field.field == "neural":
-        begun, network = state.load(NETWORK), plan.field.network
-        weights, setup = shared.weights, shared.setup
-        field = fit_network(
-            trajectory, setup, seen, reporting, weights, network, perceptual, log, begun
-        ).field
-    else:
-        target = shared.plan.field.target_psnr
-        fitted = fit_field(trajectory, seen, choosing, reporting, shared.weights, "auto", target)
-        field = fitted.chosen.field
-        if resolve_slider(plan.slider, trajectory.strengths) == "even":
-            field, remap = equalize_slider(field, shared.setup)
-    return field, {strength: remap.at(s) for s, strength in trajectory.asked}
-
-
-def _slider_value(asked: Mapping[float, float], strength: float, at: float) -> float:
-    """Where on its slider a variant shows a strength: as it was asked, or between what it was asked; on the
-    run's own slider where it was shown the end alone."""
-    if strength in asked or len(asked) < 2:
-        return asked.get(strength, at)
-    knots = torch.tensor([0.0, *asked], dtype=torch.float64)
-    return float(interpolate_at(knots, torch.tensor([0.0, *asked.values()], dtype=torch.float64), strength))
-
-
-def _evaluate(
-    outcome: Outcome,
-    field: BakedField,
-    shared: AblationSetup,
-    asked: Mapping[float, float],
-    measure: Perceptual,
-) -> Outcome:
-    """With the figures that the field deserves; where it was shown no picture, on the run's own slider."""
-    evaluator, _ = shared.evaluators(field.offsets(1.0)[None])
-    shown = [
-        (s, _slider_value(asked, e, at), e)
-        for s, (at, e) in zip(SHOWN[1:], shared.columns[1:], strict=True)
-        if e
-    ]
-    course = against_editor(evaluator, {"slider": field}, [(at, e) for _, at, e in shown], measure)["slider"]
-    slider = slider_statistics(lambda s: evaluator.pictures(field.offsets(s)), masks=evaluator.pixels)
-    return replace(
-        outcome,
-        psnr=round(course.psnr[-1], 2),
-        ssim=round(course.ssim[-1], 4),
-        lpips=round(course.lpips[-1], 4),
-        between={f"{s:g}": round(p, 2) for (s, *_), p in zip(shown[:-1], course.psnr, strict=False)},
-        uniformity=round(slider.uniformity, 3),
-        t50=round(slider.t50, 3),
-        t90=round(slider.t90, 3),
-        bytes_per_member=round(field.bytes_per_member, 1),
-    )
 
 
 def _save_outcome(
