@@ -165,8 +165,8 @@ def table_of(ablations: Sequence[Ablation], title: str) -> Table:
         "views; the slider near a quarter, half and three quarters against the editor's own pictures, their "
         "mean (–: it was not asked); least over largest visible change of 20 equal steps; slider value at 50 "
         "and 90 % of the change; bytes of the field per member; of the optimization alone. "
-        "± is the standard deviation over the seeds; a row of one seed is solved for, and no seed changes a "
-        "bit of it."
+        "± is the standard deviation over the seeds; what is solved for is the same with every seed and is "
+        "trained once."
     )
     if len(ablations) > 1:
         note += f" A cell's lines: {', '.join(ablation.name for ablation in ablations)}."
