@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-Setting = Literal["color", "amount", "style", "sentence", "folder"]
+Setting = Literal["color", "amount", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
 
 ALL, SELECTION, TYPED = "all", "selection", "typed"
@@ -56,6 +56,9 @@ EDITORS = (
     EditorChoice(
         "instruct", "Instruction", "sentence", "A sentence for a model", "diffusers", "diffusion", False
     ),
+    EditorChoice(
+        "pictures", "Edited pictures", "pictures", "Rendered here (Ctrl+P), changed anywhere", pictured=False
+    ),
     EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
 )
 
@@ -74,6 +77,7 @@ class NewEdit:
         style: number of a painting
         sentence: for the model
         folder: of edited views
+        pictures: that were rendered and changed, joined by commas
         name: of the layer; "" takes the editor's
         quick: a draft in a third of the time
         preview: show the editor's own picture of the present view
@@ -90,6 +94,7 @@ class NewEdit:
     style: int = BEST_STYLES[0]
     sentence: str = ""
     folder: str = ""
+    pictures: str = ""
     name: str = ""
     quick: bool = True
     preview: bool = True
@@ -114,6 +119,9 @@ class NewEdit:
                 return f"{kind}:{self.style}"
             case "sentence":
                 return f"{kind}:{self.sentence.strip()}"
+            case "pictures":
+                files = [Path(name.strip()).expanduser().absolute() for name in self.pictures.split(",")]
+                return f"{kind}:{','.join(map(str, files))}"
             case "folder":
                 return f"{kind}:{Path(self.folder.strip()).expanduser()}"
 
@@ -139,6 +147,8 @@ class NewEdit:
             return missing
         if self.choice.setting == "sentence" and not self.sentence.strip():
             return "Type what shall change, such as: turn him into a statue"
+        if self.choice.setting == "pictures" and not self.pictures.strip():
+            return "Type the pictures that you changed"
         if self.choice.setting == "folder" and not self.folder.strip():
             return "Type the folder of the edited views"
         if self.region == TYPED and not self.typed_region.strip():

@@ -178,6 +178,11 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             imgui.set_next_item_width(-1.0)
             form = replace(form, sentence=_text("##sentence", "turn him into a statue", form.sentence))
             tip("Needs a model on this machine; see docs/cli.md")
+        case "pictures":
+            label("Pictures", column)
+            imgui.set_next_item_width(-1.0)
+            form = replace(form, pictures=_text("##pictures", "A.png, B.png", form.pictures))
+            tip("One or a few pictures that were rendered here (Ctrl+P) and changed in any program")
         case "folder":
             label("Folder", column)
             imgui.set_next_item_width(-1.0)

@@ -26,7 +26,9 @@ def test_every_editor_of_the_form_is_one_of_the_trainer() -> None:
     assert set(KINDS) <= set(EDITORS)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("instruct", "folder", "style")])
+@pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind not in ("instruct", "folder", "pictures", "style")]
+)
 def test_what_the_form_asks_for_is_what_the_trainer_takes(kind: str) -> None:
     word, _, what = form(kind).spec.partition(":")
     assert word == kind
@@ -42,6 +44,8 @@ def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
     assert "Type what" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
     assert "folder" in form("folder").obstacle
     assert form("folder", folder="edited").obstacle == ""
+    assert "pictures" in form("pictures").obstacle
+    assert form("pictures", pictures="/a.png, /b.png").spec == "pictures:/a.png,/b.png"
     assert "region" in form("recolor", region=TYPED).obstacle
     unknown = replace(CHOICES[0], package="no_such_package_at_all", extra="more")
     assert missing_package(unknown) == "Recolor needs more: pip install progdf-studio[more]"
