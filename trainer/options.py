@@ -65,7 +65,8 @@ class TrainOptions:
     """Folder of the run; created if needed."""
     region: str
     """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r, masks:DIR (one a
-    camera), photomasks:DIR (of photographs), text:"the man's shirt"; join by + -."""
+    camera), photomasks:DIR (of photographs), changed (where pictures: differ), text:"the man's shirt"; join
+    by + -."""
     editor: str
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in

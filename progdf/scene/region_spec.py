@@ -9,6 +9,7 @@
             | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
             | rectangle, lasso, brush, front, color, flood: and STEP, see region_parts.py
             | KIND ':' …                         other kinds that the caller knows, e.g. masks:, text:
+            | 'changed'                          where the caller knows changed pictures
 
 Numbers and file names hold '-' and '+' themselves, so a sign joins two parts only where a kind and its colon
 (or a whole 'all', or a step) follow. Blanks around parts do not count.
@@ -55,6 +56,9 @@ _SIGNS = {"+": union, "-": difference, "&": intersection}
 _NOTHING: Mapping[str, Kind] = {}
 _UNCHECKED: Mapping[str, Check] = {}
 
+BARE = ("changed",)
+"""Kinds that may stand without a colon and a text."""
+
 
 def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str, Kind] = _NOTHING) -> Region:
     """The region that `spec` describes in `scene`.
@@ -81,7 +85,7 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
         kind, colon, rest = part.partition(":")
         if part == "all":
             found = whole_scene(scene)
-        elif colon and kind in known:
+        elif kind in known and (colon or kind in BARE):
             found = known[kind](rest, scene)
         else:
             raise _unknown(part, known)
@@ -110,21 +114,22 @@ def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
         kind, colon, rest = part.partition(":")
         if sign == "|":
             read_step(part)
-        elif colon and kind in known:
+        elif kind in known and (colon or kind in BARE):
             known[kind](rest)
         elif part != "all":
             raise _unknown(part, known)
 
 
 def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
-    choice = ", ".join(["all", *(f"{word}:…" for word in known)])
+    choice = ", ".join(["all", *(word if word in BARE else f"{word}:…" for word in known)])
     return ProgdfError(f"unknown region '{part}'; write {choice}")
 
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     """(sign, part) for each part of a spec, the first one with '+'; a step's sign is '|'."""
     words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
-    part, step = rf"(?:{words}):|all\s*(?:$|[+&|-])", rf"(?:{steps})(?::[0-9]+)?\s*(?:$|[+&|-])"
+    bare = "|".join(("all", *BARE))
+    part, step = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])", rf"(?:{steps})(?::[0-9]+)?\s*(?:$|[+&|-])"
     joint = re.compile(rf"\s*([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))\s*")
     pieces = joint.split(spec.strip())
     if not all(pieces[0::2]):

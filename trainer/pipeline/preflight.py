@@ -76,4 +76,5 @@ def region_settings(
         plan.views.up,
         plan.scene,
         say,
+        plan.views.pictures,
     )

@@ -59,7 +59,7 @@ def drop_strays(
     if not bool(twice.any()):
         return twice
     rows = twice.nonzero()[:, 0]
-    piece = _pieces(scene.means[rows])
+    piece = connected_pieces(scene.means[rows])
     sizes = np.bincount(piece)
     # what two masks hold counts, not what one view alone shows: a tree may be larger than the bear
     sure = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
@@ -105,7 +105,7 @@ def find_holes(
     return holes
 
 
-def _pieces(points: Tensor) -> np.ndarray:
+def connected_pieces(points: Tensor) -> np.ndarray:
     """Which connected piece each point belongs to. [P,3] -> [P] int"""
     count = len(points)
     if count < 2:

@@ -22,6 +22,7 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import Check, Kind
 from progdf.scene.up_axis import UpChoice, find_up
 from trainer.editors.cache import KeptPictures, Recipe
+from trainer.editors.pictures import picture_cameras, picture_paths
 from trainer.options import LiftRule
 from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
@@ -35,10 +36,8 @@ from trainer.views.view import (
     with_near_plane,
 )
 
+from .changed import LIFTED_AT, changed_region
 from .lift import lift_masks
-
-LIFTED_AT = 512
-"""Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +55,7 @@ class RegionSettings:
         up: as --up
         scene: the scene's file, whose format may say which way is up
         say: hears in a line each what became of the masks
+        pictures: changed pictures, for the kind `changed`
     """
 
     cameras: Path | None
@@ -68,6 +68,7 @@ class RegionSettings:
     up: UpChoice = "auto"
     scene: Path | None = None
     say: Callable[[str], None] | None = None
+    pictures: Sequence[Path] = ()
 
     def up_of(self, scene: Gaussians) -> Tensor:
         """The direction that is up in a scene without cameras. [3]"""
@@ -78,7 +79,7 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
     """The kinds of region that pictures tell of, for `parse_region`.
 
     masks:DIR are drawn over straight pictures, as RUN/views/original are; photomasks:DIR over photographs,
-    which are straightened where the cameras have lenses.
+    which are straightened where the cameras have lenses; `changed` is where pictures differ from the scene.
     """
 
     def from_folder(rest: str, scene: Gaussians, bent: bool) -> Region:
@@ -112,6 +113,9 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         "masks": lambda rest, scene: from_folder(rest, scene, bent=False),
         "photomasks": lambda rest, scene: from_folder(rest, scene, bent=True),
         "text": from_text,
+        "changed": lambda rest, scene: changed_region(
+            scene, *_changed_pictures(rest, settings), settings.threshold, settings.say
+        ),
     }
 
 
@@ -126,7 +130,19 @@ def region_checks(settings: RegionSettings) -> dict[str, Check]:
         "masks": lambda rest: load_cameras(_mask_folder("masks", rest, settings)[1]),
         "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, settings)[1]),
         "text": of_text,
+        "changed": lambda rest: _changed_pictures(rest, settings),
     }
+
+
+def _changed_pictures(rest: str, settings: RegionSettings) -> tuple[Sequence[Path], Sequence[Camera]]:
+    """The pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
+    paths = picture_paths(rest) if rest else settings.pictures
+    if not paths:
+        raise ProgdfError(
+            "changed needs pictures: use it with --editor pictures:A.png, or name them, changed:A.png,B.png"
+        )
+    given = [] if settings.cameras is None else load_cameras(settings.cameras)
+    return paths, picture_cameras(paths, given)
 
 
 def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, Path]:

@@ -1,0 +1,103 @@
+"""`--region changed`: the members that show where pictures differ from the scene."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.io.images import to_picture
+from progdf.io.picture_camera import camera_chunk
+from progdf.scene.region_spec import check_region, parse_region
+from tests.helpers.trained import small
+from trainer.editors import make_editor
+from trainer.regions.changed import find_change
+from trainer.regions.from_pictures import RegionSettings, region_checks, region_kinds
+
+
+def settings(pictures: list[Path], folder: Path) -> RegionSettings:
+    return RegionSettings(None, 6, lambda: folder, pictures=pictures)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Four sides of the bear, its body filled with blue, as .png with their cameras."""
+    folder = tmp_path_factory.mktemp("pictures")
+    case = small("body", count=6, image_size=160)
+    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    paths = []
+    for i, view in enumerate(case.views[:4]):
+        paths.append(folder / f"p{i}.png")
+        to_picture(editor.edit(view, 1.0)).save(paths[-1], pnginfo=camera_chunk(view.camera))
+    return paths
+
+
+def test_what_was_filled_is_found_again(pictures: list[Path], tmp_path: Path) -> None:
+    case = small("body", count=6, image_size=160)
+    found = parse_region("changed", case.scene, kinds=region_kinds(settings(pictures, tmp_path)))
+    truth, members = set(case.region.members.tolist()), set(found.members.tolist())
+    assert len(truth & members) > 0.4 * len(
+        truth | members
+    )  # .47 of few, large Gaussians; .94-.99 of the robot's
+    named = "changed:" + ",".join(str(path) for path in pictures)
+    again = parse_region(named, case.scene, kinds=region_kinds(settings([], tmp_path)))
+    assert torch.equal(again.members, found.members)
+    without = parse_region("all-changed", case.scene, kinds=region_kinds(settings(pictures, tmp_path)))
+    assert len(without) == len(case.scene) - len(found)
+
+
+def test_pictures_that_differ_nowhere_are_one_line(tmp_path: Path) -> None:
+    case = small("body", count=6, image_size=160)
+    to_picture(case.views[0].image).save(tmp_path / "A.png", pnginfo=camera_chunk(case.views[0].camera))
+    with pytest.raises(ProgdfError, match="differ nowhere from the scene; change them"):
+        parse_region("changed", case.scene, kinds=region_kinds(settings([tmp_path / "A.png"], tmp_path)))
+
+
+def test_changed_without_pictures_is_one_line_before_the_scene_is_read(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="changed needs pictures: use it with --editor pictures"):
+        check_region("changed", region_checks(settings([], tmp_path)))
+    with pytest.raises(ProgdfError, match="unknown region 'changed'"):
+        check_region("changed")
+
+
+def scene_picture() -> Tensor:
+    """Soft blobs on white, as a render has them."""
+    rows, columns = np.mgrid[:120, :160]
+    image = np.ones((120, 160, 3), np.float32)
+    for y, x, color in ((40, 50, (0.8, 0.3, 0.1)), (70, 110, (0.2, 0.5, 0.3)), (90, 40, (0.3, 0.3, 0.7))):
+        near = np.exp(-(((rows - y) / 14) ** 4 + ((columns - x) / 18) ** 4))[..., None]
+        image = image * (1 - near) + near * np.array(color, np.float32)
+    return torch.from_numpy(image.astype(np.float32))
+
+
+def painted(image: Tensor) -> Tensor:
+    changed = image.clone()
+    changed[35:50, 40:60] = torch.tensor([0.1, 0.8, 0.9])
+    return changed
+
+
+def jpeg(image: Tensor) -> Tensor:
+    file = io.BytesIO()
+    to_picture(image).save(file, "JPEG", quality=75)
+    return torch.from_numpy(np.asarray(Image.open(file), np.float32) / 255)
+
+
+@pytest.mark.parametrize("how", ["as it is", "jpeg", "moved by two pixels", "moved and jpeg"])
+def test_noise_and_a_shift_are_no_change(how: str) -> None:
+    def saved(image: Tensor) -> Tensor:
+        image = image.roll((2, -1), (0, 1)) if "moved" in how else image
+        return jpeg(image) if "jpeg" in how else image
+
+    original = scene_picture()
+    assert not bool(find_change(original, saved(original)).any())
+    found = find_change(original, saved(painted(original)))
+    truth = torch.zeros_like(found)
+    truth[35:50, 40:60] = True
+    assert float((found & truth).sum() / (found | truth).sum()) > 0.45  # rims of a pixel or two
+    assert bool(found[36:49, 41:59].all())

@@ -1,0 +1,140 @@
+"""The region that changed pictures tell of by themselves: the Gaussians that show where they differ.
+
+A program that saves a picture changes all of it a little: JPEG's blocks, another rounding, a model that moves
+everything by a pixel. So a pixel has changed where no pixel near it in the render has its color, once the
+picture is laid over the render; specks and the gaps between them go. What is left is lifted as masks are, by
+the weights with which Gaussians show there, which know what lies before what; and what the pictures leave
+open is as its own surface is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.formats.load_report import format_count
+from progdf.gaussians import Gaussians
+from progdf.region import Region
+from trainer.editors.pictures import mend_background, transmittance
+from trainer.store.images import read_picture
+from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plane
+
+from .few_masks import connected_pieces
+from .lift import lift_masks
+
+LIFTED_AT = 512
+"""Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
+
+_SHIFT = 2  # pixels by which a program may have moved the picture
+_STILL = 0.4  # quantile of the difference that tells how well a shift fits: much of a picture is unchanged
+_EDGE = 0.02  # of color, from pixel to pixel: the rest fits anywhere
+_NEAR = 1  # pixels around a place in which the render may have its color
+_CHANGED = 0.05  # of color: more differs than noise, JPEG and another renderer bring
+_SPECK, _GAP = 2, 5  # pixels: what is narrower is none; what is wider than a gap is not closed
+_HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
+_LEAST = 0.5  # of a member's visible share lies where the pictures differ
+_PIECE = 0.03  # of the largest connected piece: smaller ones are strays
+
+
+def changed_region(
+    scene: Gaussians,
+    paths: Sequence[Path],
+    cameras: Sequence[Camera],
+    threshold: float | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Region:
+    """The members that show where the pictures differ from the scene.
+
+    Args:
+        scene: the original
+        paths: the changed pictures
+        cameras: theirs, at their size
+        threshold: least share of a member's visible weight that has to lie there; None: half
+        say: hears in a line each what was found
+
+    Raises:
+        ProgdfError: a picture cannot be read, or they differ nowhere.
+    """
+    small = with_near_plane([fit_size(camera, LIFTED_AT) for camera in cameras], scene)
+    masks = []
+    for path, camera in zip(paths, small, strict=True):
+        picture = read_picture(path, size=(camera.width, camera.height))
+        original = render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
+        masks.append(find_change(original, mend_background(picture, transmittance(scene, camera))))
+    if not any(bool(mask.any()) for mask in masks):
+        raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
+    least = _LEAST if threshold is None else threshold
+    found = lift_masks(scene, small, masks, "changed", "share", least)
+    region = _largest_pieces(scene, found)
+    if not len(region):
+        raise ProgdfError(
+            "no Gaussian lies mostly where the pictures differ; change more, or name the region with --region"
+        )
+    if say is not None:
+        share = sum(float(mask.float().mean()) for mask in masks) / len(masks)
+        strays = len(found) - len(region)
+        say(
+            f"changed: {share:.1%} of the pictures differ, which {format_count(len(region))} show"
+            + (f"; {format_count(strays)} in small pieces left out" if strays else "")
+        )
+    return region
+
+
+def find_change(original: Tensor, picture: Tensor) -> Tensor:
+    """Where a picture differs from the render, cleaned of noise. [H,W,3], [H,W,3] -> [H,W] bool"""
+    a, b = (ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, picture))
+    shifts = [(y, x) for y in range(-_SHIFT, _SHIFT + 1) for x in range(-_SHIFT, _SHIFT + 1)]
+    shifts.sort(key=lambda shift: abs(shift[0]) + abs(shift[1]))  # of equal ones the least
+
+    edges = np.max([np.abs(_moved(a, shift) - a).max(axis=2) for shift in ((0, 1), (1, 0))], axis=0) > _EDGE
+    if not edges.any():
+        edges[:] = True
+
+    def misfit(shift: tuple[int, int]) -> float:
+        return float(np.quantile(np.abs(_moved(b, shift) - a).max(axis=2)[edges], _STILL))
+
+    errors = [misfit(shift) for shift in shifts]
+    best = int(np.argmin(errors))
+    # noise alone makes one a little better than another
+    b = _moved(b, shifts[best if errors[best] < 0.8 * errors[0] else 0])
+    around = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]
+    apart = np.min([np.abs(_moved(a, shift) - b).max(axis=2) for shift in around], axis=0)
+    changed = ndimage.binary_opening(apart > _CHANGED, np.ones((_SPECK, _SPECK)))
+    changed = ndimage.binary_closing(changed, np.ones((_GAP, _GAP)), border_value=0) | changed
+    holes = ndimage.binary_fill_holes(changed) & ~changed
+    pieces, count = ndimage.label(holes)
+    if count:
+        sizes = np.bincount(pieces.ravel())
+        small = sizes <= _HOLE * changed.size
+        small[0] = False
+        changed |= small[pieces]
+    # what is compared with its surroundings ends a pixel early
+    return torch.from_numpy(ndimage.binary_dilation(changed, np.ones((3, 3))))
+
+
+def _moved(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
+    """The image moved by rows and columns, its rim repeated. [H,W,3]"""
+    height, width = image.shape[:2]
+    rows = (np.arange(height) - shift[0]).clip(0, height - 1)
+    columns = (np.arange(width) - shift[1]).clip(0, width - 1)
+    moved: np.ndarray = image[rows][:, columns]
+    return moved
+
+
+def _largest_pieces(scene: Gaussians, region: Region) -> Region:
+    """The region without pieces that are small beside its largest."""
+    if not len(region):
+        return region
+    piece = connected_pieces(scene.means[region.members])
+    sizes = np.bincount(piece)
+    kept = torch.from_numpy((sizes >= _PIECE * sizes.max())[piece])
+    score = region.score.clone()
+    score[region.members[~kept]] = 0.0
+    return Region(region.name, region.members[kept], score)
