@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -15,8 +15,8 @@ from typing import Literal
 Setting = Literal["color", "amount", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
 
-ALL, SELECTION, TYPED = "all", "selection", "typed"
-"""Regions that have no name: the whole scene, what is selected, and what is typed."""
+ALL, SELECTION, TYPED, CHANGED = "all", "selection", "typed", "changed"
+"""Regions without a name: the whole scene, what is selected, what is typed, where pictures were changed."""
 
 STYLES = 26
 BEST_STYLES = (14, 23, 20, 7, 12, 0)
@@ -138,7 +138,7 @@ class NewEdit:
         what = f"{kind} {self.style}" if kind == "style" else kind
         if self.choice.setting == "sentence" and self.sentence.strip():
             what = " ".join(self.sentence.split()[:4])
-        return what if self.region in (ALL, SELECTION, TYPED) else f"{self.region} {what}"
+        return what if self.region in (ALL, SELECTION, TYPED, CHANGED) else f"{self.region} {what}"
 
     @property
     def obstacle(self) -> str:
@@ -154,6 +154,16 @@ class NewEdit:
         if self.region == TYPED and not self.typed_region.strip():
             return "Type the region, such as sphere:0,0,0,1"
         return ""
+
+
+def with_editor(form: NewEdit, editor: int) -> NewEdit:
+    """The form with another editor; a few changed pictures know their own region."""
+    region, finds = form.region, EDITORS[editor].kind == "pictures"
+    if finds and region == ALL:
+        region = CHANGED
+    elif not finds and region == CHANGED:
+        region = ALL
+    return replace(form, editor=editor, region=region, error="")
 
 
 def missing_package(choice: EditorChoice) -> str:

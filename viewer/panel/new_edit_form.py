@@ -10,12 +10,14 @@ from imgui_bundle import imgui
 from viewer.jobs.new_edit import (
     ALL,
     BEST_STYLES,
+    CHANGED,
     EDITORS,
     SELECTION,
     STYLES,
     TYPED,
     NewEdit,
     missing_package,
+    with_editor,
 )
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.widgets import (
@@ -107,6 +109,8 @@ def region_title(region: str, shown: FormInput) -> str:
             return f"Whole scene  ·  {group_digits(shown.count)}"
         case "selection":
             return f"Selection  ·  {group_digits(shown.selected)}"
+        case "changed":
+            return "Where they differ"
         case "typed":
             return "Typed…"
     return f"{region}  ·  {group_digits(sizes.get(region, 0))}"
@@ -118,6 +122,7 @@ def _region(form: NewEdit, shown: FormInput, column: float) -> NewEdit:
     room = imgui.get_content_region_avail().x - 2 * imgui.get_frame_height()
     if imgui.begin_combo("##region", elide(region_title(form.region, shown), room)):
         offered = [SELECTION] * bool(shown.selected) + [name for name, _ in shown.regions] + [ALL, TYPED]
+        offered = [CHANGED] * (form.choice.kind == "pictures") + offered
         for region in offered:
             if imgui.selectable(f"{region_title(region, shown)}##{region}", region == form.region)[0]:
                 form = replace(form, region=region, error="")
@@ -143,7 +148,7 @@ def _editor(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
                 imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if missing else PALETTE.text))
             )
             if imgui.selectable(editor.title, i == form.editor)[0]:
-                form = replace(form, editor=i, error="")
+                form = with_editor(form, i)
             imgui.pop_style_color()
             tip(missing or editor.help)
         imgui.end_combo()

@@ -14,7 +14,7 @@ import numpy as np
 from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
-from viewer.jobs.new_edit import ALL, SELECTION, TYPED
+from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED
 from viewer.state import comparison as compare
 from viewer.state import history, paint, playback, selection, snapshots
 from viewer.state import layers as stack
@@ -304,7 +304,7 @@ def _snapshot(workspace: Workspace, _: str) -> Workspace:
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
     """Open the form of a new edit, of what is selected where something is; or close it."""
     form, selection = workspace.form, workspace.view.selection
-    known = (ALL, TYPED, *(region.name for region in selection.regions))
+    known = (ALL, TYPED, CHANGED, *(region.name for region in selection.regions))
     if selection.count:
         form = replace(form, region=SELECTION)
     elif form.region not in known:

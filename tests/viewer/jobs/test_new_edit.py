@@ -11,8 +11,8 @@ import pytest
 from trainer.cli import train_options
 from trainer.editors import CHECKS, EDITORS
 from trainer.editors.style import STYLES as TRAINED_STYLES
+from viewer.jobs.new_edit import ALL, CHANGED, STYLES, TYPED, NewEdit, missing_package, with_editor
 from viewer.jobs.new_edit import EDITORS as CHOICES
-from viewer.jobs.new_edit import STYLES, TYPED, NewEdit, missing_package
 from viewer.jobs.training_job import EditOrder
 
 KINDS = [choice.kind for choice in CHOICES]
@@ -49,6 +49,13 @@ def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
     assert "region" in form("recolor", region=TYPED).obstacle
     unknown = replace(CHOICES[0], package="no_such_package_at_all", extra="more")
     assert missing_package(unknown) == "Recolor needs more: pip install progdf-studio[more]"
+
+
+def test_changed_pictures_find_their_own_region() -> None:
+    found = with_editor(NewEdit(), KINDS.index("pictures"))
+    assert found.region == CHANGED
+    assert with_editor(found, 0).region == ALL
+    assert with_editor(NewEdit(region="hands"), KINDS.index("pictures")).region == "hands"
 
 
 def test_a_name_is_one_that_a_file_can_have() -> None:

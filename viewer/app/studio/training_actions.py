@@ -17,7 +17,7 @@ from progdf.scene.region_spec import check_region
 from viewer.app.application import Application, failure_line
 from viewer.files.document import Document
 from viewer.jobs import run_files
-from viewer.jobs.new_edit import ALL, SELECTION, TYPED, NewEdit
+from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED, NewEdit
 from viewer.jobs.training_job import EditOrder, TrainingJob
 from viewer.jobs.training_queue import TrainingQueue, spare_threads
 from viewer.state.selection import NOBODY, SUFFIX, add_region, free_name, unpack
@@ -29,7 +29,7 @@ LIVE_EVERY_S = 3.0
 LIVE_SHARE = 0.05
 """Of the window's time, at most, that showing them may take."""
 
-_KINDS = ("masks", "photomasks", "text")
+_KINDS = ("masks", "photomasks", "text", "changed")
 """Of regions, besides those that every command knows."""
 
 
@@ -135,8 +135,8 @@ class TrainingActions:
         Raises:
             ProgdfError: it cannot be read or written.
         """
-        if form.region == ALL:
-            return ALL
+        if form.region in (ALL, CHANGED):
+            return form.region
         if form.region == TYPED:
             spec = form.typed_region.strip()
             check_region(spec, {kind: lambda _: None for kind in _KINDS})
