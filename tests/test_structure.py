@@ -32,7 +32,7 @@ ORDER = {
         motion optimize fit report plan preview pipeline evaluate cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",
     "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer
-        recorded_runs viewer field_plot field edits networks warps __main__""",
+        recorded_runs viewer field_plot field edits networks warps pictures __main__""",
 }
 
 MOST_FILES = 14

@@ -1,0 +1,106 @@
+"""`python -m benchmarks pictures --scenes SCENE.ply`: a region from one picture, two and four; others judge.
+
+The truth is painted in 3D: an edit of which every picture is known. A few of a rig's pictures are given, all
+the others are compared. Labels beside the scene (SCENE_labels.npy, label 1) are the region; without, all is.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import pack
+from progdf.metrics.image import decibels
+from progdf.scene.region_spec import parse_region
+from progdf.scene.up_axis import find_up
+from trainer.editors import make_editor
+from trainer.optimize.color_solver import color_columns
+from trainer.optimize.picture_solver import make_picture_solver
+from trainer.setup.training_setup import quantize_image
+from trainer.views.crops import crop_scene
+from trainer.views.view import (
+    BACKGROUND,
+    crop,
+    make_view,
+    name_cameras,
+    region_rig,
+    render_view,
+    with_near_plane,
+)
+
+from .table import Table
+
+EDITS = ("stripes:#20a040", "recolor:#3060d0")
+RIG, SIZE, LARGE, NEAR = 36, 256, 512, 45.0
+GIVEN = ((0,), (9,), (27,), (0, 18), (0, 9, 18, 27))
+"""Numbers of the rig's pictures: the front is 0."""
+
+NOTE = (
+    f"A rig of {RIG} cameras around the region; the pictures given are of {LARGE} pixels, the others, of "
+    f"{SIZE}, judge: PSNR over the pixels that show the region, mean / worst; the solver's processor time."
+)
+
+
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """Measure each edit from each set of pictures.
+
+    Raises:
+        ProgdfError: no scene is named, or one cannot be read.
+    """
+    if not scenes:
+        raise ProgdfError("pictures need a scene; name one with --scenes")
+    rows = [row for path in scenes for edit in EDITS for row in _rows(path, edit)]
+    columns = ("scene, edit", "pictures", f"up to {NEAR:.0f}° away, dB", "farther", "all others", "s")
+    return [Table("pictures", "One picture and a few", columns, tuple(rows), NOTE)]
+
+
+def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
+    scene = load_scene(path)
+    labels = path.with_name(f"{path.stem}_labels.npy")
+    region = parse_region(f"labels:{labels}:1" if labels.is_file() else "all", scene)
+    up, background = find_up(scene, (), "auto").direction, torch.tensor(BACKGROUND)
+    cameras = with_near_plane(name_cameras(region_rig(scene, region, RIG, SIZE, up)), scene)
+    views = [make_view(scene, region, camera, background) for camera in cameras]
+    editor = make_editor(edit, scene, region, views)
+    center = scene.means[region.members].mean(dim=0)
+    toward = torch.stack([camera.position - center for camera in cameras])
+    toward = toward / toward.norm(dim=1, keepdim=True)
+    original = pack(scene[region.members], with_shN=scene.sh_degree > 0)
+    truth = [editor.edit(view, 1.0) for view in views]
+    rows = []
+    for given in GIVEN:
+        large = [make_view(scene, region, cameras[i].resize(LARGE, LARGE), background) for i in given]
+        edited = [quantize_image(editor.edit(view, 1.0)) for view in large]
+        large = [view.widen([picture]) for view, picture in zip(large, edited, strict=True)]
+        began = time.process_time()
+        crops = [crop_scene(scene, region.members, v.camera, v.box, background, True) for v in large]
+        solver = make_picture_solver(scene, region.members, crops, original, True)
+        targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
+        offsets = solver.solve(targets, torch.zeros(len(region), 1 + solver.bands.shape[1], 3))
+        took = time.process_time() - began
+        moved = original.clone()
+        moved[:, color_columns(original.shape[1], offsets.shape[1])] += offsets.flatten(1)
+        found = scene.replace_rows(region.members, moved)
+        near: list[float] = []
+        far: list[float] = []
+        for i, view in enumerate(views):
+            counts = view.mask > 0.05
+            if i in given or not bool(counts.any()):
+                continue
+            shown = render_view(found, view.camera, background).clamp(0.0, 1.0)
+            error = decibels(float((shown - truth[i])[counts].square().mean()))
+            cosine = max(float(toward[i] @ toward[k]) for k in given)
+            (near if cosine >= math.cos(math.radians(NEAR)) else far).append(error)
+        numbers = ", ".join(str(i) for i in given)
+        rows.append((f"{path.stem}, {edit}", numbers, *map(_said, (near, far, near + far)), f"{took:.1f}"))
+    return rows
+
+
+def _said(values: Sequence[float]) -> str:
+    return f"{sum(values) / len(values):.1f} / {min(values):.1f}" if values else "-"
