@@ -182,7 +182,7 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             label("Text", column)
             imgui.set_next_item_width(-1.0)
             form = replace(form, sentence=_text("##sentence", "turn him into a statue", form.sentence))
-            tip("Needs a model on this machine; see docs/cli.md")
+            tip("Needs a model on this machine; see progdf train --help")
         case "pictures":
             label("Pictures", column)
             imgui.set_next_item_width(-1.0)
