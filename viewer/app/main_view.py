@@ -16,6 +16,7 @@ from imgui_bundle import imgui
 from progdf.errors import ProgdfError
 from viewer.camera import inputs
 from viewer.camera.inputs import NO_KEYS, Keys
+from viewer.camera.view_camera import to_camera
 from viewer.files import exports as saved_files
 from viewer.gl.screen import read_rgb
 from viewer.panel import panel
@@ -332,4 +333,6 @@ class MainView:
             return saved_files.picture(self.pictures, title, read_rgb(screen, size))
         image = self.canvas.image(view, self._pointer().size)
         pixels = draw_labels(image, view.compare, self.canvas.comparer.labels(view))
-        return saved_files.picture(self.pictures, title, pixels)
+        compares = view.compare.mode != "off"  # which is no view that could be edited and trained on
+        camera = None if compares else to_camera(view.camera, image.shape[1], image.shape[0])
+        return saved_files.picture(self.pictures, title, pixels, camera)

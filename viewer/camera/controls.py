@@ -242,7 +242,7 @@ KEYS = (
     KeyBinding("Ctrl+K", "timeline_file", "save the timeline as a file"),
     KeyBinding("T", "timeline", "show or hide the timeline"),
     KeyBinding("F1", "help", "this list"),
-    KeyBinding("F2", "picture", "save the image as PNG"),
+    KeyBinding("F2", "picture", "take this view as PNG, with its camera"),
     KeyBinding("Shift+F2", "window_picture", "save the whole window as PNG"),
     KeyBinding("F3", "snapshot", "add a snapshot of the sliders"),
     KeyBinding("F4", "camera", "save this view as a camera"),

@@ -25,15 +25,17 @@ REQUESTS = ("picture", "window_picture", "timeline_file")
 """Those of `actions.REQUESTS` that end here."""
 
 
-def picture(folder: Path, title: str, image: NDArray[np.uint8]) -> str:
+def picture(folder: Path, title: str, image: NDArray[np.uint8], camera: Camera | None = None) -> str:
     """Save `image` [H,W,3] under the scene's name; the line that says where.
+
+    The file carries the camera, where there is one: what is changed in it can be trained on.
 
     Raises:
         ProgdfError: it cannot be written.
     """
 
     def save() -> str:
-        return f"Saved {save_picture(folder, Path(title).stem, image).resolve()}"
+        return f"Saved {save_picture(folder, Path(title).stem, image, camera).resolve()}"
 
     return _try_save("picture", folder, save)
 

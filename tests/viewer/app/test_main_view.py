@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from imgui_bundle import imgui
 from PIL import Image
 
+from progdf.io.picture_camera import find_picture_camera
 from tests.helpers.ui_rig import Rig, bear, rig
+from viewer.camera.view_camera import to_camera
 from viewer.gl import edit_pass
 
 pytestmark = pytest.mark.gl
@@ -92,6 +95,10 @@ def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Pat
         first, second = sorted(tmp_path.iterdir())
         assert (first.name, second.name) == ("bear_001.png", "bear_002.png")
         assert np.array_equal(np.asarray(Image.open(first)), shown)
+        taken = find_picture_camera(first)
+        expected = to_camera(hand.main_view.work.view.camera, shown.shape[1], shown.shape[0])
+        assert torch.allclose(taken.viewmat, expected.viewmat, atol=1e-6)
+        assert torch.allclose(taken.K, expected.K, atol=1e-4)
         assert np.asarray(Image.open(second)).shape == (540, 640, 3)
         message = hand.main_view.work.message
         assert message is not None

@@ -146,7 +146,9 @@ def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) ->
         hand.key("Y")
         shown = hand.picture()
         hand.key("F2")
-        saved = np.asarray(Image.open(tmp_path / "bear_001.png"))
+        picture = Image.open(tmp_path / "bear_001.png")
+        assert not picture.info, "a comparison is no view that could be edited"
+        saved = np.asarray(picture)
         left, right = beside_line(saved, 170)
         shown_left, shown_right = beside_line(shown, 170)
         assert np.array_equal(left, shown_left)
