@@ -54,6 +54,14 @@ def drawn(view: ViewState, recorded: tuple[bool, bool]) -> np.ndarray:
 @pytest.fixture
 def hand(runs: list[Path]) -> Iterator[Rig]:
     drawn(first_view(bear(), 1.0, 1.0), (True, True))
+    with rig(first_view(bear(), AT, AT), gdf_paths=runs[1:]) as made:
+        yield made
+
+
+@pytest.fixture
+def tall(runs: list[Path]) -> Iterator[Rig]:
+    """With room for the whole panel."""
+    drawn(first_view(bear(), 1.0, 1.0), (True, True))
     with rig(first_view(bear(), AT, AT), (640, 600), gdf_paths=runs[1:]) as made:
         yield made
 
@@ -213,11 +221,11 @@ def test_where_nothing_was_recorded_the_original_is_shown_and_the_reason_told() 
 
 
 @pytest.mark.gl
-def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it_was(hand: Rig) -> None:
-    hand.key("Y")
-    place = recorded_button(hand)
-    hand.click(*place)
-    assert hand.main_view.work.view.compare.against == "recorded"
+def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it_was(tall: Rig) -> None:
+    tall.key("Y")
+    place = recorded_button(tall)
+    tall.click(*place)
+    assert tall.main_view.work.view.compare.against == "recorded"
     with rig(first_view(bear(), AT, AT), (640, 600)) as bare:
         bare.key("Y")
         bare.click(*place)
