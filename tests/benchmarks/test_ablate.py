@@ -283,6 +283,7 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
     assert (asked[0].steps, asked[0].stages) == (40, 2)
 
 
+@pytest.mark.slow
 def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_one_row_for_all(
     options: TrainOptions, tmp_path: Path
 ) -> None:
@@ -304,6 +305,7 @@ def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_on
         assert opened.width > 800
 
 
+@pytest.mark.slow
 def test_a_network_is_trained_beside_the_members_and_shipped(
     options: TrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

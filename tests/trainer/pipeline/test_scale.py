@@ -69,8 +69,9 @@ def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: 
 
 @pytest.mark.parametrize(
     ("editor", "kind"),
-    [("recolor:#3060d0", "color"), pytest.param("darken:0.6", "style", marks=pytest.mark.slow)],
+    [("recolor:#3060d0", "color"), ("darken:0.6", "style")],
 )
+@pytest.mark.slow
 def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: str) -> None:
     demo = bear(1500)
     members = demo.members("scarf")
