@@ -23,10 +23,10 @@ from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.select import hand
-from viewer.state import playback, workspace
+from viewer.state import comparison, playback, workspace
 from viewer.state.actions import perform
 from viewer.state.recordings import RecordingFile
-from viewer.state.snapshots import SliderSnapshot
+from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
@@ -183,8 +183,11 @@ class MainView:
         if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.is_repeating(keys):
             self.work = workspace.record_undo(self.work)
         if self.work != before:
+            view = comparison.end_at_edit(before.view, self.work.view)
+            self.work = replace(self.work, view=view)
             self.wake()
         shown, area = self._shown_view(), self._pointer().size
+        self.canvas.comparer.sides = compare_sides(self.work.snapshots, shown)
         asked = (self.work.overlap, self.work.pointed) if shown.panel else (None, None)
         self.canvas.draw(shown, screen, area, self._is_held(), self._clock, self.work.focus, *asked)
         self._draw_overlays()
@@ -263,7 +266,9 @@ class MainView:
     def _shown_view(self) -> ViewState:
         if inputs.holds_original(self._keys):
             return workspace.original(self.work.view)
-        view = self.work.view
+        view, sides = self.work.view, compare_sides(self.work.snapshots, self.work.view)
+        if sides is not None:
+            return sides.right
         return replace(view, layers=(*view.layers, *self.live)) if self.live else view
 
     def _is_held(self) -> bool:

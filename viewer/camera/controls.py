@@ -245,6 +245,7 @@ KEYS = (
     KeyBinding("F2", "picture", "take this view as PNG, with its camera"),
     KeyBinding("Shift+F2", "window_picture", "save the whole window as PNG"),
     KeyBinding("F3", "snapshot", "add a snapshot of the sliders"),
+    KeyBinding("Shift+F3", "compare_snapshots", "compare two snapshots"),
     KeyBinding("F4", "camera", "save this view as a camera"),
     KeyBinding("Ctrl+N", "new_edit", "new edit"),
     KeyBinding("Ctrl+S", "save", "save the session"),

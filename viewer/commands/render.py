@@ -27,6 +27,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
 from viewer.state import recordings, timeline
+from viewer.state.snapshots import compare_sides
 from viewer.state.view_state import Comparison, Timeline, ViewState
 
 from . import arguments, opening
@@ -115,6 +116,8 @@ def _render_still(
             f"there is nothing recorded to compare with: {missing}; give the .gdf in its run folder"
         )
     comparer = Comparer(engine, engine.ctx, where)
+    comparer.sides = compare_sides(found.snapshots, view)
+    view = comparer.sides.right if comparer.sides else view
     try:
         image = comparer.image(view, camera=camera)
         # a comparison is no view that could be edited and trained on
@@ -126,6 +129,8 @@ def _render_still(
             return ""
         if comparer.against(view) == "original":
             return f"PSNR of edited against original {comparer.psnr:.2f} dB"
+        if comparer.sides is not None:
+            return "PSNR of snapshot {1} against {0} {2:.2f} dB".format(*comparer.sides.names, comparer.psnr)
         recorded = recordings.describe(view, engine.gdfs, comparer.recordings)
         return f"PSNR of the field against what was recorded {comparer.psnr:.2f} dB ({recorded})"
     finally:

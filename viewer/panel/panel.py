@@ -156,7 +156,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         actions += [asked] if asked else []
     state, selected = selection_section.draw(state, ui, actions)
     region = region_rows.draw(state.selection.regions, ui, actions)
-    state = _view(state, shown.unrecorded, ui, actions)
+    state = _view(state, shown.unrecorded, len(shown.snapshots) > 1, ui, actions)
     snapshot_cards.draw(shown.snapshots, ui, actions)
     _end_body()
     _footer(state, shown, ui, actions)
@@ -207,7 +207,7 @@ def _title(shown: PanelInput, ui: UiContext) -> list[str]:
     return actions
 
 
-def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) -> ViewState:
+def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions: list[str]) -> ViewState:
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     section("View", ui)
     column = 82.0 * ui.scale
@@ -235,7 +235,7 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
     background = (red, green, blue) if changed else state.background
-    comparison = _comparison(state.compare, unrecorded, column, ui)
+    comparison = _comparison(state.compare, unrecorded, kept, column, ui)
     label("Show", column)
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
@@ -248,8 +248,11 @@ def _view(state: ViewState, unrecorded: str, ui: UiContext, actions: list[str]) 
     return replace(state, camera=camera, background=background, compare=comparison)
 
 
-def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext) -> Comparison:
-    """Off, beside each other or subtracted; with the original, or with what was recorded."""
+def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, ui: UiContext) -> Comparison:
+    """Off, beside each other or subtracted; with the original, what was recorded, or two snapshots.
+
+    `unrecorded`: why nothing is; `kept`: whether there are snapshots.
+    """
     label("Compare", column)
     chosen = choice("compare", ("Off", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
     tip("Split view (Y) or amplified difference (Shift+Y)")
@@ -258,10 +261,14 @@ def _comparison(shown: Comparison, unrecorded: str, column: float, ui: UiContext
     if shown.mode == "off":
         return shown
     label("Against", column)
-    against = 0 if unrecorded else AGAINST.index(shown.against)
-    chosen = choice("against", ("Original", "Recorded"), against, ui, usable=1 if unrecorded else 2)
+    off = {i for i, no in ((1, unrecorded), (2, not kept)) if no}
+    against = AGAINST.index(shown.against)
+    chosen = choice("against", ("Original", "Recorded", "A | B"), 0 if against in off else against, ui, off)
     told = f"\nNo recording: {unrecorded}" if unrecorded else ""
-    tip(f"Compare with the original, or with the snapshots recorded in training (Alt+Y){told}")
+    tip(
+        "Compare with the original, with what training recorded (Alt+Y), or snapshot A with B (Shift+F3)"
+        + told
+    )
     if chosen is not None:
         shown = replace(shown, against=AGAINST[chosen])
     if shown.mode == "difference":

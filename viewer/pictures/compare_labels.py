@@ -35,7 +35,13 @@ class Labels:
     notice: str = ""
 
 
-def labels(compare: Comparison, decibels: float, recorded: str = "", obstacle: str = "") -> Labels:
+def labels(
+    compare: Comparison,
+    decibels: float,
+    recorded: str = "",
+    obstacle: str = "",
+    names: tuple[str, str] | None = None,
+) -> Labels:
     """What to say over a comparison.
 
     Args:
@@ -43,12 +49,15 @@ def labels(compare: Comparison, decibels: float, recorded: str = "", obstacle: s
         decibels: PSNR of the two pictures; NaN where it was not taken
         recorded: which snapshots are on the other side, "" for the original
         obstacle: why the recording was asked for and is not shown
+        names: of the snapshots on the two sides
     """
     if math.isinf(decibels):
         line, figure = "difference: none", " · no difference"
     else:
         figure = "" if math.isnan(decibels) else f" · PSNR {decibels:.1f} dB"
         line = f"difference × {compare.amplify:g}{figure}"
+    if names is not None:
+        return Labels(names[0], names[1] + figure, f"{line} · {names[0]} against {names[1]}")
     if recorded:
         return Labels(recorded, FIELD + figure, f"{line} · {recorded}")
     return Labels(line=line, notice=f"Against the original: {obstacle}" if obstacle else "")

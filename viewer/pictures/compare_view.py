@@ -1,8 +1,8 @@
 """Two pictures in one: side by side at a divider, or their difference amplified, with PSNR.
 
-Beside the edited picture stands the original, or the same edits as they were recorded. That side is drawn by
-a second engine, made when it is first asked for: against the original a slider then moves only one of the
-two pictures, the divider neither.
+Beside the edited picture stands the original, the same edits as they were recorded, or one snapshot beside
+another. That side is drawn by a second engine, made when it is first asked for: against the original a slider
+then moves only one of the two pictures, the divider neither.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from viewer.render.renderers import Image
 from viewer.render.timings import FrameTimings
 from viewer.state import recordings
 from viewer.state.recordings import RecordingFile
+from viewer.state.snapshots import SnapshotSides
 from viewer.state.view_state import ViewState
 
 from .compare_labels import Labels, column, labels
@@ -47,6 +48,8 @@ class Comparer:
         """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
         self.recordings = tuple(found) or (RecordingFile(),) * len(engine.gdfs)
         """Where the edits were recorded; one that turned out to be broken is none."""
+        self.sides: SnapshotSides | None = None
+        """The snapshots that the next view compares; that view is then `sides.right`."""
         self._ctx = ctx
         self._other: ViewEngine | None = None
         self._against = ""  # what `_other` draws, of `AGAINST`
@@ -100,12 +103,16 @@ class Comparer:
 
     def against(self, view: ViewState) -> str:
         """What the picture of `view` is set against, of `AGAINST`: what it asks for, if that exists."""
-        return "original" if recordings.obstacle(self.recordings) else view.compare.against
+        missing = {"recorded": recordings.obstacle(self.recordings), "snapshots": self.sides is None}
+        return "original" if missing.get(view.compare.against) else view.compare.against
 
     def labels(self, view: ViewState) -> Labels:
         """What to say over the last comparison, of `view`."""
         wished, found = view.compare.against, self.against(view)
-        obstacle = recordings.obstacle(self.recordings) if wished != found else ""
+        if self.sides is not None:
+            return labels(view.compare, self.psnr, names=self.sides.names)
+        why = {"recorded": recordings.obstacle(self.recordings), "snapshots": "there is no snapshot (F3)"}
+        obstacle = why[wished] if wished != found else ""
         recorded = recordings.describe(view, self.engine.gdfs, self.recordings) if found == "recorded" else ""
         return labels(view.compare, self.psnr, recorded, obstacle)
 
@@ -118,7 +125,8 @@ class Comparer:
     def _second(self, view: ViewState) -> ViewEngine:
         """What draws the other side of `view`."""
         if self._other is None or self._against != self.against(view):
-            gdfs = self._load_recorded() if self.against(view) == "recorded" else ()
+            gdfs = self.engine.gdfs if self.sides else ()
+            gdfs = self._load_recorded() if self.against(view) == "recorded" else gdfs
             if self._other is not None:
                 self._other.release()
             self._against = self.against(view)  # reading a recording may have shown that it is none
@@ -141,6 +149,8 @@ class Comparer:
 
     def _other_view(self, view: ViewState) -> ViewState:
         """What the other side of `view` shows."""
+        if self.sides is not None:
+            return replace(view, layers=self.sides.left.layers, blend=self.sides.left.blend)
         recorded = self.against(view) == "recorded"
         return recordings.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
 
@@ -155,7 +165,7 @@ class Comparer:
             original = other.draw(beside, framebuffer, size, pixels)
         finally:
             framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
-        if new and pixels == 1 and self._against == "recorded":
+        if new and pixels == 1 and self._against != "original":
             self.psnr = _psnr(other.image(beside, size), self.engine.image(view, size))
         elif new:
             self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors

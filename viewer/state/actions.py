@@ -362,6 +362,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
     "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
     "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),
+    "compare_snapshots": lambda w, _: replace(w, view=compare.toggle_snapshots(w.view)),
     "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
     "new_edit": _new_edit,
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),

@@ -11,7 +11,7 @@ from . import history
 from .history import Edit
 from .layers import LONGEST_NAME
 from .selection import SelectionState
-from .view_state import Timeline, ViewState
+from .view_state import SnapshotPair, Timeline, ViewState
 
 MOST = 200
 
@@ -29,6 +29,15 @@ class SliderSnapshot:
     name: str
     edit: Edit
     camera: ViewCamera = ViewCamera()
+
+
+@dataclass(frozen=True)
+class SnapshotSides:
+    """Two snapshots that are compared: what each shows, seen from where one looks, and their names."""
+
+    left: ViewState
+    right: ViewState
+    names: tuple[str, str]
 
 
 def take(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
@@ -65,6 +74,21 @@ def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     later = tuple(replace(layer, strength=0.0) for layer in view.layers if layer.gdf not in kept)
     back = history.apply_edit(view, snapshot.edit)
     return replace(back, layers=(*back.layers, *later), timeline=view.timeline, selection=view.selection)
+
+
+def pair_of(kept: Sequence[SliderSnapshot], pair: SnapshotPair) -> tuple[int, int]:
+    """The places of A and B in `kept`, which begins with the original; the last two where none is named."""
+    places = {snapshot.name: i for i, snapshot in reversed(list(enumerate(kept)))}
+    return places.get(pair.a, max(len(kept) - 2, 0)), places.get(pair.b, len(kept) - 1)
+
+
+def compare_sides(snapshots: Sequence[SliderSnapshot], view: ViewState) -> SnapshotSides | None:
+    """What `view` shows where it compares two snapshots, else None."""
+    if view.compare.mode == "off" or view.compare.against != "snapshots" or not snapshots:
+        return None
+    kept = with_original(snapshots, view)
+    a, b = (kept[i] for i in pair_of(kept, view.pair))
+    return SnapshotSides(restore(view, a), restore(view, b), (a.name, b.name))
 
 
 def _sliders(view: ViewState) -> Edit:

@@ -21,7 +21,7 @@ SMALLEST_PX, LARGEST_PX = 4.0, 400.0
 SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "split", "difference")
-AGAINST = ("original", "recorded")
+AGAINST = ("original", "recorded", "snapshots")
 MOST_AMPLIFIED = 64.0
 LONGEST, FASTEST = 9999, 120  # frames, frames per second
 RESOLUTION_MODES = ("auto", "on", "off")
@@ -114,13 +114,26 @@ class Comparison:
         mode: of `COMPARE_MODES`
         divider: where the edited side of a split begins, share of the picture's width
         amplify: what a difference is multiplied by, 1 to 64
-        against: "original", or "recorded": the same strengths as training recorded them, where it did
+        against: "original", or "recorded": the same strengths as training recorded them, where it did; or
+            "snapshots": A of `ViewState.pair` against its B, whatever the sliders say
     """
 
     mode: Annotated[str, one_of(COMPARE_MODES)] = "off"
     divider: Share = 0.5
     amplify: Annotated[float, Meta(ge=1.0, le=MOST_AMPLIFIED)] = 4.0
     against: Annotated[str, one_of(AGAINST)] = "original"
+
+
+@dataclass(frozen=True)
+class SnapshotPair:
+    """Two snapshots by their names, "" for the last two there are (see snapshots.py).
+
+    Args:
+        a, b: what is compared, and what lies at the ends of the slider between them
+    """
+
+    a: str = ""
+    b: str = ""
 
 
 @dataclass(frozen=True)
@@ -168,6 +181,7 @@ class ViewState:
         dynamic_resolution: of `RESOLUTION_MODES`: when the window draws coarsely while something moves
         selection: what is selected and hidden, and the regions
         select: what selects
+        pair: the snapshots that are compared
     """
 
     camera: ViewCamera = ViewCamera()
@@ -184,6 +198,7 @@ class ViewState:
     dynamic_resolution: Annotated[str, one_of(RESOLUTION_MODES)] = "auto"
     selection: SelectionState = SelectionState()
     select: SelectTool = SelectTool()
+    pair: SnapshotPair = SnapshotPair()
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
 from imgui_bundle import imgui
@@ -150,9 +150,9 @@ def value_slider(
 
 
 def choice(
-    name: str, options: Sequence[str], current: int | None, ui: UiContext, usable: int | None = None
+    name: str, options: Sequence[str], current: int | None, ui: UiContext, off: Collection[int] = ()
 ) -> int | None:
-    """A row of joined buttons, the first `usable` of them; the index that was pressed, or None."""
+    """A row of joined buttons, `off` those that cannot be pressed; the index that was, or None."""
     gap = 2.0 * ui.scale
     each = (imgui.get_content_region_avail().x - gap * (len(options) - 1)) / len(options)
     pressed = None
@@ -163,7 +163,7 @@ def choice(
             imgui.same_line(0.0, gap)
         for slot in _BUTTON_COLORS if i == current else ():
             imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.accent_dark))
-        imgui.begin_disabled(usable is not None and i >= usable)
+        imgui.begin_disabled(i in off)
         if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
             pressed = i
         imgui.end_disabled()

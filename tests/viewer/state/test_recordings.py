@@ -234,7 +234,7 @@ def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it
 
 def recorded_button(hand: Rig) -> tuple[float, float]:
     """Where the panel's button "Recorded" is: the first place in its column that chooses it."""
-    x = hand.points[0] - 50.0
+    x = hand.points[0] - 109.0
     for y in range(250, hand.points[1] - 40, 8):
         before = hand.main_view.work.view
         hand.click(x, y)

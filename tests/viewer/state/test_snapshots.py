@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 
+from tests.helpers.divided import beside_line
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app import app as application
 from viewer.state import snapshots, workspace
@@ -83,3 +84,31 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
         hand.modifier(imgui.Key.enter)
         hand.settle()
         assert [kept.name for kept in hand.main_view.work.snapshots] == ["dusk", "2"]
+
+
+@pytest.mark.gl
+def test_two_snapshots_are_compared_until_something_is_edited() -> None:
+    with rig(first_view(bear(), 1.0, 0.0), (1024, 640)) as hand:
+        hand.key("Shift+F3")
+        assert (
+            "there is no snapshot" in hand.main_view.canvas.comparer.labels(hand.main_view.work.view).notice
+        )
+        hand.key("Shift+F3")
+        warm = hand.picture()
+        hand.key("F3")
+        hand.key("2")
+        for chord in (*["Shift+Left"] * 10, "1", *["Shift+Right"] * 10, "F3"):
+            hand.key(chord)
+        assert hand.strengths == [0.0, 1.0]
+        gold = hand.picture()
+        hand.key("1")
+        hand.key("Shift+Left")
+        hand.key("Shift+F3")
+        seen, middle = hand.picture(), round(0.5 * 724)
+        assert np.array_equal(*(beside_line(p, middle)[0] for p in (seen, warm)))
+        assert np.array_equal(*(beside_line(p, middle)[1] for p in (seen, gold)))
+        said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
+        assert said.left == "1"
+        assert said.right.startswith("2 · PSNR")
+        hand.key("Shift+Left")
+        assert hand.main_view.work.view.compare.mode == "off", "one sees what one does"
