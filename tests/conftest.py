@@ -135,6 +135,22 @@ def _write_difference(name: str, expected: np.ndarray, found: np.ndarray) -> Non
 
 
 @pytest.fixture(scope="module")
+def software_gpu() -> None:
+    """Goldens hold for one renderer of splats, text and lines; another differs in the last bits."""
+    from progdf.errors import ProgdfError
+    from viewer.render.headless import headless_context, is_software
+
+    try:
+        context = headless_context()
+    except ProgdfError as error:
+        pytest.skip(str(error))
+    name, software = context.info["GL_RENDERER"], is_software(context)
+    context.release()
+    if not software:
+        pytest.skip(f"goldens were drawn by llvmpipe, here is {name}")
+
+
+@pytest.fixture(scope="module")
 def ctx() -> Iterator[moderngl.Context]:
     """An OpenGL context without a window."""
     from viewer.render.headless import headless_context

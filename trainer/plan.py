@@ -7,10 +7,10 @@ the scene is looked at. A plan is all that the bits of a result depend on, but f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from trainer.editors import GIVEN, UNTOLD, VIEW_BY_VIEW
 from trainer.editors.base import EditKind, EditorSettings
@@ -29,7 +29,6 @@ from .options import (
     QUICK_STEPS,
     QUICK_VIEWS,
     STAGE_STEPS,
-    VIEWS,
     Bands,
     FieldKind,
     LiftRule,
@@ -326,34 +325,3 @@ def plan_optimization(asked: OptimizationPlan, kind: EditKind, group_steps: int)
         seed=asked.seed,
         few=few,
     )
-
-
-def segmented_views(plan: Plan) -> int:
-    """How many pictures are segmented, at most, to find what text:"…" names."""
-    return plan.views.views or VIEWS
-
-
-def plan_difference(was: Plan, now: Plan) -> str:
-    """A value that differs, in words, "--steps 24, not 40"; "" where none does. What was typed goes first."""
-    typed = {field.name for field in fields(TrainOptions)}
-    pairs = zip(_values(was), _values(now), strict=True)
-    found = [(name, before, after) for (name, before), (_, after) in pairs if before != after]
-    if not found:
-        return ""
-    name, before, after = min(found, key=lambda value: value[0] not in typed)
-    said = "--" + name.replace("_", "-") if name in typed else name.replace("_", " ")
-    return f"{said} {_said(before)}, not {_said(after)}"
-
-
-def _values(part: Any) -> Iterator[tuple[str, Any]]:
-    """All values of a plan with their names, in order; paths as places."""
-    for field in fields(part):
-        value = getattr(part, field.name)
-        if is_dataclass(value):
-            yield from _values(value)
-        else:
-            yield field.name, value.resolve() if isinstance(value, Path) else value
-
-
-def _said(value: object) -> object:
-    return "by default" if value is None or value == "" else value

@@ -10,7 +10,8 @@ from progdf.io.cameras import load_cameras
 from progdf.scene.region_spec import check_region
 from trainer.editors import check_editor, check_new_editor
 from trainer.editors.pictures import picture_cameras
-from trainer.plan import Plan, segmented_views
+from trainer.options import VIEWS
+from trainer.plan import Plan
 from trainer.regions.from_pictures import RegionSettings, region_checks
 from trainer.store.run_folder import check_folder, open_run_folder
 
@@ -67,7 +68,7 @@ def region_settings(
     region = plan.region
     return RegionSettings(
         plan.views.cameras,
-        segmented_views(plan),
+        plan.views.views or VIEWS,
         kept,
         region.lift_rule,
         region.lift_threshold,

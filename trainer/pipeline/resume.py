@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import torch
@@ -16,8 +16,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
-from trainer.options import MOST_THREADS
-from trainer.plan import Plan, plan_difference
+from trainer.options import MOST_THREADS, TrainOptions
+from trainer.plan import Plan
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
 REGION = "region"
@@ -165,6 +165,32 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
         return convert_json(found, _Identity)
     except ValueError as error:
         raise folder.state.damage_error(folder.state.path / "run.json", error) from None
+
+
+def plan_difference(was: Plan, now: Plan) -> str:
+    """A value that differs, in words, "--steps 24, not 40"; "" where none does. What was typed goes first."""
+    typed = {field.name for field in fields(TrainOptions)}
+    pairs = zip(_values(was), _values(now), strict=True)
+    found = [(name, before, after) for (name, before), (_, after) in pairs if before != after]
+    if not found:
+        return ""
+    name, before, after = min(found, key=lambda value: value[0] not in typed)
+    said = "--" + name.replace("_", "-") if name in typed else name.replace("_", " ")
+    return f"{said} {_said(before)}, not {_said(after)}"
+
+
+def _values(part: Any) -> Iterator[tuple[str, Any]]:
+    """All values of a plan with their names, in order; paths as places."""
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if is_dataclass(value):
+            yield from _values(value)
+        else:
+            yield field.name, value.resolve() if isinstance(value, Path) else value
+
+
+def _said(value: object) -> object:
+    return "by default" if value is None or value == "" else value
 
 
 def _check_plan(folder: RunFolder, was: Plan, now: Plan, remedy: str) -> None:

@@ -90,10 +90,6 @@ def _toggle(workspace: Workspace, number: str) -> Workspace:
     return replace(workspace, view=_toggle_shown(workspace.view, index))
 
 
-def _hide(workspace: Workspace, _: str) -> Workspace:
-    return _change_focused(workspace, _toggle_shown)
-
-
 def _nudge(workspace: Workspace, by: str) -> Workspace:
     return _change_focused(
         workspace, lambda view, i: stack.nudge(view, i, workspace.active_slider, float(by))
@@ -101,20 +97,16 @@ def _nudge(workspace: Workspace, by: str) -> Workspace:
 
 
 def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
-    """The next active_slider that the focused layer has; its gains unfold, so that one sees which."""
+    """The next slider that the focused layer has; its gains unfold, so that one sees which."""
     if workspace.focus is None:
         return workspace
     view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
-    sliders = [
-        active_slider
-        for active_slider in stack.SLIDERS
-        if active_slider == "strength" or active_slider in facts.rows[gdf].kinds
-    ]
+    sliders = [slider for slider in stack.SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
     place = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
-    active_slider = sliders[(place + by) % len(sliders)]
-    if active_slider != "strength" and gdf not in view.unfolded:
+    slider = sliders[(place + by) % len(sliders)]
+    if slider != "strength" and gdf not in view.unfolded:
         view = replace(view, unfolded=(*view.unfolded, gdf))
-    return replace(workspace, active_slider=active_slider, view=view)
+    return replace(workspace, active_slider=slider, view=view)
 
 
 def _move(workspace: Workspace, by: str) -> Workspace:
@@ -235,14 +227,6 @@ def _change_focused(workspace: Workspace, change: Callable[[ViewState, int], Vie
     return replace(workspace, view=change(workspace.view, workspace.focus))
 
 
-def _undo(workspace: Workspace, _: str) -> Workspace:
-    return _back(workspace, history.undo(workspace.past))
-
-
-def _redo(workspace: Workspace, _: str) -> Workspace:
-    return _back(workspace, history.redo(workspace.past))
-
-
 def _back(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
@@ -258,10 +242,6 @@ def _with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
         places = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
         focus = focus if focus in places else next(iter(places), None)
     return replace(workspace, view=view, focus=focus)
-
-
-def _fly(workspace: Workspace, _: str) -> Workspace:
-    return with_camera(workspace, controls.toggle_fly(workspace.view.camera))
 
 
 def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
@@ -287,18 +267,10 @@ def _restore(workspace: Workspace, index: str) -> Workspace:
     return _with_layers_of(workspace, snapshots.restore(workspace.view, kept[int(index)]))
 
 
-def _forget(workspace: Workspace, index: str) -> Workspace:
-    return replace(workspace, snapshots=snapshots.remove(workspace.snapshots, int(index) - 1))
-
-
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`"""
     index, _, name = argument.partition(":")
     return replace(workspace, snapshots=snapshots.rename(workspace.snapshots, int(index) - 1, name))
-
-
-def _snapshot(workspace: Workspace, _: str) -> Workspace:
-    return replace(workspace, snapshots=snapshots.take(workspace.snapshots, workspace.view))
 
 
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
@@ -328,7 +300,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": _step_back,
     "toggle": _toggle,
-    "hide": _hide,
+    "hide": lambda w, _: _change_focused(w, _toggle_shown),
     "nudge": _nudge,
     "move": _move,
     "solo": lambda workspace, _: _change_focused(workspace, stack.toggle_solo),
@@ -351,13 +323,13 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
         w, softness=paint.softness(w.view.brush.softness + float(by))
     ),
     "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
-    "snapshot": _snapshot,
+    "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),
     "restore": _restore,
-    "forget": _forget,
+    "forget": lambda w, at: replace(w, snapshots=snapshots.remove(w.snapshots, int(at) - 1)),
     "name_snapshot": _name_snapshot,
-    "undo": _undo,
-    "redo": _redo,
-    "fly": _fly,
+    "undo": lambda w, _: _back(w, history.undo(w.past)),
+    "redo": lambda w, _: _back(w, history.redo(w.past)),
+    "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
     "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),

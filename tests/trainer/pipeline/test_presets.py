@@ -18,7 +18,8 @@ from trainer.cli import train_options
 from trainer.editors.base import EditKind
 from trainer.optimize.settings import Optimization, pgs_settings
 from trainer.options import Preset, TrainOptions
-from trainer.plan import Plan, make_plan, plan_difference, plan_optimization
+from trainer.pipeline.resume import plan_difference
+from trainer.plan import Plan, make_plan, plan_optimization
 from trainer.presets import PRESETS, apply_preset
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")

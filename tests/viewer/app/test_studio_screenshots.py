@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from progdf.errors import ProgdfError
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
 from viewer.app.studio.start_page import RecentFile
@@ -18,26 +17,13 @@ from viewer.jobs.delivery import DeliverOptions, Delivery
 from viewer.jobs.new_edit import TYPED, NewEdit
 from viewer.jobs.training_job import EditOrder, Progress, TrainingJob
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context, is_software
+from viewer.render.headless import headless_context
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
-pytestmark = pytest.mark.gl
-
-
-@pytest.fixture(scope="module", autouse=True)
-def software_gpu() -> None:
-    """As for the other screenshots of the interface."""
-    try:
-        context = headless_context()
-    except ProgdfError as error:
-        pytest.skip(str(error))
-    software = is_software(context)
-    context.release()
-    if not software:
-        pytest.skip("the goldens were drawn by a software GPU")
+pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 
 
 def test_the_start_page_with_files_that_were_open(screenshot: Compare) -> None:

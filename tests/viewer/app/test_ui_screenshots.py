@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 
-from progdf.errors import ProgdfError
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys
 from viewer.panel import panel
-from viewer.render.headless import headless_context, is_software
 from viewer.render.timings import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
@@ -24,20 +22,7 @@ from viewer.state.workspace import Dialog
 Compare = Callable[[str, np.ndarray], None]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def software_gpu() -> None:
-    """Goldens hold for one rasterizer of text and lines; elsewhere they would differ by a hair's breadth."""
-    try:
-        context = headless_context()
-    except ProgdfError as error:
-        pytest.skip(str(error))
-    software = is_software(context)
-    context.release()
-    if not software:
-        pytest.skip("the goldens were drawn by a software GPU")
-
-
-pytestmark = pytest.mark.gl
+pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 SMALLEST = (1024, 640)
 """The least window size that the layout is made for."""
 

@@ -18,7 +18,6 @@ from tests.helpers.ui_rig import STEP_S, Rig, bear, first_view, rig
 from viewer.files import timeline_file
 from viewer.panel import panel, timeline_bar
 from viewer.pictures import film
-from viewer.render.headless import headless_context, is_software
 from viewer.state import timeline
 from viewer.state.view_state import Keyframe, Timeline, ViewState
 
@@ -297,12 +296,8 @@ def test_frames_for_a_full_disk_are_one_line_and_leave_no_folder(tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("software_gpu")
 def test_the_timeline_in_use(screenshot: Callable[[str, np.ndarray], None]) -> None:
-    context = headless_context()
-    software = is_software(context)
-    context.release()
-    if not software:
-        pytest.skip("the goldens were drawn by a software GPU")
     with rig(keyed(), WINDOW) as hand:
         hand.key("T")
         hand.drag(at(hand, 5), at(hand, 12))

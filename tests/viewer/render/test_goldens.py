@@ -10,16 +10,8 @@ import pytest
 
 from tests.helpers.stacks import Stack, view_of
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import is_software
 
 Compare = Callable[[str, np.ndarray], None]
-
-
-@pytest.fixture(scope="module")
-def software_gpu(ctx: moderngl.Context) -> None:
-    """Goldens hold for one renderer; another differs in the last bits."""
-    if not is_software(ctx):
-        pytest.skip(f"goldens were drawn by llvmpipe, here is {ctx.info['GL_RENDERER']}")
 
 
 @pytest.mark.gl
