@@ -17,13 +17,25 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 
 from .cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras
+from .images import picture_text
+
+EDITS_KEY = "progdf:edits"
+"""Of the text in a .png that names the edits which it shows."""
 
 
-def camera_chunk(camera: Camera) -> PngInfo:
-    """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered."""
+def camera_chunk(camera: Camera, edits: Sequence[str] = ()) -> PngInfo:
+    """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered, and the
+    names of the edits that it shows."""
     info = PngInfo()
     info.add_text(PICTURE_KEY, cameras_to_json([camera]))
+    if edits:
+        info.add_itxt(EDITS_KEY, ", ".join(edits))
     return info
+
+
+def edits_in_picture(path: str | os.PathLike[str]) -> str:
+    """The edits that a .png says it shows, "" for none. Raises ProgdfError: it is no picture."""
+    return picture_text(path, EDITS_KEY) or ""
 
 
 def find_picture_camera(path: str | os.PathLike[str], given: Sequence[Camera] = ()) -> Camera:

@@ -16,6 +16,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.picture_camera import edits_in_picture
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
@@ -141,6 +142,12 @@ def _changed_pictures(rest: str, settings: RegionSettings) -> tuple[Sequence[Pat
         raise ProgdfError(
             "changed needs pictures: use it with --editor pictures:A.png, or name them, changed:A.png,B.png"
         )
+    for path in paths:
+        if edits := edits_in_picture(path):
+            raise ProgdfError(
+                f"{path} was taken with edits on ({edits}), and what they change would count; take "
+                "the view without them, or name the region with --region"
+            )
     given = [] if settings.cameras is None else load_cameras(settings.cameras)
     return paths, picture_cameras(paths, given)
 

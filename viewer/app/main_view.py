@@ -14,6 +14,7 @@ import moderngl
 from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
+from progdf.io.picture_camera import camera_chunk
 from viewer.camera import inputs
 from viewer.camera.inputs import NO_KEYS, Keys
 from viewer.camera.view_camera import to_camera
@@ -25,7 +26,9 @@ from viewer.render.engine import ViewEngine, drawn_size
 from viewer.select import hand
 from viewer.state import comparison, playback, workspace
 from viewer.state.actions import perform
+from viewer.state.layers import shown_edits
 from viewer.state.recordings import RecordingFile
+from viewer.state.selection import NOBODY
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
@@ -228,7 +231,7 @@ class MainView:
         for action in inputs.requested_actions(self._keys):
             if self.at_start and action not in start_page.KEYS:
                 continue
-            if not asks or action in ("picture", "window_picture"):
+            if not asks or action in ("picture", "take_view", "window_picture"):
                 self._perform(action)
         if self.at_start:
             for action in start_page.draw(self.recent_files, self.ui):
@@ -336,8 +339,13 @@ class MainView:
             return saved_files.timeline(self.pictures, title, view)
         if request == "window_picture":
             return saved_files.picture(self.pictures, title, read_rgb(screen, size))
+        if request == "take_view":
+            view = workspace.original(self.work.view)
+            view = replace(view, selection=replace(view.selection, hidden=NOBODY))
         image = self.canvas.image(view, self._pointer().size)
         pixels = draw_labels(image, view.compare, self.canvas.comparer.labels(view))
-        compares = view.compare.mode != "off"  # which is no view that could be edited and trained on
-        camera = None if compares else to_camera(view.camera, image.shape[1], image.shape[0])
-        return saved_files.picture(self.pictures, title, pixels, camera)
+        if view.compare.mode != "off":  # which is no view that could be edited and trained on
+            return saved_files.picture(self.pictures, title, pixels)
+        camera = to_camera(view.camera, image.shape[1], image.shape[0])
+        said = saved_files.picture(self.pictures, title, pixels, camera_chunk(camera, shown_edits(view)))
+        return f"{said}; change it, then New edit, Edited pictures" if request == "take_view" else said

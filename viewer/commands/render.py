@@ -27,6 +27,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
 from viewer.state import recordings, timeline
+from viewer.state.layers import shown_edits
 from viewer.state.snapshots import compare_sides
 from viewer.state.view_state import Comparison, Timeline, ViewState
 
@@ -107,7 +108,7 @@ def _render_still(
     if options.alpha:
         picture = Image.fromarray(transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
-            picture.save(temporary_file, pnginfo=camera_chunk(camera))
+            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view)))
         return ""
     where = found.document.recordings()
     missing = recordings.obstacle(where)
@@ -121,7 +122,7 @@ def _render_still(
     try:
         image = comparer.image(view, camera=camera)
         # a comparison is no view that could be edited and trained on
-        carried = camera_chunk(camera) if view.compare.mode == "off" else None
+        carried = camera_chunk(camera, shown_edits(view)) if view.compare.mode == "off" else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
@@ -21,21 +22,24 @@ from .images import free_path, save_picture
 
 CAMERAS = ".cameras.json"
 
-REQUESTS = ("picture", "window_picture", "timeline_file")
+REQUESTS = ("picture", "take_view", "window_picture", "timeline_file")
 """Those of `actions.REQUESTS` that end here."""
 
 
-def picture(folder: Path, title: str, image: NDArray[np.uint8], camera: Camera | None = None) -> str:
+def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> str:
     """Save `image` [H,W,3] under the scene's name; the line that says where.
 
-    The file carries the camera, where there is one: what is changed in it can be trained on.
+    Args:
+        folder, title: where, and the scene's name
+        image: pixels
+        info: what the file carries: with a camera, what is changed in it can be trained on
 
     Raises:
         ProgdfError: it cannot be written.
     """
 
     def save() -> str:
-        return f"Saved {save_picture(folder, Path(title).stem, image, camera).resolve()}"
+        return f"Saved {save_picture(folder, Path(title).stem, image, info).resolve()}"
 
     return _try_save("picture", folder, save)
 

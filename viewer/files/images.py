@@ -7,16 +7,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
-from progdf.camera import Camera
 from progdf.io.atomic import atomic_write
-from progdf.io.picture_camera import camera_chunk
 
 
-def save_picture(folder: Path, stem: str, image: NDArray[np.uint8], camera: Camera | None = None) -> Path:
+def save_picture(folder: Path, stem: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> Path:
     """Write `image` [H,W,3] as STEM_001.png, or the next free number; returns the path.
 
-    The file carries the camera, where there is one.
+    Args:
+        folder, stem: where, and how it is named
+        image: pixels
+        info: what the file carries, see `camera_chunk`
 
     Raises:
         ProgdfError: the folder does not exist.
@@ -24,8 +26,7 @@ def save_picture(folder: Path, stem: str, image: NDArray[np.uint8], camera: Came
     """
     path = free_path(folder, stem, ".png")
     with atomic_write(path) as temporary_file:
-        carried = None if camera is None else camera_chunk(camera)
-        Image.fromarray(image).save(temporary_file, pnginfo=carried)
+        Image.fromarray(image).save(temporary_file, pnginfo=info)
     return path
 
 

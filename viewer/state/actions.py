@@ -285,7 +285,7 @@ def _new_edit(workspace: Workspace, _: str) -> Workspace:
 
 
 REQUESTS = (
-    *("picture", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
+    *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
     *("train", "stop_run", "resume_run", "discard_run", "run_log", "stop_and_quit"),
     *("export", "render_picture", "render_film", "deliver", "stop_delivery", "about", "demo"),

@@ -22,6 +22,11 @@ def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
     return alone or tuple(layer for layer in view.layers if layer.enabled)
 
 
+def shown_edits(view: ViewState) -> list[str]:
+    """The names of the layers that change the picture."""
+    return [layer.name for layer in visible_layers(view) if layer.strength > 0.0]
+
+
 def largest_strength(view: ViewState) -> float:
     """The upper end of the sliders."""
     return OVERSHOOT if view.overshoot else 1.0

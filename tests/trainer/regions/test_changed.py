@@ -66,6 +66,14 @@ def test_changed_without_pictures_is_one_line_before_the_scene_is_read(tmp_path:
         check_region("changed")
 
 
+def test_a_picture_that_shows_edits_is_one_line_before_the_scene_is_read(tmp_path: Path) -> None:
+    case = small("body", count=6, image_size=160)
+    carried = camera_chunk(case.views[0].camera, ["jacket", "gold"])
+    to_picture(case.views[0].image).save(tmp_path / "A.png", pnginfo=carried)
+    with pytest.raises(ProgdfError, match=r"A.png was taken with edits on \(jacket, gold\).* without them"):
+        check_region("changed", region_checks(settings([tmp_path / "A.png"], tmp_path)))
+
+
 def scene_picture() -> Tensor:
     """Soft blobs on white, as a render has them."""
     rows, columns = np.mgrid[:120, :160]

@@ -12,7 +12,7 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
-from progdf.io.picture_camera import find_picture_camera
+from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from tests.helpers.ui_rig import Rig, bear, rig
 from viewer.camera.view_camera import to_camera
 from viewer.gl import edit_pass
@@ -99,10 +99,25 @@ def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Pat
         expected = to_camera(hand.main_view.work.view.camera, shown.shape[1], shown.shape[0])
         assert torch.allclose(taken.viewmat, expected.viewmat, atol=1e-6)
         assert torch.allclose(taken.K, expected.K, atol=1e-4)
+        assert edits_in_picture(first) == ", ".join(layer.name for layer in hand.main_view.work.view.layers)
         assert np.asarray(Image.open(second)).shape == (540, 640, 3)
         message = hand.main_view.work.message
         assert message is not None
         assert str(second) in message.text
+
+
+def test_the_view_taken_to_be_changed_shows_no_edit_and_all_that_is_hidden(tmp_path: Path) -> None:
+    with rig(pictures=tmp_path) as hand:
+        hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.0))
+        hand.drag(hand.slider(1, 0.5), hand.slider(1, 0.0))
+        original = hand.picture()
+        hand.drag(hand.slider(0, 0.0), hand.slider(0, 1.0))
+        for key in ("Ctrl+A", "Ctrl+H", "Ctrl+F2"):
+            hand.key(key)
+        (taken,) = tmp_path.iterdir()
+        assert np.array_equal(np.asarray(Image.open(taken)), original)
+        assert edits_in_picture(taken) == ""
+        find_picture_camera(taken)
 
 
 def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_path: Path) -> None:
