@@ -39,7 +39,7 @@ TITLES = {
 }
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
-    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a session or cameras.",
+    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a changed picture, a session or cameras.",
     "replace": "An edit (.gdf) of this scene. The layer keeps its position, strength and gains.",
     "leave": "Save changes to {}?",
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",

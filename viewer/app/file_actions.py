@@ -105,8 +105,14 @@ class FileActions:
         return self._app.document.path is not None and workspace.has_unsaved(self._app.main_view.work)
 
     def open(self, path: Path) -> None:
-        """A file by what it is: scenes and sessions replace all, an edit comes on top, a camera is taken."""
-        self._report_errors(lambda: self._open(path, kind_of(path)))
+        """A file by what it is: scenes and sessions replace all, an edit comes on top, a camera is taken, a
+        changed picture goes into the form of a new edit."""
+
+        def open_kind() -> None:
+            picture = path.suffix.lower() in view_actions.PICTURES
+            self._open(path, "picture" if picture else kind_of(path))
+
+        self._report_errors(open_kind)
 
     def save(self, path: Path) -> None:
         """Save the session there from now on.
@@ -159,8 +165,11 @@ class FileActions:
         self._browser.close()
 
     def _open(self, path: Path, kind: str) -> None:
-        if self._app.main_view.at_start and kind in ("cameras", "timeline", "gdf"):
+        if self._app.main_view.at_start and kind in ("picture", "cameras", "timeline", "gdf"):
             raise ProgdfError(f"{path.name} belongs to a scene; open that first")
+        if kind == "picture":
+            view_actions.edit_picture(self._app.main_view, path)
+            return
         if kind == "cameras":
             view_actions.look_through(self._app.main_view, path)
             return

@@ -348,4 +348,4 @@ class MainView:
             return saved_files.picture(self.pictures, title, pixels)
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         said = saved_files.picture(self.pictures, title, pixels, camera_chunk(camera, shown_edits(view)))
-        return f"{said}; change it, then New edit, Edited pictures" if request == "take_view" else said
+        return f"{said}; change it in any program, and drop it here" if request == "take_view" else said

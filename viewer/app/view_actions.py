@@ -1,18 +1,25 @@
-"""Cameras and timelines as files: opened into the view on screen, or kept from it."""
+"""Cameras, timelines and changed pictures as files: opened into the view on screen, or kept from it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
+from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from viewer.camera.view_camera import from_camera, to_camera
 from viewer.files import exports, timeline_file
+from viewer.jobs.new_edit import with_picture
 from viewer.state.playback import Player
 from viewer.state.workspace import with_camera
 
 from .application import Application
 from .main_view import MainView
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+"""Endings of what `edit_picture` takes."""
 
 
 def look_through(main_view: MainView, path: Path) -> None:
@@ -21,10 +28,27 @@ def look_through(main_view: MainView, path: Path) -> None:
     Raises:
         ProgdfError: it holds none.
     """
-    work = main_view.work
-    camera = from_camera(work.view.camera, load_cameras(path)[0], main_view.facts.bounds)
-    main_view.work = with_camera(work, camera)
+    _take_camera(main_view, load_cameras(path)[0])
     main_view.show_message(f"Looking through the first camera of {path.name}")
+
+
+def edit_picture(main_view: MainView, path: Path) -> None:
+    """Put a picture that was changed into the form of a new edit, and look from where it was taken.
+
+    Raises:
+        ProgdfError: it is no picture, its camera is not found, or it was taken with edits on.
+    """
+    camera = find_picture_camera(path)
+    if edits := edits_in_picture(path):
+        raise ProgdfError(f"{path.name} was taken with edits on ({edits}); take the view with Ctrl+F2")
+    _take_camera(main_view, camera)
+    work = main_view.work
+    main_view.work = replace(work, form=with_picture(work.form, path, work.form_open), form_open=True)
+
+
+def _take_camera(main_view: MainView, camera: Camera) -> None:
+    seen = from_camera(main_view.work.view.camera, camera, main_view.facts.bounds)
+    main_view.work = with_camera(main_view.work, seen)
 
 
 def keep_camera(app: Application, session: Path | None) -> None:

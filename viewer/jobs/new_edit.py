@@ -57,7 +57,7 @@ EDITORS = (
         "instruct", "Instruction", "sentence", "A sentence for a model", "diffusers", "diffusion", False
     ),
     EditorChoice(
-        "pictures", "Edited pictures", "pictures", "Rendered here (Ctrl+P), changed anywhere", pictured=False
+        "pictures", "Edited pictures", "pictures", "Taken here (Ctrl+F2), changed anywhere", pictured=False
     ),
     EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
 )
@@ -138,6 +138,8 @@ class NewEdit:
         what = f"{kind} {self.style}" if kind == "style" else kind
         if self.choice.setting == "sentence" and self.sentence.strip():
             what = " ".join(self.sentence.split()[:4])
+        if self.choice.setting == "pictures" and self.pictures.strip():
+            what = Path(self.pictures.split(",")[0].strip()).stem
         return what if self.region in (ALL, SELECTION, TYPED, CHANGED) else f"{self.region} {what}"
 
     @property
@@ -164,6 +166,16 @@ def with_editor(form: NewEdit, editor: int) -> NewEdit:
     elif not finds and region == CHANGED:
         region = ALL
     return replace(form, editor=editor, region=region, error="")
+
+
+def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
+    """The form with a picture that was changed; beside those that it has where this is a further one."""
+    kept = [name.strip() for name in form.pictures.split(",") if name.strip()]
+    known = kept if further and form.choice.kind == "pictures" else []
+    names = [*(name for name in known if name != str(path)), str(path)]
+    pictures = next(i for i, choice in enumerate(EDITORS) if choice.kind == "pictures")
+    region = form.region if known else CHANGED
+    return replace(form, editor=pictures, pictures=", ".join(names), region=region, error="")
 
 
 def missing_package(choice: EditorChoice) -> str:

@@ -187,7 +187,7 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             label("Pictures", column)
             imgui.set_next_item_width(-1.0)
             form = replace(form, pictures=_text("##pictures", "A.png, B.png", form.pictures))
-            tip("One or a few pictures that were rendered here (Ctrl+P) and changed in any program")
+            tip("One or a few pictures that were taken here (Ctrl+F2) and changed in any program")
         case "folder":
             label("Folder", column)
             imgui.set_next_item_width(-1.0)

@@ -7,13 +7,17 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import save_gdf
+from progdf.io.picture_camera import camera_chunk
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
+from viewer.camera.view_camera import to_camera
 from viewer.files import timeline_file
+from viewer.files.images import save_picture
 from viewer.state.view_state import Keyframe, Timeline
 
 
@@ -67,6 +71,30 @@ def test_a_dropped_timeline_is_ready_to_play_and_can_be_undone(
     opened.main_view.restart(opened.main_view.work.view)
     opened.open(tmp_path / "half.ply")
     assert opened.main_view.work.view.timeline == Timeline()
+
+
+@pytest.mark.gl
+def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_taken(
+    opened: application.App, tmp_path: Path
+) -> None:
+    main_view = opened.main_view
+    before = main_view.work.view.camera
+    image = np.zeros((300, 400, 3), np.uint8)
+    taken = to_camera(replace(before, azimuth=before.azimuth + 20.0), 400, 300)
+    picture = save_picture(tmp_path, "helmet", image, camera_chunk(taken))
+    opened.open(picture)
+    opened.draw()
+    assert main_view.work.form_open
+    assert main_view.work.form.pictures == str(picture)
+    assert main_view.work.view.camera.azimuth == pytest.approx(before.azimuth + 20.0, abs=1e-3)
+    for name, carried, line in (
+        ("worn", camera_chunk(taken, ["scarf"]), "with edits on (scarf)"),
+        ("lost", None, "does not say from where"),
+    ):
+        opened.open(save_picture(tmp_path, name, image, carried))
+        assert main_view.work.message is not None
+        assert line in main_view.work.message.text
+        assert main_view.work.form.pictures == str(picture)
 
 
 @pytest.mark.gl

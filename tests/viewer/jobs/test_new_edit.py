@@ -11,7 +11,16 @@ import pytest
 from trainer.cli import train_options
 from trainer.editors import CHECKS, EDITORS
 from trainer.editors.style import STYLES as TRAINED_STYLES
-from viewer.jobs.new_edit import ALL, CHANGED, STYLES, TYPED, NewEdit, missing_package, with_editor
+from viewer.jobs.new_edit import (
+    ALL,
+    CHANGED,
+    STYLES,
+    TYPED,
+    NewEdit,
+    missing_package,
+    with_editor,
+    with_picture,
+)
 from viewer.jobs.new_edit import EDITORS as CHOICES
 from viewer.jobs.training_job import EditOrder
 
@@ -56,6 +65,16 @@ def test_changed_pictures_find_their_own_region() -> None:
     assert found.region == CHANGED
     assert with_editor(found, 0).region == ALL
     assert with_editor(NewEdit(region="hands"), KINDS.index("pictures")).region == "hands"
+
+
+def test_a_dropped_picture_is_ready_to_train_and_a_further_one_comes_beside_it() -> None:
+    first = with_picture(form("recolor", region="hands", pictures="old.png"), Path("a/helmet.png"), True)
+    assert (first.spec, first.region) == (f"pictures:{Path.cwd()}/a/helmet.png", CHANGED)
+    assert first.layer_name == "helmet"
+    second = with_picture(replace(first, region="hands"), Path("b.png"), True)
+    assert (second.pictures, second.region) == ("a/helmet.png, b.png", "hands")
+    assert with_picture(second, Path("b.png"), True).pictures == second.pictures
+    assert with_picture(second, Path("c.png"), False).pictures == "c.png"
 
 
 def test_a_name_is_one_that_a_file_can_have() -> None:
