@@ -220,7 +220,8 @@ def _style(form: NewEdit, ui: UiContext) -> NewEdit:
 def _preview(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> NewEdit:
     """The strength of the editor's own picture, and whether it is shown."""
     if not form.choice.pictured:
-        small("No picture in advance: this editor takes its time", PALETTE.dim)
+        if form.choice.kind != "pictures":
+            small("No picture in advance: this editor takes its time", PALETTE.dim)
         return form
     label("Preview", column)
     side = imgui.get_frame_height()
