@@ -41,7 +41,7 @@ def layers(hand: Rig) -> None:
 def compare(hand: Rig) -> None:
     """The original beside the edited scene, the divider in the hand."""
     _at(hand, (1.0,) * len(hand.strengths))
-    hand.key("Y")
+    hand.key("Shift+Y")
     hand.move(490.0, 300.0)
     hand.frame(3)
 

@@ -33,6 +33,9 @@ _UNDER, _SHOWN, _COVERED = 0.03, 0.5, 0.6
 """A ground has no more of the scene under it, shows in no fewer cells of the plan, and what stands on it
 covers no more of them."""
 
+_FEET = 0.01
+"""Share of a scene that lies under its ground: strays, and the far side of what is soft."""
+
 _ACROSS = 32
 _LEAST = 0.06
 """Of the cells of the largest thing: what fills fewer is a tuft or a stray. The toy robot's hands fill .11 of
@@ -114,6 +117,20 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
         if clear > best:
             best, eye = clear, stand
     return eye, target
+
+
+def ground_height(scene: Gaussians, up: Tensor) -> float:
+    """How high along `up` a scene's ground lies, or the feet of what stands in it; world units.
+
+    Strays below do not count; of a scene without anything solid, 0.
+    """
+    rows = _sample(scene)
+    solid = rows[scene.opacities[rows] > _SOLID]
+    if not len(solid):
+        return 0.0
+    shown = scene[_without_background(scene, solid)]
+    height = float(_quantile(shown.means @ up, _FEET))
+    return height if math.isfinite(height) else 0.0
 
 
 def _sample(scene: Gaussians) -> Tensor:

@@ -31,10 +31,17 @@ def bear(size: int = 1500) -> Stack:
 
 
 def first_view(stack: Stack, *strengths: float) -> ViewState:
-    """The bear from the front, its edits at these strengths; never coarse, however slow the machine is."""
+    """The bear from the front, its edits at these strengths; never coarse, however slow the machine is, and
+    without axes over it."""
     layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
     camera = first_camera(stack.scene, stack.demo.cameras)
-    return ViewState(camera=camera, layers=layers, background=stack.demo.background, dynamic_resolution="off")
+    return ViewState(
+        camera=camera,
+        layers=layers,
+        background=stack.demo.background,
+        dynamic_resolution="off",
+        axes=False,
+    )
 
 
 class Rig:

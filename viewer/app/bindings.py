@@ -11,19 +11,19 @@ from viewer.camera import controls
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 
 MOUSE_HELP = (
-    ("Left drag", "orbit"),
+    ("Left drag", "orbit; with Alt also while a tool is on"),
     ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
     ("Right drag", "pan; in fly mode look around"),
     ("Wheel", "zoom"),
     ("Click", "select the layer under the cursor"),
     ("Double-click", "set the orbit pivot"),
+    ("Axes", "click an end to look from there"),
     ("W A S D Q E", "fly; Shift faster, Alt slower"),
     ("Shift on a slider", "fine adjustment"),
     ("Ctrl+click a slider", "type a value"),
     ("Double-click a slider", "reset it"),
     ("Right-click", "menu of a layer or snapshot"),
     ("Esc, right-click", "cancel a drag"),
-    ("Hold \\", "show the original"),
 )
 
 TOPICS = (
@@ -37,7 +37,7 @@ TOPICS = (
 )
 """Each with the action of its first key in `controls.KEYS`; it goes on to the next one's first."""
 
-_ROW, _BETWEEN = 1.34, 0.8  # in sizes of the small text: from row to row, and above a heading
+_ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: from row to row, and above a heading
 COLUMN_PX, _MARGIN_PX = 322.0, 14.0  # at 1×
 _MOST_COLUMNS = 3
 
@@ -142,6 +142,7 @@ _NAMES = {
     "Shift+Right": "Shift+← →",
     "Ctrl+Right": "Ctrl+← →",
     "Escape": "Esc",
+    "Num1": "Numpad 1 3 7",
     "Alt+Down": "Alt+↑ ↓",
     "]": "[ ]",
     "R": "R L P U",

@@ -52,6 +52,9 @@ def draw(view: ViewState, said: Labels, area: Area, held: bool, ui: UiContext) -
         overlay.banner(said.line, area, ui)
     if view.compare.mode == "split":
         _divider(view.compare.divider, said, area, held, ui)
+        _knob(round(view.compare.divider * area.width), area.height / 2, held, ui)
+    if view.compare.mode == "beside":
+        _divider(0.5, said, area, False, ui)
     if view.compare.mode != "off" and said.notice:
         overlay.banner(said.notice, area, ui, row=1)
 
@@ -64,15 +67,15 @@ def _divider(share: float, said: Labels, area: Area, held: bool, ui: UiContext) 
     top, bottom = imgui.ImVec2(x, 0.0), imgui.ImVec2(x, area.height)
     canvas.add_line(top, bottom, u32(PALETTE.scrim), 3.0 * ui.scale)
     canvas.add_line(top, bottom, ink, 1.5 * ui.scale)
-    _knob(canvas, x, area.height / 2, ink, ui)
     _tag(canvas, x, said.left, True, ui)
     _tag(canvas, x, said.right, False, ui)
     canvas.pop_clip_rect()
 
 
-def _knob(canvas: imgui.ImDrawList, x: float, y: float, ink: int, ui: UiContext) -> None:
+def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
     """A round grip with an arrow to either side."""
-    s = ui.scale
+    s, canvas = ui.scale, imgui.get_background_draw_list()
+    ink = u32(PALETTE.accent if held else PALETTE.handle)
     canvas.add_circle_filled(imgui.ImVec2(x, y), 12.0 * s, u32(PALETTE.scrim))
     canvas.add_circle(imgui.ImVec2(x, y), 12.0 * s, ink, 0, 1.5 * s)
     for way in (-1.0, 1.0):

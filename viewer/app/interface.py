@@ -14,10 +14,10 @@ from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_labels import Labels
 from viewer.select import outline
 from viewer.state import workspace
-from viewer.state.actions import perform
+from viewer.state.actions import GLIDES, perform
 from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
-from viewer.ui import overlay
+from viewer.ui import axis_gizmo, overlay
 from viewer.ui.pointer import PointerContext
 
 from . import bindings, compare_overlay, dialogs, mouse
@@ -63,11 +63,10 @@ def panels(
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
     form = result.form or work.form
     work = replace(work, overlap=result.overlap, pointed=result.pointed, form=form)
-    work = _perform(work, result.actions, pointer)
+    work = perform_actions(work, result.actions, pointer)
     if work.player.shown:
-        work = _perform(
-            work, timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui), pointer
-        )
+        asked = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
+        work = perform_actions(work, asked, pointer)
     return work
 
 
@@ -95,9 +94,12 @@ def over_picture(
         original: the key that shows it is held
     """
     area, ui, view = pointer.area, pointer.ui, work.view
-    if view.brush.active and not imgui.get_io().want_capture_mouse:
+    io = imgui.get_io()
+    on_axes = not io.want_capture_mouse and bool(axis_gizmo.under(view, area, ui))
+    if view.brush.active and not (io.want_capture_mouse or io.key_alt or on_axes):
         brush.ring(view, ui)
-    outline.draw(held.gesture, view, ui)
+    axis_gizmo.draw(view, area, on_axes or held.drag == axis_gizmo.DRAG, ui)
+    outline.draw(held.gesture, view, ui, pointer.left)
     if original:
         overlay.banner("Original", area, ui)
     else:
@@ -129,7 +131,11 @@ def draw_dialog(
     return replace(work, dialog=answer.dialog, requests=(*work.requests, *answer.requests))
 
 
-def _perform(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
+def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
+    """What keys and buttons ask for; see `perform`."""
     for action in actions:
+        before = work.view.camera
         work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
+        if action.partition(":")[0] in GLIDES:
+            work = workspace.glide_from(work, before)
     return work

@@ -16,7 +16,7 @@ from imgui_bundle import imgui
 from progdf.errors import ProgdfError
 from progdf.io.picture_camera import camera_chunk
 from viewer.camera import inputs
-from viewer.camera.inputs import NO_KEYS, Keys
+from viewer.camera.inputs import NO_KEYS, Keys, Taps
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports as saved_files
 from viewer.gl.screen import read_rgb
@@ -25,7 +25,6 @@ from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.select import hand
 from viewer.state import comparison, playback, workspace
-from viewer.state.actions import perform
 from viewer.state.layers import shown_edits
 from viewer.state.recordings import RecordingFile
 from viewer.state.selection import NOBODY
@@ -83,6 +82,8 @@ class MainView:
         self._tool = MouseTool()
         self._revealed = self.work.focus  # the layer that the panel was last scrolled to
         self._keys = NO_KEYS  # of the present frame
+        self._taps = Taps()
+        self._half = 0  # of two pictures side by side, the one that the mouse is in
         self._clock = 0.0
         self._pending = PendingKeys()
         self._resting = False
@@ -127,7 +128,9 @@ class MainView:
         self.ui.make_current()
         if not self._resting and (inputs.has_pending_input() or self.opening):
             return 0.0
-        waits = [FLIGHT_S] if inputs.is_flying(self._keys) else []
+        waits = [FLIGHT_S] if inputs.is_flying(self._keys) or self._taps.since else []
+        if self.work.glide is not None:
+            waits.append(0.0)
         if imgui.get_io().want_text_input:
             waits.append(BLINK_S)
         if self.work.message is not None:
@@ -185,6 +188,8 @@ class MainView:
         self._handle_input(seconds)
         if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.is_repeating(keys):
             self.work = workspace.record_undo(self.work)
+        if self.work.view.layers != before.view.layers:
+            self.work = replace(self.work, before=False)
         if self.work != before:
             view = comparison.end_at_edit(before.view, self.work.view)
             self.work = replace(self.work, view=view)
@@ -228,7 +233,10 @@ class MainView:
         )
         self._tool = replace(self._tool, gesture=gesture)
         asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
-        for action in inputs.requested_actions(self._keys):
+        flies = self.work.view.camera.mode == "fly"
+        self._taps, tapped = inputs.tapped_actions(self._taps, self._keys, self._clock, flies)
+        self._keys = self._taps.without(self._keys)
+        for action in (*inputs.requested_actions(self._keys), *tapped):
             if self.at_start and action not in start_page.KEYS:
                 continue
             if not asks or action in ("picture", "take_view", "window_picture"):
@@ -259,33 +267,42 @@ class MainView:
         self._keys = replace(self._keys, pressed=())
 
     def _perform(self, action: str) -> None:
-        area = self._area()
-        self.work = perform(self.work, action, self.facts, area.width / area.height)
+        self.work = interface.perform_actions(self.work, [action], self._pointer())
 
     def _pointer(self) -> PointerContext:
         """What lies under the mouse."""
-        return PointerContext(self.engine, self.facts, self._shown_view(), self._area(), self.ui, self._clock)
+        area = self._area()
+        if self._tool.drag is None:
+            self._half = int(2 * imgui.get_io().mouse_pos.x >= area.width)
+        return PointerContext(
+            self.engine, self.facts, self._shown_view(), area, self.ui, self._clock, self._half
+        )
 
     def _shown_view(self) -> ViewState:
-        if inputs.holds_original(self._keys):
+        if self._shows_original:
             return workspace.original(self.work.view)
         view, sides = self.work.view, compare_sides(self.work.snapshots, self.work.view)
         if sides is not None:
             return sides.right
         return replace(view, layers=(*view.layers, *self.live)) if self.live else view
 
+    @property
+    def _shows_original(self) -> bool:
+        return self.work.before or inputs.holds_original(self._keys)
+
     def _is_held(self) -> bool:
         """Whether the user holds something that moves the picture, or a film plays."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
-        return inputs.is_flying(self._keys) or inputs.is_repeating(self._keys) or self.work.player.playing
+        moves = self.work.player.playing or self.work.glide is not None
+        return moves or inputs.is_flying(self._keys) or inputs.is_repeating(self._keys)
 
     def _draw_overlays(self) -> None:
         """What is drawn over the picture; where some of it goes away, another frame follows."""
         pointer, before = self._pointer(), self.work
         pressed = [press.chord for press in self._keys.pressed]
         self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
-        original = inputs.holds_original(self._keys)
+        original = self._shows_original
         if self.cover is not None and not original:
             cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         said = self.canvas.comparer.labels(self.work.view)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from imgui_bundle import imgui
 
 from viewer.camera import controls, inputs
+from viewer.camera.named_views import AXES, look_at_view
 from viewer.camera.view_camera import ViewCamera
 from viewer.panel import brush
 from viewer.render.picking import layer_at, seen_at, surface_point
@@ -17,6 +18,7 @@ from viewer.state import paint, workspace
 from viewer.state.paint import Stroke
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Workspace
+from viewer.ui import axis_gizmo
 from viewer.ui.context import UiContext
 from viewer.ui.pointer import PointerContext
 
@@ -30,17 +32,19 @@ class MouseTool:
     """What the mouse holds.
 
     Args:
-        drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER`, `brush.DRAG` or `hand.DRAG`; None while it
-            holds nothing
+        drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER`, `brush.DRAG`, `hand.DRAG` or
+            `axis_gizmo.DRAG`; None while it holds nothing
         stroke: of the brush, from its first drag on
         gesture: of the tool that selects; of a polygon also between its clicks
         divider: where that of a split stood when it was gripped, share of the picture's width
+        axis: the end of an axis that was pressed, of `named_views.AXES`, or another part of the axes
     """
 
     drag: str | None = None
     stroke: Stroke | None = None
     gesture: Gesture | None = None
     divider: float = 0.5
+    axis: str = ""
 
 
 def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
@@ -52,6 +56,8 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     if tool.drag == hand.DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
         gesture, work = hand.release(tool.gesture, work, pointer)
         tool = replace(tool, gesture=gesture)
+    if tool.drag == axis_gizmo.DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
+        work = _look_along(work, tool.axis)
     if not inputs.any_button_down():
         tool = replace(tool, drag=None)
     if io.want_capture_mouse:
@@ -60,9 +66,12 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
         compare_overlay.show_grip()
         if imgui.is_mouse_clicked(0):
             return MouseTool(compare_overlay.DIVIDER, divider=work.view.compare.divider), work
-    if work.view.brush.active and imgui.is_mouse_clicked(0):
+    axis, plain = axis_gizmo.under(work.view, pointer.area, pointer.ui), not io.key_alt
+    if axis and imgui.is_mouse_clicked(0):
+        return replace(tool, drag=axis_gizmo.DRAG, axis=axis), work
+    if work.view.brush.active and plain and imgui.is_mouse_clicked(0):
         return _begin_stroke(tool, work, pointer)
-    if work.view.select.tool and imgui.is_mouse_clicked(0):
+    if work.view.select.tool and plain and imgui.is_mouse_clicked(0):
         gesture, work = hand.press(tool.gesture, work, pointer)
         return replace(tool, drag=hand.DRAG, gesture=gesture), work
     camera = work.view.camera
@@ -103,9 +112,13 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
             return tool, work
         gesture, work = hand.follow(tool.gesture, work, pointer)
         return replace(tool, gesture=gesture), work
+    if tool.drag == axis_gizmo.DRAG:
+        camera = work.view.camera
+        turned = controls.orbit(camera, dx, dy) if _has_traveled(pointer.ui) else camera
+        return tool, workspace.with_camera(work, turned)
     if tool.drag and (dx or dy):
         # also where the button went up within this frame: a slow frame must not lose the end of a drag
-        height, radius = pointer.area.height / scale, pointer.facts.bounds.radius
+        height, radius = pointer.scale * pointer.area.height / scale, pointer.facts.bounds.radius
         camera = controls.drag(work.view.camera, tool.drag, dx, dy, height, radius)
         return tool, workspace.with_camera(work, camera)
     return tool, work
@@ -140,6 +153,14 @@ def _has_traveled(ui: UiContext) -> bool:
     """Whether the left button moved between its press and its release, by more than a tremor."""
     way = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
     return bool(way.x or way.y)
+
+
+def _look_along(work: Workspace, axis: str) -> Workspace:
+    """A click on an end of an axis: seen from there."""
+    camera = work.view.camera
+    if axis not in AXES:
+        return work
+    return workspace.glide_from(workspace.with_camera(work, look_at_view(camera, axis)), camera)
 
 
 def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:

@@ -141,16 +141,21 @@ class DragBinding:
 
 @dataclass(frozen=True)
 class KeyBinding:
-    """A key: modifiers in the order Ctrl, Shift, Alt, then the key's name. `repeats` while held."""
+    """A key: modifiers in the order Ctrl, Shift, Alt, then the key's name.
+
+    `repeats` while held; with `tap` it is done when the key is let go soon, as held it does something else.
+    """
 
     chord: str
     action: str
     help: str
     repeats: bool = False
+    tap: bool = False
 
 
 DRAGS = (
     DragBinding("left", "", "orbit"),
+    DragBinding("left", "Alt", "orbit"),
     DragBinding("middle", "", "orbit"),
     DragBinding("middle", "Shift", "pan"),
     DragBinding("middle", "Ctrl", "dolly"),
@@ -162,6 +167,8 @@ FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q
 """Physical keys (their places on a US keyboard) → right, up, ahead."""
 
 HELD_ORIGINAL = "\\"
+TAP_S = 0.25
+"""A key that is let go sooner was tapped, not held."""
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
 KEYS = (
@@ -225,10 +232,21 @@ KEYS = (
     KeyBinding("Ctrl+Shift+Z", "redo", "redo", repeats=True),
     KeyBinding("Ctrl+Y", "redo", "", repeats=True),
     KeyBinding("V", "fly", "orbit or fly mode"),
-    KeyBinding("F", "frame", "frame the selected layer, or the scene"),
-    KeyBinding("Shift+F", "home", "reset the view"),
-    KeyBinding("Y", "split", "split view with the original"),
-    KeyBinding("Shift+Y", "difference", "difference from the original"),
+    KeyBinding("F", "frame", "frame the selection, layer or scene"),
+    KeyBinding("Num.", "frame", ""),
+    KeyBinding("Shift+F", "home", "reset the view (numpad 0)"),
+    KeyBinding("Num0", "home", ""),
+    KeyBinding("Num1", "look:front", "front, right, top; Ctrl opposite"),
+    KeyBinding("Num3", "look:right", ""),
+    KeyBinding("Num7", "look:top", ""),
+    KeyBinding("Ctrl+Num1", "look:back", ""),
+    KeyBinding("Ctrl+Num3", "look:left", ""),
+    KeyBinding("Ctrl+Num7", "look:bottom", ""),
+    KeyBinding("Shift+G", "grid", "grid on the ground"),
+    KeyBinding(HELD_ORIGINAL, "before", "original: tap, or hold", tap=True),
+    KeyBinding("Y", "beside", "side by side; with Shift split view"),
+    KeyBinding("Shift+Y", "split", ""),
+    KeyBinding("D", "difference", "difference (a tap; held it flies)", tap=True),
     KeyBinding("Alt+Y", "against", "compare with the recording"),
     KeyBinding("Space", "play", "play or pause"),
     KeyBinding("K", "key", "insert a keyframe"),

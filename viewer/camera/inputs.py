@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
@@ -47,6 +47,17 @@ class Keys:
 NO_KEYS = Keys()
 
 
+@dataclass(frozen=True)
+class Taps:
+    """Keys that are down and may yet have been tapped, and since when."""
+
+    since: tuple[tuple[str, float], ...] = ()
+
+    def without(self, keys: Keys) -> Keys:
+        """The keys, of which these do not fly yet."""
+        return replace(keys, fly=keys.fly - {chord for chord, _ in self.since})
+
+
 def has_reached_imgui(press: Press) -> bool:
     """Whether imgui, which takes text and keys in over several frames, has come to this key.
 
@@ -80,8 +91,27 @@ def requested_actions(keys: Keys) -> list[str]:
         key.action
         for press in keys.pressed
         for key in controls.KEYS
-        if key.chord == press.chord and (key.repeats or not press.again)
+        if key.chord == press.chord and not key.tap and (key.repeats or not press.again)
     ]
+
+
+def tapped_actions(taps: Taps, keys: Keys, now: float, flies: bool) -> tuple[Taps, list[str]]:
+    """Actions of keys that were let go soon after they went down; none while a text field is open.
+
+    Args:
+        taps: as it was after the last frame
+        now: seconds on the main view's clock
+        flies: flight keys fly at once, so that none of them is tapped
+    """
+    if imgui.get_io().want_text_input:
+        return Taps(), []
+    actions = {key.chord: key.action for key in controls.KEYS if key.tap}
+    ignored = controls.FLY_KEYS if flies or len(keys.fly) > 1 else ()
+    down = {press.chord: now for press in keys.pressed if press.chord in actions and not press.again}
+    since = {chord: at for chord, at in {**dict(taps.since), **down}.items() if chord not in ignored}
+    tapped = [c for c, at in since.items() if c not in keys.held and now - at <= controls.TAP_S]
+    held = tuple((c, at) for c, at in since.items() if c in keys.held and now - at <= controls.TAP_S)
+    return Taps(held), [actions[chord] for chord in tapped]
 
 
 def is_repeating(keys: Keys) -> bool:

@@ -167,6 +167,21 @@ def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
     )
 
 
+def half_camera(camera: Camera) -> Camera:
+    """The same view in a picture of half the width: the square in its middle stays in sight."""
+    width, shrink = max(camera.width // 2, 1), half_scale(camera.width, camera.height)
+    K = camera.K.clone()
+    K[:2] *= shrink
+    K[0, 2] += 0.5 * (width - shrink * camera.width)
+    K[1, 2] += 0.5 * (1.0 - shrink) * camera.height
+    return replace(camera, K=K, width=width)
+
+
+def half_scale(width: int, height: int) -> float:
+    """How large things are in the picture of `half_camera`, of what they are in the whole one."""
+    return min(max(width // 2, 1) / max(min(width, height), 1), 1.0)
+
+
 def look_along(camera: ViewCamera, back: Vec3) -> ViewCamera:
     """The same pivot and distance, seen along −`back` (any length): azimuth and elevation that give it."""
     up = unit(camera.up, (0.0, 1.0, 0.0))

@@ -14,7 +14,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.scene.neighborhood import Neighborhood
 from progdf.terminal import escape_text
-from viewer.camera.view_camera import bounds_of, first_camera, fit_all
+from viewer.camera.view_camera import bounds_of, first_camera, fit, fit_all
 from viewer.render.threads import all_threads
 from viewer.state.layer_facts import layer_rows
 from viewer.state.recordings import RecordingFile, find_recording
@@ -49,6 +49,7 @@ class Document:
             rows=rows,
             recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, scene, aspect),
+            fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
             neighborhood=cache(lambda: Neighborhood(scene)),
             home=lambda camera, aspect: replace(
                 first_camera(scene, (), aspect, camera.fov_y, camera.up), mode=camera.mode

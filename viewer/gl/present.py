@@ -23,20 +23,22 @@ class Presenter:
         picture: moderngl.Texture,
         framebuffer: moderngl.Framebuffer,
         size: tuple[int, int] | None = None,
+        left: int = 0,
     ) -> None:
-        """Fill the lower left `size` pixels of `framebuffer` with `picture`: pixel by pixel where it has as
-        many (which is what None means), else smoothly."""
+        """Fill the lower `size` pixels of `framebuffer`, from the column `left` on, with `picture`: pixel by
+        pixel where it has as many (which is what None means), else smoothly."""
         size = size or picture.size
         framebuffer.use()
-        self.ctx.viewport = (0, 0, *size)
+        self.ctx.viewport = (left, 0, *size)
         self.ctx.enable_only(moderngl.NOTHING)
         picture.use(0)
         if size == picture.size:
-            self._program["picture"] = 0
+            self._program["picture"], self._program["left"] = 0, left
             self._vao.render(moderngl.TRIANGLES, vertices=3)
         else:
             picture.filter = (moderngl.LINEAR, moderngl.LINEAR)
             self._stretch["picture"], self._stretch["shown_size"] = 0, size
+            self._stretch["left"] = left
             self._stretch_vao.render(moderngl.TRIANGLES, vertices=3)
 
     def release(self) -> None:

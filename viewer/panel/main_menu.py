@@ -8,6 +8,7 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from progdf.terminal import escape_text
+from viewer.state.view_state import ViewState
 from viewer.ui.context import Icon, UiContext
 from viewer.ui.widgets import elide, icon_button, menu, tip
 
@@ -22,10 +23,19 @@ _MAKES = (
     ("Render picture…", "Ctrl+P", "render_picture"),
     ("Render film…", "Ctrl+Shift+P", "render_film"),
 )
+_VIEWS = (
+    ("Front", "Numpad 1", "look:front"),
+    ("Back", "Ctrl+Numpad 1", "look:back"),
+    ("Right", "Numpad 3", "look:right"),
+    ("Left", "Ctrl+Numpad 3", "look:left"),
+    ("Top", "Numpad 7", "look:top"),
+    ("Bottom", "Ctrl+Numpad 7", "look:bottom"),
+)
+_FRAMES = (("Frame", "F", "frame"), ("Home", "Shift+F", "home"))
 _HELP = (("Shortcuts", "F1", "help"), ("About", "", "about"), ("Quit", "Ctrl+Q", "quit"))
 
 
-def button(recent: Sequence[Path], ui: UiContext) -> list[str]:
+def button(recent: Sequence[Path], view: ViewState, ui: UiContext) -> list[str]:
     """The button at the right of the present line, and its menu while it is open; what was chosen."""
     if icon_button("menu", Icon.BARS, ui):
         imgui.open_popup(NAME)
@@ -39,12 +49,27 @@ def button(recent: Sequence[Path], ui: UiContext) -> list[str]:
             imgui.separator()
             actions += _items(_MAKES)
             imgui.separator()
+            actions += _view(view)
+            imgui.separator()
             actions += _items(_HELP)
     return actions
 
 
 def _items(items: Sequence[tuple[str, str, str]]) -> list[str]:
     return [action for name, keys, action in items if imgui.menu_item(name, keys, False)[0]]
+
+
+def _view(view: ViewState) -> list[str]:
+    actions: list[str] = []
+    if imgui.begin_menu("View"):
+        actions += _items(_VIEWS)
+        imgui.separator()
+        actions += _items(_FRAMES)
+        imgui.separator()
+        shown = (("Ground grid", "Shift+G", "grid", view.grid), ("Axes", "", "axes", view.axes))
+        actions += [action for name, keys, action, on in shown if imgui.menu_item(name, keys, on)[0]]
+        imgui.end_menu()
+    return actions
 
 
 def _recent(recent: Sequence[Path], ui: UiContext) -> list[str]:

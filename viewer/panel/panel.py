@@ -135,7 +135,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         | flags.no_scroll_with_mouse.value,
     )
     actions: list[str] = []
-    actions += _title(shown, ui)
+    actions += _title(state, shown, ui)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     _begin_body(footer)
     state, asked = layer_cards.heading(state, shown.form is not None, ui)
@@ -191,7 +191,7 @@ def _end_body() -> None:
     imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
 
 
-def _title(shown: PanelInput, ui: UiContext) -> list[str]:
+def _title(state: ViewState, shown: PanelInput, ui: UiContext) -> list[str]:
     """The scene's name and size, and the menu at the right of both; what was chosen there."""
     at, side = imgui.get_cursor_pos(), imgui.get_frame_height()
     imgui.push_font(ui.fonts.bold, 0.0)
@@ -201,7 +201,7 @@ def _title(shown: PanelInput, ui: UiContext) -> list[str]:
     small(f"{group_digits(shown.count)} splats", PALETTE.dim, room - side)
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
-    actions = main_menu.button(shown.recent, ui)
+    actions = main_menu.button(shown.recent, state, ui)
     imgui.set_cursor_pos(below)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     return actions
@@ -240,7 +240,7 @@ def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions:
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
         actions.append("frame")
-    tip("Frame the selected layer, or the scene (F)")
+    tip("Frame the selection, the focused layer, or the scene (F)")
     imgui.same_line(0.0, 6.0 * ui.scale)
     if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
         actions.append("home")
@@ -254,8 +254,8 @@ def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, u
     `unrecorded`: why nothing is; `kept`: whether there are snapshots.
     """
     label("Compare", column)
-    chosen = choice("compare", ("Off", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
-    tip("Split view (Y) or amplified difference (Shift+Y)")
+    chosen = choice("compare", ("Off", "Side", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
+    tip("Side by side (Y), split view (Shift+Y), or amplified difference (D)")
     if chosen is not None:
         shown = replace(shown, mode=COMPARE_MODES[chosen])
     if shown.mode == "off":

@@ -24,7 +24,7 @@ class Labels:
     """The words of one comparison.
 
     Args:
-        left, right: the sides of a split
+        left, right: the two sides
         line: over a difference
         notice: why it is not against what was asked for, "" where it is
     """
@@ -83,6 +83,8 @@ def draw_labels(image: Image, compare: Comparison, said: Labels) -> Pixels:
 
 def column(compare: Comparison, width: int) -> int:
     """Where in a picture of this width the edited side begins, pixels."""
+    if compare.mode == "beside":
+        return width // 2
     return max(0, min(width, round(compare.divider * width)))
 
 

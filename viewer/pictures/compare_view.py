@@ -1,4 +1,4 @@
-"""Two pictures in one: side by side at a divider, or their difference amplified, with PSNR.
+"""Two pictures in one: each in a half, or split at a divider, or their difference amplified, with PSNR.
 
 Beside the edited picture stands the original, the same edits as they were recorded, or one snapshot beside
 another. That side is drawn by a second engine, made when it is first asked for: against the original a slider
@@ -19,6 +19,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from progdf.metrics.image import psnr
+from viewer.camera.view_camera import half_camera, to_camera
 from viewer.gl.present import Presenter
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.renderers import Image
@@ -60,12 +61,13 @@ class Comparer:
     def needs_draw(self, view: ViewState, size: tuple[int, int], pixels: int = 1) -> bool:
         """Whether splats have to be drawn for `view`, or a difference taken; arguments as for `draw`."""
         drawn = size if view.compare.mode == "difference" else drawn_size(size, pixels)
-        if self.engine.needs_draw(view, drawn):
+        camera = half_camera(to_camera(view.camera, *drawn)) if view.compare.mode == "beside" else None
+        if self.engine.needs_draw(view, drawn, camera):
             return True
         if view.compare.mode == "off":
             return False
         apart = view.compare.mode == "difference" and self._shown != view.compare.amplify
-        return apart or self._second(view).needs_draw(self._other_view(view), drawn)
+        return apart or self._second(view).needs_draw(self._other_view(view), drawn, camera)
 
     def draw(
         self,
@@ -85,17 +87,23 @@ class Comparer:
         if view.compare.mode == "difference":
             return self._draw_difference(view, framebuffer, size)
         self._shown = None  # the engines go on, and the next difference is another
-        if view.compare.mode == "split":
-            return self._draw_split(view, framebuffer, size, pixels)
+        if view.compare.mode in ("beside", "split"):
+            return self._draw_sides(view, framebuffer, size, pixels)
         return self.engine.draw(view, framebuffer, size, pixels)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
         """The same as an array, without labels. [H,W,3] float32, see `Engine.image`"""
         if view.compare.mode == "off":
             return self.engine.image(view, size, camera)
+        if view.compare.mode == "beside":
+            whole = camera or to_camera(view.camera, *size)
+            camera = half_camera(whole)
         edited = self.engine.image(view, size, camera)
         other = self._second(view).image(self._other_view(view), size, camera)
         self.psnr = _psnr(other, edited)
+        if view.compare.mode == "beside":
+            gap = np.ones((edited.shape[0], whole.width - 2 * edited.shape[1], 3), np.float32)
+            return np.concatenate([other, edited, gap], axis=1)
         if view.compare.mode == "split":
             at = column(view.compare, edited.shape[1])
             return np.concatenate([other[:, :at], edited[:, at:]], axis=1)
@@ -154,19 +162,24 @@ class Comparer:
         recorded = self.against(view) == "recorded"
         return recordings.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
 
-    def _draw_split(
+    def _draw_sides(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
-        at, new = column(view.compare, size[0]), self.needs_draw(view, size, pixels)
-        other, beside = self._second(view), self._other_view(view)
-        edited = self.engine.draw(view, framebuffer, size, pixels)
-        framebuffer.scissor = (0, 0, at, size[1])
-        try:
-            original = other.draw(beside, framebuffer, size, pixels)
-        finally:
-            framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
+        new, other, its_view = self.needs_draw(view, size, pixels), self._second(view), self._other_view(view)
+        camera = None
+        if view.compare.mode == "beside":
+            camera = half_camera(to_camera(view.camera, *size))
+            edited = self.engine.draw(view, framebuffer, size, pixels, half=1)
+            original = other.draw(its_view, framebuffer, size, pixels, half=0)
+        else:
+            edited = self.engine.draw(view, framebuffer, size, pixels)
+            framebuffer.scissor = (0, 0, column(view.compare, size[0]), size[1])
+            try:
+                original = other.draw(its_view, framebuffer, size, pixels)
+            finally:
+                framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
         if new and pixels == 1 and self._against != "original":
-            self.psnr = _psnr(other.image(beside, size), self.engine.image(view, size))
+            self.psnr = _psnr(other.image(its_view, size, camera), self.engine.image(view, size, camera))
         elif new:
             self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors
         return _add_timings(edited, original)

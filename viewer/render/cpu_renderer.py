@@ -39,9 +39,10 @@ CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
 
 @dataclass(frozen=True)
 class _Kept:
-    """The last picture and what it shows."""
+    """The last picture, what shines through it, 0..1 [H,W], and what it shows."""
 
     image: Image
+    through: Image
     camera: Camera
     background: Vec3
 
@@ -73,6 +74,8 @@ class CpuRenderer:
         self._texture: moderngl.Texture | None = None
         self._stale: list[Crop] | None = None  # where the texture is behind the picture; None is everywhere
         self._kept: _Kept | None = None
+        self._coverage: moderngl.Texture | None = None
+        self._covers = False  # whether that is of the picture
         self._lent = False  # whether the picture's array is in other hands
         self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
@@ -135,15 +138,15 @@ class CpuRenderer:
             crops = dirty_rectangles(self._cells, (camera.width, camera.height), worth)
         share = area(crops) / whole
         if kept is None or share > WORTH_DRAWING_APART:
-            image, share = self._draw(camera, background, None), 1.0
-            self._kept, self._stale, self._lent = _Kept(image, camera, background), None, False
+            share, self._kept = 1.0, _Kept(*self._draw(camera, background, None), camera, background)
+            self._stale, self._lent, self._covers = None, False, False
         elif crops:
             parts = [self._draw(camera, background, crop) for crop in crops]
             if self._lent:
                 kept, self._lent = replace(kept, image=kept.image.copy()), False
-            for (x0, y0, x1, y1), part in zip(crops, parts, strict=True):
-                kept.image[y0:y1, x0:x1] = part
-            self._kept = kept
+            for (x0, y0, x1, y1), (image, through) in zip(crops, parts, strict=True):
+                kept.image[y0:y1, x0:x1], kept.through[y0:y1, x0:x1] = image, through
+            self._kept, self._covers = kept, False
             self._stale = None if self._stale is None else [*self._stale, *crops]
         if kept is None:
             self._last = None
@@ -159,8 +162,25 @@ class CpuRenderer:
         self._lent = True
         return self._picture().image
 
-    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
-        """Fill the framebuffer's lower left `size` pixels with the picture; None: as many as it has."""
+    def coverage(self) -> moderngl.Texture:
+        """See `Renderer.coverage`."""
+        assert self._ctx is not None, "nothing to show on without a context"
+        through = self._picture().through
+        size = (through.shape[1], through.shape[0])
+        if self._coverage is None or self._coverage.size != size:
+            if self._coverage is not None:
+                self._coverage.release()
+            self._coverage, self._covers = self._ctx.texture(size, 1, dtype="f4"), False
+            self._coverage.swizzle = "000R"
+        if not self._covers:
+            self._coverage.write(1.0 - through)
+            self._covers = True
+        return self._coverage
+
+    def show(
+        self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None, left: int = 0
+    ) -> None:
+        """See `Renderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
         assert self._presenter is not None
         image = self._picture().image
@@ -176,20 +196,20 @@ class CpuRenderer:
                 part = np.ascontiguousarray(image[y0:y1, x0:x1])
                 self._texture.write(part, viewport=(x0, y0, x1 - x0, y1 - y0))
         self._stale = []
-        self._presenter.show(self._texture, framebuffer, size)
+        self._presenter.show(self._texture, framebuffer, size, left)
 
     def release(self) -> None:
         """Give back what it holds."""
-        if self._texture is not None:
-            self._texture.release()
+        for texture in (self._texture, self._coverage):
+            if texture is not None:
+                texture.release()
         if self._presenter is not None:
             self._presenter.release()
 
-    def _draw(self, camera: Camera, background: Vec3, crop: Crop | None) -> Image:
+    def _draw(self, camera: Camera, background: Vec3, crop: Crop | None) -> tuple[Image, Image]:
         with torch.no_grad():
-            image = render(self._drawn, camera, background, crop=crop).image
-        pixels: Image = image.numpy()
-        return pixels
+            found = render(self._drawn, camera, background, crop=crop)
+        return found.image.numpy(), found.transmittance.numpy()
 
     def _where(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """The cells of the kept picture that `rows` touch as they are. While one slider is dragged, where

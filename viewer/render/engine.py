@@ -21,8 +21,10 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.scene.bounds import near_plane
-from viewer.camera.view_camera import bounds_of, to_camera
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import bounds_of, half_camera, to_camera
 from viewer.gl.edit_pass import EditPassError
+from viewer.gl.ground_grid import GroundGrid, GroundPlane, ground_plane
 from viewer.render.timings import EditsBy, FrameTimings
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
@@ -105,6 +107,8 @@ class ViewEngine:
         self._picture: _Picture | None = None
         self.highlight: Highlight | None = None
         """What `draw` shows over the scene; `image` never does, but for what is hidden."""
+        self._grid: GroundGrid | None = None
+        self._ground: tuple[Vec3, GroundPlane] | None = None  # the plane that is the ground where this is up
         self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # and its colors. [N,4]
         if edit_pass == "gpu" and self.draws_with == "cpu":
             raise ProgdfError("the CPU draws here, so the GPU cannot edit; add --draw gl to --edit-pass gpu")
@@ -124,19 +128,25 @@ class ViewEngine:
         framebuffer: moderngl.Framebuffer,
         size: tuple[int, int],
         pixels: int = 1,
+        half: int | None = None,
     ) -> FrameTimings:
         """Bring the picture up to date and show it in the lower left `size` pixels of `framebuffer`.
 
         Args:
             pixels: of the framebuffer that one pixel of the picture fills, each way
+            half: fill only the left half (0) or the right one (1) of these, see `half_camera`
 
         Raises:
             ProgdfError: a layer of `view` means nothing; the last picture stays.
         """
-        self.timings = self._update_picture(
-            view, to_camera(view.camera, *drawn_size(size, pixels)), self.highlight
-        )
-        self.renderer.show(framebuffer, size)
+        camera, left = to_camera(view.camera, *drawn_size(size, pixels)), 0
+        if half is not None:
+            camera, size = half_camera(camera), (max(size[0] // 2, 1), size[1])
+            left = half * size[0]
+        self.timings = self._update_picture(view, camera, self.highlight)
+        self.renderer.show(framebuffer, size, left)
+        if view.grid and self.ctx is not None:
+            self._draw_grid(view, camera, framebuffer, size, left)
         return self.timings
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
@@ -186,8 +196,28 @@ class ViewEngine:
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
+        if self._grid is not None:
+            self._grid.release()
         self.editing.release()
         self.renderer.release()
+
+    def _draw_grid(
+        self,
+        view: ViewState,
+        camera: Camera,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int],
+        left: int,
+    ) -> None:
+        """The grid on the ground, over what was shown."""
+        assert self.ctx is not None, "nothing to show on without a context"
+        up = view.camera.up
+        if self._ground is None or self._ground[0] != up:
+            self._ground = up, ground_plane(self.scene, up)
+        self._grid = self._grid or GroundGrid(self.ctx)
+        self._grid.draw(
+            self._ground[1], camera, view.background, self.renderer.coverage(), framebuffer, size, left
+        )
 
     def _create(self, wants_pass: bool) -> tuple[Renderer, Editing]:
         """The renderer with the scene in it, and what edits it there."""

@@ -57,8 +57,15 @@ class Renderer(Protocol):
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped. [H,W,3]"""
 
-    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
-        """Fill the framebuffer's lower left `size` pixels with the picture; None: as many as it has."""
+    def coverage(self) -> moderngl.Texture:
+        """Of the picture: what the scene covers of each pixel, 0..1, in the alpha of a texture, upper row
+        first."""
+
+    def show(
+        self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None, left: int = 0
+    ) -> None:
+        """Fill the framebuffer's lower `size` pixels from `left` on with the picture; None: as many as it
+        has."""
 
     def release(self) -> None:
         """Give back what it holds."""
@@ -117,8 +124,13 @@ class GlRenderer:
         rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
-    def show(self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None) -> None:
-        self._presenter.show(_require_picture(self._picture), framebuffer, size)
+    def coverage(self) -> moderngl.Texture:
+        return _require_picture(self._picture)
+
+    def show(
+        self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None, left: int = 0
+    ) -> None:
+        self._presenter.show(_require_picture(self._picture), framebuffer, size, left)
 
     def release(self) -> None:
         self._presenter.release()

@@ -14,8 +14,12 @@ from .gesture import Gesture
 _HALO, _LINE = 3.0, 1.25  # widths at 1×
 
 
-def draw(gesture: Gesture | None, view: ViewState, ui: UiContext) -> None:
-    """Draw it, in window coordinates; the ring of the brush also between its strokes."""
+def draw(gesture: Gesture | None, view: ViewState, ui: UiContext, left: int = 0) -> None:
+    """Draw it, in window coordinates; the ring of the brush also between its strokes.
+
+    Args:
+        left: the column in framebuffer pixels at which the picture begins
+    """
     io, mouse = imgui.get_io(), imgui.get_mouse_pos()
     over = not io.want_capture_mouse
     if view.select.tool == "brush" and over:
@@ -23,7 +27,7 @@ def draw(gesture: Gesture | None, view: ViewState, ui: UiContext) -> None:
     if gesture is None:
         return
     density = io.display_framebuffer_scale
-    path = [imgui.ImVec2(x / density.x, y / density.y) for x, y in gesture.path]
+    path = [imgui.ImVec2((x + left) / density.x, y / density.y) for x, y in gesture.path]
     first, last = path[0], path[-1]
     if gesture.tool == "box":
         corners = (imgui.ImVec2(last.x, first.y), last, imgui.ImVec2(first.x, last.y))

@@ -13,6 +13,7 @@ import numpy as np
 
 from progdf.compose.layers import BLENDS
 from viewer.camera import controls
+from viewer.camera.named_views import look_at_view
 from viewer.camera.view_camera import FARTHEST
 from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED
 from viewer.state import comparison as compare
@@ -60,8 +61,11 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
 
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
-    """The focused layer, or what the scene is about, fills the picture; the direction stays."""
-    fit = facts.fit
+    """The selection, the focused layer, or the scene's subject fills the picture; the direction stays."""
+    fit, selected = facts.fit, workspace.view.selection
+    if selected.count:
+        mask = selection.unpack(selected.members, facts.count)
+        return with_camera(workspace, facts.fit_members(workspace.view.camera, aspect, mask))
     if workspace.focus is not None:
         fit = facts.rows[workspace.view.layers[workspace.focus].gdf].fit
     return with_camera(workspace, fit(workspace.view.camera, aspect))
@@ -74,6 +78,11 @@ def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
     if camera.up != workspace.home.up:
         home = facts.home(home, aspect)
     return with_camera(workspace, home)
+
+
+def _look(workspace: Workspace, name: str) -> Workspace:
+    """From a side, or an end of an axis, see `named_views`."""
+    return with_camera(workspace, look_at_view(workspace.view.camera, name))
 
 
 def _focus(workspace: Workspace, number: str) -> Workspace:
@@ -284,6 +293,8 @@ def _new_edit(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, form=replace(form, error=""), form_open=not workspace.form_open)
 
 
+GLIDES = ("frame", "home", "look")
+"""Actions that take the camera elsewhere, which the window shows as a short way."""
 REQUESTS = (
     *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
@@ -330,7 +341,12 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "undo": lambda w, _: _back(w, history.undo(w.past)),
     "redo": lambda w, _: _back(w, history.redo(w.past)),
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
+    "look": _look,
+    "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
+    "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
+    "before": lambda w, _: replace(w, before=not w.before),
+    "beside": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "beside")),
     "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
     "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
     "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),

@@ -20,7 +20,7 @@ BRUSH_MODES = ("add", "erase", "smooth")
 SMALLEST_PX, LARGEST_PX = 4.0, 400.0
 SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
-COMPARE_MODES = ("off", "split", "difference")
+COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "recorded", "snapshots")
 MOST_AMPLIFIED = 64.0
 LONGEST, FASTEST = 9999, 120  # frames, frames per second
@@ -182,6 +182,8 @@ class ViewState:
         selection: what is selected and hidden, and the regions
         select: what selects
         pair: the snapshots that are compared
+        grid: the window draws a grid on the ground; pictures and films never have it
+        axes: the window shows where the axes of the world point
     """
 
     camera: ViewCamera = ViewCamera()
@@ -199,6 +201,8 @@ class ViewState:
     selection: SelectionState = SelectionState()
     select: SelectTool = SelectTool()
     pair: SnapshotPair = SnapshotPair()
+    grid: bool = False
+    axes: bool = True
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

@@ -10,7 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from progdf.scene.neighborhood import Neighborhood
+from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
+from viewer.camera.named_views import Glide, glide_on
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
 from viewer.jobs.delivery import DeliverOptions, Delivery
 from viewer.jobs.new_edit import NewEdit
@@ -44,7 +46,8 @@ class SceneFacts:
         bounds: of the bulk of the scene
         rows: one per .gdf, indexed by `LayerState.gdf`
         recordings: where each .gdf was recorded, in the same order
-        fit: gives the camera that `frame` takes with no layer focused
+        fit: gives the camera that `frame` takes with nothing selected and no layer focused
+        fit_members: the same for what is selected
         home: gives the first camera for another up axis, which is the given camera's
         neighborhood: of the scene's Gaussians, made when it is first asked for
     """
@@ -55,6 +58,7 @@ class SceneFacts:
     rows: Sequence[LayerRow]
     recordings: Sequence[RecordingFile] = ()
     fit: Fit = keep_camera
+    fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
     home: Fit = keep_camera
     neighborhood: Callable[[], Neighborhood] = _unknown
 
@@ -121,6 +125,8 @@ class Workspace:
         form_open: whether it is shown
         jobs: what is being trained, or waits for that, as the window last looked
         deliveries: what is being exported and rendered
+        before: the original is shown, until its key is tapped again or a slider moves
+        glide: the camera on its way to a view that was asked for, or None
     """
 
     view: ViewState
@@ -142,6 +148,8 @@ class Workspace:
     form_open: bool = False
     jobs: tuple[TrainingJob, ...] = ()
     deliveries: tuple[Delivery, ...] = ()
+    before: bool = False
+    glide: Glide | None = None
 
 
 def new_workspace(view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> Workspace:
@@ -190,7 +198,11 @@ def cancel_drag(workspace: Workspace) -> Workspace:
 
 
 def advance(workspace: Workspace, seconds: float) -> Workspace:
-    """After so much time; the film goes on where it is playing."""
+    """After so much time; the film goes on where it is playing, and the camera where it is on its way."""
+    if workspace.glide is not None:
+        glide = glide_on(workspace.glide, workspace.view.camera, seconds)
+        workspace = replace(workspace, glide=glide)
+        workspace = with_camera(workspace, glide.camera) if glide is not None else workspace
     if not workspace.player.playing:
         return workspace
     view = workspace.view
@@ -214,6 +226,12 @@ def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
 def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
     """Looking from elsewhere; never an undo entry."""
     return replace(workspace, view=replace(workspace.view, camera=camera))
+
+
+def glide_from(workspace: Workspace, start: ViewCamera) -> Workspace:
+    """From where one looked on to where the camera is now, in place of a jump."""
+    end = workspace.view.camera
+    return replace(with_camera(workspace, start), glide=Glide(start, end)) if end != start else workspace
 
 
 def focus_layer(workspace: Workspace, index: int) -> Workspace:

@@ -10,7 +10,7 @@ from imgui_bundle import imgui
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
 from viewer.state.selection import NOBODY, unpack
 from viewer.state.view_state import ViewState
@@ -31,6 +31,7 @@ class PointerContext:
         area: the part of the window that shows it
         ui: fonts and scale
         now: seconds on the main view's clock
+        half: side by side, the one that the mouse is in, or was in when its drag began: 0 left, 1 right
     """
 
     engine: ViewEngine
@@ -39,6 +40,22 @@ class PointerContext:
     area: Area
     ui: UiContext
     now: float
+    half: int = 0
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether the picture is two pictures of half the width."""
+        return self.shown.compare.mode == "beside"
+
+    @property
+    def scale(self) -> float:
+        """How large things are in the picture, of what they are where it has all of the area."""
+        return half_scale(*self.size) if self.is_beside else 1.0
+
+    @property
+    def left(self) -> int:
+        """The column in framebuffer pixels at which the picture under the mouse begins."""
+        return self.half * (self.size[0] // 2) if self.is_beside else 0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -50,11 +67,12 @@ class PointerContext:
     def cursor(self) -> tuple[float, float]:
         """Where the mouse is, in pixels of the picture."""
         mouse, density = imgui.get_io().mouse_pos, imgui.get_io().display_framebuffer_scale
-        return mouse.x * density.x, mouse.y * density.y
+        return mouse.x * density.x - self.left, mouse.y * density.y
 
     def camera(self, camera: ViewCamera) -> Camera:
         """`camera` as it takes the picture."""
-        return to_camera(camera, *self.size)
+        whole = to_camera(camera, *self.size)
+        return half_camera(whole) if self.is_beside else whole
 
     @property
     def scene(self) -> Gaussians:

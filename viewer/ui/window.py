@@ -40,6 +40,8 @@ KEY_NAMES = {
     glfw.KEY_COMMA: ",",
     glfw.KEY_PERIOD: ".",
     glfw.KEY_KP_ENTER: "Enter",
+    **{getattr(glfw, f"KEY_KP_{i}"): f"Num{i}" for i in range(10)},
+    glfw.KEY_KP_DECIMAL: "Num.",
 }
 _X11_LINE_FEED = 109
 """Scancode of a key that glfw does not name: what programs that type for one press as Enter."""

@@ -143,7 +143,7 @@ def grips_key(hand: Rig, x: float, y: float) -> bool:
 
 @ways
 def test_the_divider_of_a_split_goes_back(hand: Rig, call_off: CallOff) -> None:
-    hand.key("Y")
+    hand.key("Shift+Y")
     hand.drag((0.5 * LEFT, 300), (0.3 * LEFT, 300))
     dragged_and_called_off(hand, call_off, (0.3 * LEFT, 300), (0.6 * LEFT, 300), (0.8 * LEFT, 310))
     hand.drag((0.3 * LEFT, 300), (0.7 * LEFT, 300))

@@ -47,12 +47,12 @@ def the_panel(hand: Rig) -> np.ndarray:
 
 
 def test_the_window_at_its_smallest(screenshot: Compare) -> None:
-    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+    with rig(replace(first_view(bear(), 0.7, 0.5), axes=True), SMALLEST) as hand:
         screenshot("ui_main", hand.image())
 
 
 def test_the_window_on_a_dense_screen(screenshot: Compare) -> None:
-    with rig(first_view(bear(), 0.7, 0.5), (700, 560), density=2.0) as hand:
+    with rig(replace(first_view(bear(), 0.7, 0.5), axes=True), (700, 560), density=2.0) as hand:
         screenshot("ui_2x", hand.image())
 
 
@@ -124,7 +124,7 @@ def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Com
 
 def test_the_original_beside_the_edited(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
-        hand.key("Y")
+        hand.key("Shift+Y")
         hand.move(362.0, 250.0)
         hand.frame(3)
         screenshot("ui_split", hand.image())
@@ -139,7 +139,7 @@ def test_the_field_beside_what_was_recorded(screenshot: Compare, tmp_path: Path)
 
 def test_the_difference_from_the_original(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
-        hand.key("Shift+Y")
+        hand.key("D")
         screenshot("ui_difference", hand.image())
 
 

@@ -17,6 +17,7 @@ from progdf.__main__ import main
 from progdf.metrics.image import psnr
 from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera.view_camera import half_camera, to_camera
 from viewer.state import comparison as compare
 from viewer.state.view_state import Comparison, ViewState
 
@@ -37,22 +38,22 @@ def hand() -> Iterator[Rig]:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_y_shows_the_original_left_and_the_edited_right_of_the_divider(draw: str) -> None:
+def test_shift_y_shows_the_original_left_and_the_edited_right_of_the_divider(draw: str) -> None:
     original = whole(0.0, 0.0, draw)
     with rig(first_view(bear(), 1.0, 1.0), draw=draw) as hand:
         edited = hand.picture()
-        hand.key("Y")
+        hand.key("Shift+Y")
         left, right = beside_line(hand.picture(), 170)
         assert np.array_equal(left, beside_line(original, 170)[0])
         assert np.array_equal(right, beside_line(edited, 170)[1])
         assert not np.array_equal(left, beside_line(edited, 170)[0])
-        hand.key("Y")
+        hand.key("Shift+Y")
         assert np.array_equal(hand.picture(), edited)
 
 
 @pytest.mark.gl
 def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
-    hand.key("Y")
+    hand.key("Shift+Y")
     before, drawn = hand.main_view.work.view.camera, hand.main_view.canvas.pictures_drawn
     hand.drag((170.0, 300.0), (100.0, 310.0))
     assert hand.main_view.work.view.compare.divider == pytest.approx(100 / 340)
@@ -67,7 +68,7 @@ def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
 
 @pytest.mark.gl
 def test_beside_the_divider_a_drag_turns_both_sides(hand: Rig) -> None:
-    hand.key("Y")
+    hand.key("Shift+Y")
     hand.drag((250.0, 300.0), (280.0, 300.0))
     view = hand.main_view.work.view
     assert view.compare.divider == 0.5
@@ -80,7 +81,7 @@ def test_beside_the_divider_a_drag_turns_both_sides(hand: Rig) -> None:
 
 @pytest.mark.gl
 def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
-    hand.key("Y")
+    hand.key("Shift+Y")
     hand.drag((170.0, 300.0), (120.0, 300.0))
     left, right = beside_line(hand.picture(), 120)
     for _ in range(8):
@@ -93,7 +94,7 @@ def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
 
 @pytest.mark.gl
 def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_psnr(hand: Rig) -> None:
-    hand.key("Shift+Y")
+    hand.key("D")
     view = hand.main_view.work.view
     edited = hand.main_view.engine.image(view, SIZE).clip(0, 1)
     original = hand.main_view.engine.image(replace(view, layers=()), SIZE).clip(0, 1)
@@ -111,7 +112,7 @@ def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_p
 @pytest.mark.gl
 def test_equal_pictures_have_no_difference() -> None:
     with rig(first_view(bear(), 0.0, 0.0)) as hand:
-        hand.key("Shift+Y")
+        hand.key("D")
         assert hand.picture()[BANNER:].max() == 0
         assert hand.main_view.canvas.comparer.psnr == math.inf
         assert hand.main_view.canvas.comparer.labels(hand.main_view.work.view).line == "difference: none"
@@ -122,7 +123,7 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
     from viewer.camera.inputs import Keys
 
     original = whole(0.0, 0.0)
-    for chord in ("Y", "Shift+Y"):
+    for chord in ("Shift+Y", "D"):
         hand.key(chord)
         hand.frame(2, Keys(held=frozenset("\\")))
         assert np.array_equal(hand.picture()[BANNER:], original[BANNER:])
@@ -131,7 +132,7 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
 
 @pytest.mark.gl
 def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
-    for chord in ("Y", "Shift+Y"):
+    for chord in ("Shift+Y", "D"):
         hand.key(chord)
         hand.frame(60)  # a tooltip may wait for a second of rest
         drawn = hand.main_view.canvas.pictures_drawn
@@ -143,7 +144,7 @@ def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
 @pytest.mark.gl
 def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) -> None:
     with rig(first_view(bear(), 1.0, 1.0), pictures=tmp_path) as hand:
-        hand.key("Y")
+        hand.key("Shift+Y")
         shown = hand.picture()
         hand.key("F2")
         picture = Image.open(tmp_path / "bear_001.png")
@@ -153,6 +154,74 @@ def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) ->
         shown_left, shown_right = beside_line(shown, 170)
         assert np.array_equal(left, shown_left)
         assert np.array_equal(right, shown_right)
+
+
+@pytest.mark.gl
+def test_y_shows_two_pictures_that_turn_together_and_can_be_picked_in(hand: Rig, tmp_path: Path) -> None:
+    hand.key("Y")
+    hand.drag((250.0, 300.0), (290.0, 310.0))
+    view = hand.main_view.work.view
+    half = half_camera(to_camera(view.camera, *SIZE))
+    sides = (hand.picture()[BANNER:, :165], hand.picture()[BANNER:, 175:])
+    images = [
+        np.clip(hand.main_view.engine.image(replace(shown, compare=Comparison()), camera=half), 0, 1) * 255
+        for shown in (replace(view, layers=()), view)
+    ]
+    assert np.abs(sides[0] - images[0][BANNER:, :165]).max() <= 0.51
+    assert np.abs(sides[1] - images[1][BANNER:, 5:]).max() <= 0.51
+    assert np.abs(images[0] - images[1]).max() > 60
+    hand.main_view.work = replace(hand.main_view.work, focus=None)
+    hand.click(262.0, 262.0)
+    assert hand.main_view.work.focus is not None, "the scarf in the right half"
+    hand.main_view.work = replace(hand.main_view.work, focus=None)
+    hand.click(92.0, 262.0)
+    assert hand.main_view.work.focus is not None, "and in the left one"
+    hand.main_view.pictures, shown = tmp_path, hand.picture()
+    hand.key("F2")
+    saved = np.asarray(Image.open(tmp_path / "bear_001.png"))
+    assert np.array_equal(saved[BANNER:, :165], shown[BANNER:, :165])
+    assert np.array_equal(saved[BANNER:, 175:], shown[BANNER:, 175:])
+
+
+@pytest.mark.gl
+def test_a_tap_of_backslash_stays_with_the_original_until_the_next_or_a_slider_moves(hand: Rig) -> None:
+    from viewer.camera.inputs import Keys, Press
+
+    edited = hand.picture()
+    hand.key("\\")
+    assert np.array_equal(hand.picture()[BANNER:], whole(0.0, 0.0)[BANNER:])
+    hand.key("\\")
+    assert np.array_equal(hand.picture(), edited)
+    held = Keys(held=frozenset("\\"))
+    hand.frame(keys=replace(held, pressed=(Press("\\"),)))
+    hand.frame(30, held)
+    hand.frame()
+    assert np.array_equal(hand.picture(), edited), "it was held, not tapped"
+    hand.key("\\")
+    hand.key("Shift+Left")
+    assert not hand.main_view.work.before
+
+
+@pytest.mark.gl
+def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand: Rig) -> None:
+    from viewer.camera.inputs import Keys, Press
+
+    camera = hand.main_view.work.view.camera
+    down = Keys(held=frozenset("D"), fly=frozenset("D"))
+    hand.frame(keys=replace(down, pressed=(Press("D"),)))
+    hand.frame(5, down)
+    hand.frame()
+    assert hand.main_view.work.view.compare.mode == "difference"
+    assert hand.main_view.work.view.camera == camera
+    hand.frame(keys=replace(down, pressed=(Press("D"),)))
+    hand.frame(30, down)
+    hand.frame()
+    assert hand.main_view.work.view.compare.mode == "difference"
+    assert hand.main_view.work.view.camera != camera
+    hand.key("V")
+    hand.frame(keys=replace(down, pressed=(Press("D"),)))
+    hand.frame()
+    assert hand.main_view.work.view.compare.mode == "difference", "in fly mode it only flies"
 
 
 def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:

@@ -178,14 +178,14 @@ def test_a_rested_picture_draws_nothing_more(hand: Rig) -> None:
 
 @pytest.mark.gl
 def test_a_split_is_coarse_on_both_sides_and_a_difference_never(hand: Rig) -> None:
-    hand.key("Y")
+    hand.key("Shift+Y")
     hand.move(60.0, 270.0)
     hand.press()
     hand.move(90.0, 270.0)
     assert "coarse" in shown(hand)["picture"]
     hand.release()
     wait(hand, REST_S)
-    hand.key("Shift+Y")
+    hand.key("D")
     hold_and_orbit(hand)
     assert "coarse" not in shown(hand)["picture"]
     hand.release()

@@ -149,7 +149,7 @@ def test_the_psnr_of_field_against_recording_is_told_on_the_fields_side(hand: Ri
     said = comparer.labels(hand.main_view.work.view)
     assert said.right == f"field · PSNR {expected:.1f} dB"
     assert said.left == "recorded: scarf 0.31–0.5, ears 0.31–0.5"
-    hand.key("Shift+Y")
+    hand.key("D")
     assert comparer.psnr == pytest.approx(expected, abs=1e-3)
     assert comparer.labels(hand.main_view.work.view).line == (
         f"difference × 4 · PSNR {expected:.1f} dB · {said.left}"
@@ -171,13 +171,13 @@ def test_a_slider_moves_both_sides_at_the_same_strength(hand: Rig) -> None:
 
 @pytest.mark.gl
 def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_is_shown(hand: Rig) -> None:
-    hand.key("Shift+Y")
+    hand.key("D")
     before, psnr_before = hand.picture(), hand.main_view.canvas.comparer.psnr
-    hand.key("Y")
+    hand.key("Shift+Y")
     for _ in range(5):
         hand.key("2")  # the lower layer, the scarf
         hand.key("Shift+Right")
-    hand.key("Shift+Y")
+    hand.key("D")
     assert not np.array_equal(hand.picture()[BANNER:], before[BANNER:])
     assert hand.main_view.canvas.comparer.psnr != psnr_before
 
@@ -222,12 +222,12 @@ def test_where_nothing_was_recorded_the_original_is_shown_and_the_reason_told() 
 
 @pytest.mark.gl
 def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it_was(tall: Rig) -> None:
-    tall.key("Y")
+    tall.key("Shift+Y")
     place = recorded_button(tall)
     tall.click(*place)
     assert tall.main_view.work.view.compare.against == "recorded"
     with rig(first_view(bear(), AT, AT), (640, 600)) as bare:
-        bare.key("Y")
+        bare.key("Shift+Y")
         bare.click(*place)
         assert bare.main_view.work.view.compare.against == "original"
 
