@@ -72,6 +72,10 @@ class Rig:
             self.main_view.frame(self.screen, self.pixels, passed)
             seconds -= passed
 
+    def pause(self, seconds: float) -> None:
+        """One frame that comes so much later."""
+        self.main_view.frame(self.screen, self.pixels, seconds)
+
     def event(self) -> None:
         """Something came in: the window wakes the main view and draws."""
         self.main_view.wake()

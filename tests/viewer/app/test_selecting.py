@@ -257,7 +257,8 @@ def test_keys_change_the_selection_as_a_whole(hand: Rig) -> None:
 def test_the_mouse_on_the_name_of_a_layer_shows_its_region(hand: Rig) -> None:
     before = hand.picture().astype(int)
     hand.move(WINDOW[0] - 300 + 90, 112.0)
-    hand.frame(60)
+    hand.pause(1.0)
+    hand.frame(2)
     assert hand.main_view.work.pointed == ("layer", 1)
     assert np.abs(hand.picture() - before).max() > 30
     hand.move(*MIDDLE)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from progdf.__main__ import main
 from tests.helpers.paths import ROOT
 from tests.helpers.ui_rig import bear
 from viewer.app import app as application
@@ -221,7 +222,9 @@ def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop:
 
 @pytest.mark.window
 @pytest.mark.gl
-def test_the_real_mouse_paints_and_undo_takes_the_stroke_away(desktop: Desktop) -> None:
+def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_saves(
+    desktop: Desktop,
+) -> None:
     desktop.point(*slider(0, 0.5))  # where the brush's ring is not over the picture
     desktop.xdotool("key", "2")  # the lower card: the scarf
     clean = desktop.shot()
@@ -239,6 +242,22 @@ def test_the_real_mouse_paints_and_undo_takes_the_stroke_away(desktop: Desktop) 
     assert changed(painted, desktop.rest()) == 0
     desktop.xdotool("key", "b")
     assert changed(clean, desktop.shot()) > 50, "where it was erased the edit is gone"
+    # and closing it with unsaved changes asks, and saves
+    bright = brightness(desktop.rest())
+    desktop.xdotool("key", "shift+Left")
+    desktop.xdotool("key", "ctrl+q")
+    # the picture is dimmed behind a question
+    desktop.until("the question", lambda: brightness(desktop.shot()) < 0.8 * bright)
+    desktop.xdotool("key", "Escape")
+    desktop.until("the picture", lambda: brightness(desktop.shot()) > 0.9 * bright)
+    desktop.xdotool("key", "ctrl+q")
+    desktop.until("the question", lambda: brightness(desktop.shot()) < 0.8 * bright)
+    desktop.xdotool("key", "s")
+    desktop.until("the field", lambda: not desktop.xdotool("key", "Return") and desktop.process.poll() == 0)
+    assert desktop.process.wait(timeout=PATIENCE_S) == 0
+    assert desktop.process.communicate() == ("", "")
+    saved = open_session(desktop.folder / "bear.session.json")
+    assert saved.view.layers[0].strength == pytest.approx(0.4)
 
 
 def scarf_on_screen() -> tuple[float, float]:
@@ -275,23 +294,17 @@ def test_ctrl_c_in_the_terminal_closes_an_idle_window(desktop: Desktop) -> None:
     assert desktop.process.communicate() == ("", "progdf: interrupted\n")
 
 
-def test_without_a_display_view_says_so_in_one_line(tmp_path: Path) -> None:
-    paths = bear().save(tmp_path)
-    hidden = {"DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE"}
-    environment = {name: value for name, value in os.environ.items() if name not in hidden}
-    run = subprocess.run(
-        [sys.executable, "-m", "progdf", "view", str(paths[0])],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
-    if sys.platform != "linux":
-        pytest.skip("only Linux can be without a display")
-    assert run.returncode == 2
-    assert run.stderr.count("\n") == 1
-    assert run.stderr.startswith("progdf: no window")
-    assert "progdf render" in run.stderr
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can be without a display")
+def test_without_a_display_view_says_so_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", str(bear().save(tmp_path)[0])]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("progdf: no window")
+    assert "progdf render" in said
 
 
 def test_chords_are_named_as_in_the_table_of_bindings() -> None:
@@ -301,27 +314,6 @@ def test_chords_are_named_as_in_the_table_of_bindings() -> None:
     assert chord("F2", 0) == "F2"
     bound = {key.chord.rpartition("+")[2] for key in controls.KEYS} | {controls.HELD_ORIGINAL}
     assert bound <= set(KEY_NAMES.values()), "every bound key is known to the window"
-
-
-@pytest.mark.window
-@pytest.mark.gl
-def test_closing_the_real_window_with_unsaved_changes_asks_and_saves(desktop: Desktop) -> None:
-    desktop.xdotool("key", "2")
-    bright = brightness(desktop.rest())
-    desktop.xdotool("key", "shift+Left")
-    desktop.xdotool("key", "ctrl+q")
-    # the picture is dimmed behind a question
-    desktop.until("the question", lambda: brightness(desktop.shot()) < 0.8 * bright)
-    desktop.xdotool("key", "Escape")
-    desktop.until("the picture", lambda: brightness(desktop.shot()) > 0.9 * bright)
-    desktop.xdotool("key", "ctrl+q")
-    desktop.until("the question", lambda: brightness(desktop.shot()) < 0.8 * bright)
-    desktop.xdotool("key", "s")
-    desktop.until("the field", lambda: not desktop.xdotool("key", "Return") and desktop.process.poll() == 0)
-    assert desktop.process.wait(timeout=PATIENCE_S) == 0
-    assert desktop.process.communicate() == ("", "")
-    saved = open_session(desktop.folder / "bear.session.json")
-    assert saved.view.layers[0].strength == pytest.approx(0.4)
 
 
 @pytest.mark.window

@@ -134,7 +134,8 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
 def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
     for chord in ("Shift+Y", "D"):
         hand.key(chord)
-        hand.frame(60)  # a tooltip may wait for a second of rest
+        hand.pause(1.0)
+        hand.frame(2)  # a tooltip may wait for a second of rest
         drawn = hand.main_view.canvas.pictures_drawn
         hand.frame(3)
         assert hand.main_view.next_frame_delay() is None

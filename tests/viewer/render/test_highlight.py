@@ -253,7 +253,8 @@ def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
     with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:
         before, saved = hand.picture().astype(int), hand.main_view.work.past
         hand.move(700 - 300 + 60, 166.0)
-        hand.frame(60)
+        hand.pause(1.0)
+        hand.frame(2)
         assert hand.main_view.work.overlap == 1, "the upper layer's card is the first"
         assert np.abs(hand.picture() - before).max() > 60
         hand.move(700 - 300 + 60, 136.0)

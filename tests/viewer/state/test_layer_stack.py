@@ -241,7 +241,7 @@ def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> No
     after = hand.main_view.engine.gaussians(hand.main_view.work.view)
     assert torch.equal(after.sh0, before)
     assert torch.equal(after.means, bear().scene.means)
-    hand.frame(30)
+    hand.pause(0.5)
     hand.double_click(LEFT + 150, y)
     assert layers(hand)[1].gains == Gains(), "a double click brings all of it back"
 
@@ -293,7 +293,7 @@ def test_a_click_on_a_splat_focuses_its_layer_and_a_drag_does_not(hand: Rig) -> 
     at = on_screen(hand, ear)
     hand.drag(at, (at[0] + 40, at[1]))
     assert hand.main_view.work.focus == 0
-    hand.frame(30)  # no double click
+    hand.pause(0.5)  # no double click
     at = on_screen(hand, ear)
     before = hand.main_view.work.view
     click(hand, *at)
@@ -398,7 +398,7 @@ def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
 
 def menu(hand: Rig, layer: int, item: int) -> None:
     """A right click on a layer's card, then one of Rename, Duplicate, Replace and Delete."""
-    hand.frame(30)
+    hand.pause(0.5)
     hand.move(LEFT + 150, HEADS + row(layer))
     hand.press(1)
     hand.release(1)
@@ -455,10 +455,10 @@ def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.main_view.work.past.past) == 1, "on the handle it is one step"
     lens = (LEFT + 210, 437.0)
-    hand.frame(30)
+    hand.pause(0.5)
     click(hand, *lens)
     assert hand.main_view.work.view.camera.fov_y != 45.0
-    hand.frame(30)
+    hand.pause(0.5)
     hand.double_click(*lens)
     hand.frame(3)
     assert hand.main_view.work.view.camera.fov_y == 45.0

@@ -252,7 +252,7 @@ def test_locked_hidden_or_no_layers_are_not_painted_and_the_window_says_why(hand
         assert hand.main_view.work.message is not None
         assert told in hand.main_view.work.message.text
         hand.key(chord)
-        hand.frame(30)
+        hand.pause(0.5)
 
 
 def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
