@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .assemble import DemoScene
-from .bear import SMALLEST, bear
+from .bear import SKY, SMALLEST, bear
 from .edits import (
     AnalyticEdit,
     bear_edits,
@@ -16,9 +16,11 @@ from .edits import (
     stripes_edit,
     swing_edit,
 )
+from .panda import paint_panda
 from .room import SMALLEST_ROOM, room
 
 __all__ = [
+    "SKY",
     "SMALLEST",
     "SMALLEST_ROOM",
     "AnalyticEdit",
@@ -28,6 +30,7 @@ __all__ = [
     "bend_edit",
     "darken_edit",
     "deform_edit",
+    "paint_panda",
     "recolor_edit",
     "room",
     "scale_edit",

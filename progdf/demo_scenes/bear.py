@@ -16,7 +16,8 @@ from .bear_parts import LABELS, bear_parts
 SMALLEST = 400
 """Fewer Gaussians than this are no bear."""
 
-_SKY = (0.749, 0.847, 0.945)
+SKY = (0.510, 0.639, 0.761)
+"""Darker than snow and lighter than fur, and cold, so that the bear stands out before it in any coat."""
 
 
 def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
@@ -28,7 +29,7 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
     if size < SMALLEST:
         raise ProgdfError(f"{size} Gaussians are too few for a bear; use at least {SMALLEST}")
     gaussians, labels = assemble(bear_parts(), LABELS, paint, size, seed)
-    return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), _SKY)
+    return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), SKY)
 
 
 def _rig(count: int = 32, width: int = 512, height: int = 512) -> tuple[Camera, ...]:

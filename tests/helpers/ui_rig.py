@@ -23,6 +23,7 @@ from viewer.render.headless import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 STEP_S = 1.0 / 60.0
+BACKGROUND = (0.749, 0.847, 0.945)
 
 
 @cache
@@ -36,11 +37,7 @@ def first_view(stack: Stack, *strengths: float) -> ViewState:
     layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
     camera = first_camera(stack.scene, stack.demo.cameras)
     return ViewState(
-        camera=camera,
-        layers=layers,
-        background=stack.demo.background,
-        dynamic_resolution="off",
-        axes=False,
+        camera=camera, layers=layers, background=BACKGROUND, dynamic_resolution="off", axes=False
     )
 
 

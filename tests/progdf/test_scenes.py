@@ -253,6 +253,27 @@ def test_recoloring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
     assert torch.allclose(typical_color(sh0_to_rgb(edited.sh0[scarf])), target, atol=0.12)
 
 
+def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bear: scenes.DemoScene) -> None:
+    camera = bear.cameras[2].resize(200, 200)
+
+    def cover(parts: tuple[str, ...]) -> torch.Tensor:
+        shown = torch.zeros(len(bear.gaussians), 3).index_fill(0, bear.members(*parts), 1.0)
+        return render(bear.gaussians, camera, (0.0, 0.0, 0.0), colors=shown).image[..., 0].clamp(0, 1)
+
+    picture = render(bear.gaussians, camera, bear.background).image.clamp(0, 1)
+    painted = scenes.paint_panda(picture, camera, cover)
+    limbs, trunk = cover(("ears", "arms", "legs")) > 0.98, cover(("body",)) > 0.98
+    assert float(painted[limbs].mean()) < 0.3
+    assert float(picture[limbs].mean()) > 0.4
+    assert float(painted[trunk].mean()) > 0.8
+    assert float(picture[trunk].mean()) < 0.75
+    rest = cover(("head", "body", "ears", "arms", "legs")) < 0.002
+    assert torch.allclose(painted[rest], picture[rest], atol=0.01)
+    nose = (cover(("head",)) > 0.98) & (picture.amax(dim=2) < 0.15)
+    assert int(nose.sum()) > 20
+    assert torch.allclose(painted[nose], picture[nose], atol=0.05)
+
+
 @pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
 def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
     with pytest.raises(ProgdfError, match="between 0 and 1"):

@@ -1,4 +1,4 @@
-"""`progdf demo`: a scene of our own, three trained edits, pictures of what the sliders do, and the window."""
+"""`progdf demo`: a scene of our own, trained edits, pictures of what the sliders do, and the window."""
 
 from __future__ import annotations
 
@@ -17,21 +17,24 @@ import torch
 import tyro
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
-from progdf.demo_scenes import DemoScene, bear, room
+from progdf.demo_scenes import DemoScene, bear, paint_panda, room
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.cameras import save_cameras
-from progdf.io.images import contact_sheet, write_image
+from progdf.io.images import contact_sheet, to_picture, write_image
+from progdf.io.picture_camera import camera_chunk
 from progdf.rasterize import render
 from trainer.option_checks import check_ranges
 from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions
 from trainer.plan import Plan, make_plan
 from trainer.store.state import StateFolder
 
+Paint = Callable[[Tensor, Camera, Callable[[tuple[str, ...]], Tensor]], Tensor]
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MOST_GAUSSIANS = 5_000_000
 """As many as large trained scenes have: what --size says at most."""
@@ -41,11 +44,17 @@ _GRID = (0.0, 1 / 3, 2 / 3, 1.0)
 
 @dataclass(frozen=True)
 class DemoEdit:
-    """One edit of the demo: what it is called, which parts it may change, how."""
+    """One edit of the demo: what it is called, which parts it may change, how.
+
+    Args:
+        paint: makes a changed picture of the scene, of which the edit is then made: picture, its camera, how
+            much of each pixel named parts are -> picture; its parts are found
+    """
 
     name: str
-    parts: tuple[str, ...]
-    editor: str
+    parts: tuple[str, ...] = ()
+    editor: str = ""
+    paint: Paint | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,7 @@ class Show:
         inside: whether the edits are trained from the scene's own cameras, as one cannot see in from outside
         draft: the effort of --quick
         full: the effort otherwise
-        edits: two edits that share no Gaussian, and one that shares Gaussians with both
+        edits: two edits that share no Gaussian, one that meets one of them at least, and more
     """
 
     make: Callable[[int, int], DemoScene]
@@ -77,7 +86,7 @@ class Show:
     inside: bool
     draft: Effort
     full: Effort
-    edits: tuple[DemoEdit, DemoEdit, DemoEdit]
+    edits: tuple[DemoEdit, ...]
 
 
 _COAT = ("body", "head", "ears", "arms", "legs")
@@ -90,9 +99,12 @@ SHOWS = {
         draft=Effort(views=10, image_size=160, steps=160),
         full=Effort(views=24, image_size=256, steps=480),
         edits=(
-            DemoEdit("scarf", ("scarf",), "recolor:#3d4fc4"),
-            DemoEdit("gold", _COAT, "recolor:#d9a012"),
-            DemoEdit("frost", (*_COAT, "scarf"), "recolor:#62b3ea"),
+            # Few hues, warm against cold: fur and one red accent before a cold sky. Gold is the warm end,
+            # frost takes all warmth but the scarf's, and petrol, red's opposite, is reached by way of plum.
+            DemoEdit("scarf", ("scarf",), "recolor:#1b6972"),
+            DemoEdit("gold", _COAT, "recolor:#d0921a"),
+            DemoEdit("frost", (*_COAT, "grass"), "recolor:#e3eefa"),
+            DemoEdit("panda", paint=paint_panda),
         ),
     ),
     "room": Show(
@@ -118,7 +130,7 @@ SHOWS = {
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Make a scene, train three region edits of it, write pictures, open the window if there is a display."""
+    """Make a scene, train edits of it, write pictures, open the window if there is a display."""
 
     scene: Literal["bear", "room"] = "bear"
     """A bear in the grass to look at from all around, or a room to stand in."""
@@ -182,7 +194,7 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
 
 
 def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
-    """Write what three sliders do: each alone, two against each other, and in large.
+    """Write what sliders do: each alone, two against each other, and in large.
 
     Args:
         folder: where scene.ply lies and the pictures go
@@ -203,7 +215,7 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
             return render(compose_layers(gaussians, layers), sized, background=scene.background).image
 
     names = list(gdfs)
-    first, second, third = names
+    first, second, third, *_ = names
     sliders = contact_sheet(
         [[shot(300, {name: strength}) for strength in STRENGTHS] for name in names],
         names,
@@ -231,10 +243,14 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
     from .resume import find_run  # only now: `--help` and the pictures need none of it
     from .run import train
 
+    for edit in show.edits:
+        if edit.paint is not None:
+            _paint_picture(options.out / f"{edit.name}.png", scene, scene.cameras[show.view], edit.paint)
     runs = {edit.name: _plan(options, show, scene, edit) for edit in show.edits}
     here = {name: find_run(options.out / name, run) for name, run in runs.items()}
     for edit in show.edits:
-        print(f"\n{edit.name}: {edit.editor} on {', '.join(edit.parts)}", flush=True)
+        how = f"{edit.editor} on {', '.join(edit.parts)}" if edit.paint is None else f"{edit.name}.png"
+        print(f"\n{edit.name}: {how}", flush=True)
         out = options.out / edit.name
         goes_on = "stopped" in here.values() and here[edit.name] != "nothing"
         if not goes_on:
@@ -253,11 +269,12 @@ def _plan(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) ->
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
     effort = show.draft if options.quick else show.full
+    painted = edit.paint is not None
     asked = TrainOptions(
         scene=folder / "scene.ply",
         out=folder / edit.name,
-        region=f"labels:{folder / 'labels.npy'}:{ids}",
-        editor=edit.editor,
+        region="changed" if painted else f"labels:{folder / 'labels.npy'}:{ids}",
+        editor=f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor,
         cameras=folder / "cameras.json" if show.inside else None,
         views=effort.views,
         image_size=effort.image_size,
@@ -265,6 +282,21 @@ def _plan(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) ->
         seed=options.seed,
     )
     return make_plan(asked)
+
+
+def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -> None:
+    """Write the scene as `camera` shows it, changed by hand; the .png carries the camera."""
+    gaussians = scene.gaussians
+
+    def cover(parts: tuple[str, ...]) -> Tensor:
+        shown = torch.zeros(len(gaussians), 3).index_fill(0, scene.members(*parts), 1.0)
+        return render(gaussians, camera, (0.0, 0.0, 0.0), colors=shown).image[..., 0].clamp(0, 1)
+
+    with torch.no_grad():
+        picture = render(gaussians, camera, scene.background).image.clamp(0, 1)
+        painted = to_picture(paint(picture, camera, cover))
+    with atomic_write(path) as temporary_file:
+        painted.save(temporary_file, pnginfo=camera_chunk(camera))
 
 
 def _gdf(folder: Path, edit: DemoEdit) -> Path:

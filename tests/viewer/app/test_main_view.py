@@ -13,7 +13,7 @@ from imgui_bundle import imgui
 from PIL import Image
 
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
-from tests.helpers.ui_rig import Rig, bear, rig
+from tests.helpers.ui_rig import BACKGROUND, Rig, rig
 from viewer.camera.view_camera import to_camera
 from viewer.gl import edit_pass
 
@@ -177,7 +177,7 @@ def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> Non
 def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:
     hand.key("F12")
     assert hand.main_view.work.view.panel is False
-    background = np.array(bear().demo.background) * 255
+    background = np.array(BACKGROUND) * 255
     assert np.abs(hand.image()[5, -5] - background).max() <= 1
 
 

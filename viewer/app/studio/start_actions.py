@@ -7,6 +7,7 @@ from pathlib import Path
 
 import moderngl
 
+from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
 from progdf.io.user_folders import state_folder
 from viewer.app.application import failure_line
@@ -20,8 +21,6 @@ from .start_page import RecentFile, shown_files
 from .training_actions import StudioApplication
 
 POLL_S = 0.5
-SKY = (0.749, 0.847, 0.945)
-"""Behind the demo's bear."""
 
 
 class StartActions:
@@ -104,7 +103,7 @@ class StartActions:
         self._demo, self._added = folder, set()
         words = ["demo", "--quick", "--no-window", f"--out={folder}"]
         try:
-            self._deliveries.start("Demo: three edits", folder, words)
+            self._deliveries.start("Demo: four edits", folder, words)
         except OSError as error:
             raise ProgdfError(f"the demo cannot start: {error.strerror or error}") from error
         self._app.main_view.show_message("Making the demo's scene …")

@@ -78,7 +78,7 @@ def _head(ui: UiContext) -> list[str]:
     imgui.same_line(0.0, 10.0 * scale)
     if imgui.button("Try the demo", size):
         actions.append("demo")
-    tip("Makes a small scene and trains three edits of it here: a minute or two")
+    tip("Makes a small scene and trains four edits of it here: a minute or two")
     imgui.dummy(imgui.ImVec2(0.0, 10.0 * scale))
     return actions
 
