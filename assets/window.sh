@@ -10,8 +10,8 @@ screen=$!
 trap 'kill "$screen"; rm -rf "$folder"' EXIT
 sleep 1
 cd "$folder"
-"$progdf" view "$demo/scene.ply" "$demo"/*/scarf.gdf "$demo"/*/gold.gdf "$demo"/*/frost.gdf \
-  --set scarf=0.8 --set gold=0.6 --background '#bfd8f1' &
+"$progdf" view "$demo/scene.ply" "$demo"/*/scarf.gdf "$demo"/*/gold.gdf "$demo"/*/frost.gdf "$demo"/*/panda.gdf \
+  --set scarf=0.9 --set gold=0.7 --background '#82a3c2' &
 window=$!
 xdotool search --sync --onlyvisible --name scene.ply >/dev/null
 sleep 20 # the first picture on a machine compiles the rasterizer
