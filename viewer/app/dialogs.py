@@ -31,6 +31,7 @@ TITLES = {
     "overwrite": "File already exists",
     "restore": "Recover unsaved work?",
     "training": "Training is not finished",
+    "delivery": "Still being written",
     "log": "Training log",
     "export": "Export the edited scene",
     "render_picture": "Render picture",
@@ -45,6 +46,7 @@ _HINTS = {
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
     "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
     "training": "{} is being trained. A run that is stopped can go on when the scene is opened again.",
+    "delivery": "{} is not finished. What is stopped now is not kept.",
     "log": "{}",
     "export": "A plain 3DGS .ply of what the sliders show, which any viewer opens.",
     "render_picture": "This view at any size.",
@@ -75,6 +77,7 @@ _CHOICES = {
     "leave": (_Button("Save", ("Enter", "S")), _Button("Discard", ("D",)), _Button("Cancel")),
     "overwrite": (_Button("Rename…", ("Enter", "R")), _Button("Replace"), _Button("Cancel")),
     "training": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
+    "delivery": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
     "log": (_Button("Close", ("Enter",)),),
     "about": (_Button("Close", ("Enter",)),),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
@@ -234,6 +237,8 @@ def _answer(dialog: Dialog, button: str) -> Answer:
             return Answer(Dialog("save", path, dialog.then))
         case "training", "Stop and quit":
             return Answer(None, ("stop_and_quit",))
+        case "delivery", "Stop and quit":
+            return Answer(None, ("drop_and_quit",))
         case "restore", "Restore":
             return Answer(None, (f"restore_autosave:{path}",))
         case "restore", "Discard":

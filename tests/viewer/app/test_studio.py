@@ -169,6 +169,19 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     assert "nothing to move" in window.main_view.work.message.text
 
 
+def test_quitting_asks_while_something_is_written(window: application.App) -> None:
+    press(window, "Ctrl+E", "Enter", "Ctrl+Q")
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert (asked.kind, asked.text) == ("delivery", "Exporting bear_edited.ply")
+    press(window, "Enter")
+    assert not window.is_closed
+    press(window, "Ctrl+Q", "S")
+    for _ in range(3):
+        turn(window)
+    assert window.is_closed
+
+
 def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Path) -> None:
     folder = bear_files(tmp_path)
     with null_app(empty(), ViewState(), folder) as app:

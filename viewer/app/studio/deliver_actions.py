@@ -33,6 +33,7 @@ class DeliverActions:
     def __init__(self, app: Application) -> None:
         self._app = app
         self.deliveries = Deliveries()
+        self._leaves = False
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
@@ -43,6 +44,13 @@ class DeliverActions:
             self._deliver(argument)
         elif name == "stop_delivery":
             self.deliveries.stop(int(argument))
+        elif name == "quit" and self.deliveries.busy and not self._leaves:
+            written = next(shown.title for shown in self.deliveries.shown if shown.status != "failed")
+            self._app.main_view.ask(Dialog("delivery", written))
+        elif name == "drop_and_quit":
+            self._leaves = True
+            for shown in self.deliveries.shown:
+                self.deliveries.stop(shown.number)
         elif name == "about":
             lines = f"ProGDF Studio {__version__}, Python {sys.version.split()[0]}"
             self._app.main_view.ask(Dialog("about", lines))
@@ -59,6 +67,9 @@ class DeliverActions:
             elif delivery.status == "done":
                 self._app.main_view.show_message(f"Wrote {delivery.out}")
         self._publish()
+        if self._leaves and not self.deliveries.busy:
+            self._leaves = False
+            self._app.main_view.request("quit")
         return POLL_S if self.deliveries.busy else None
 
     def close(self) -> None:
