@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
 import subprocess
 import sys
 import tomllib
 from collections import Counter
 from collections.abc import Mapping
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -39,6 +42,9 @@ MOST_FILES = 14
 MOST_LINES = 400
 
 Graph = dict[str, set[str]]
+
+parse = cache(ast.parse)
+"""Each file is looked at by several tests."""
 
 
 def source_files() -> list[Path]:
@@ -73,7 +79,7 @@ def imported_modules(source: str, module: str, is_package: bool) -> list[tuple[i
         for child in ast.iter_child_nodes(node):
             visit(child)
 
-    visit(ast.parse(source))
+    visit(parse(source))
     return found
 
 
@@ -104,7 +110,7 @@ def import_cycle(graph: Graph) -> list[str]:
 def forbidden_imports(source: str, package: str, where: str) -> list[str]:
     """Imports in `source` that its package must not make, as `where:line imports module`."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parse(source)):
         if isinstance(node, ast.Import):
             modules = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
@@ -181,7 +187,7 @@ def test_the_tests_of_imports_see_cycles_and_upward_imports() -> None:
 
 def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str]) -> None:
     # an `__init__` that says what its folder holds, and nothing more, is no source
-    filled = [path for path, source in sources.items() if len(ast.parse(source).body) > 1]
+    filled = [path for path, source in sources.items() if len(parse(source).body) > 1]
     files = Counter(path.parent.as_posix() for path in filled)
     shaders = Counter(path.parent.as_posix() for path in (ROOT / "shaders").rglob("*.*"))
     full = sorted(folder for folder, count in (files + shaders).items() if count > MOST_FILES)
@@ -202,20 +208,47 @@ def test_the_wheel_holds_what_is_used_and_the_sdist_what_is_read() -> None:
     )
 
 
-def test_progdf_and_trainer_load_no_window_system() -> None:
-    code = (
-        "import sys, pkgutil, importlib, progdf, trainer\n"
-        "for package in (progdf, trainer):\n"
-        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
-        "        if not module.name.endswith('__main__'): importlib.import_module(module.name)\n"
-        f"print(sorted({{name.split('.')[0] for name in sys.modules}} & {FORBIDDEN['trainer']!r}))"
+FRESH = f"""
+import importlib, json, pkgutil, sys
+import progdf, progdf.rasterize
+found = {{"compilers": sorted({{"numba", "llvmlite"}} & set(sys.modules))}}
+import trainer
+for package in (progdf, trainer):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+found["windows"] = sorted({{name.split(".")[0] for name in sys.modules}} & {FORBIDDEN["trainer"]!r})
+import viewer.commands.cli
+found["interfaces"] = [name for name in sys.modules if "imgui" in name or name == "glfw"]
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, list[str]], Path]:
+    """What imports alone have loaded in a process of its own, and its folder for compiled kernels."""
+    cache = tmp_path_factory.mktemp("fresh") / "cache"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    run = subprocess.run(
+        [sys.executable, "-c", FRESH], capture_output=True, text=True, cwd=ROOT, env=environment
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert run.returncode == 0, run.stderr
-    assert run.stdout.strip() == "[]"
+    return json.loads(run.stdout), cache
 
 
-def test_importing_progdf_does_not_compile_or_load_kernels() -> None:
-    code = "import sys, progdf; print('numba' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert run.stdout.strip() == "False", run.stderr
+def test_importing_progdf_does_not_load_the_compiler(fresh: tuple[dict[str, list[str]], Path]) -> None:
+    assert fresh[0]["compilers"] == []
+
+
+def test_progdf_and_trainer_load_no_window_system(fresh: tuple[dict[str, list[str]], Path]) -> None:
+    assert fresh[0]["windows"] == []
+
+
+def test_what_draws_without_a_window_needs_no_interface_library(
+    fresh: tuple[dict[str, list[str]], Path],
+) -> None:
+    assert fresh[0]["interfaces"] == []
+
+
+def test_importing_the_kernels_writes_nothing(fresh: tuple[dict[str, list[str]], Path]) -> None:
+    assert not fresh[1].exists()

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -117,12 +114,6 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
         image.sum().backward()  # type: ignore[no-untyped-call]
 
 
-def test_importing_progdf_does_not_load_the_compiler() -> None:
-    code = "import sys, progdf, progdf.rasterize; print('numba' in sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == "False"
-
-
 def test_a_cold_start_says_once_that_it_compiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -144,10 +135,3 @@ def test_the_kernels_are_cached_outside_the_source_tree() -> None:
     render(one_gaussian(), front_camera())
     assert list(kernel_cache().rglob("*.nbi"))
     assert Path(__file__).parents[3] not in kernel_cache().parents
-
-
-def test_importing_the_kernels_writes_nothing(tmp_path: Path) -> None:
-    code = "import progdf.rasterize.cpu.engine, progdf.compose.composer, progdf.rasterize.pixel_cells"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-    assert not (tmp_path / "cache").exists()

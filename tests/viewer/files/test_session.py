@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -217,9 +215,3 @@ def test_a_pinhole_camera_becomes_the_windows_camera() -> None:
     again = from_camera(view, seen, application.Document("b", bear().scene).facts().bounds)
     assert eye(again) == pytest.approx(eye(view), abs=1e-4)
     assert again.fov_y == pytest.approx(view.fov_y, abs=1e-3)
-
-
-def test_what_draws_without_a_window_needs_no_interface_library() -> None:
-    code = "import sys, viewer.commands.cli; print([m for m in sys.modules if 'imgui' in m or m == 'glfw'])"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "[]"
