@@ -6,11 +6,13 @@ Conventions: Kerbl et al. 2023 (3D Gaussian Splatting) with the choices listed i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.gaussians import normalize_quats
 from progdf.sh import shade
 
@@ -20,6 +22,8 @@ from .conventions import (
     ANTIALIAS_FLOOR,
     DILATION,
     FRUSTUM_MARGIN,
+    GOLDEN,
+    SIMPLIFY,
     TRANSMITTANCE_MIN,
     RasterInfo,
 )
@@ -85,7 +89,7 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
 def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceSplats, RasterInfo]:
     """Project, cull and sort."""
     dtype = gaussians.means.dtype
-    width, height, sh_degree = view.width, view.height, view.sh_degree
+    sh_degree = view.sh_degree
     means, quats, scales, opacities, colors, viewmat, K = (
         tensor.double() for tensor in (*gaussians.tensors, view.viewmat, view.K)
     )
@@ -103,17 +107,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
-    # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    tan_x = torch.clamp(x / z, -(cx / fx + margin_x), (width - cx) / fx + margin_x)
-    tan_y = torch.clamp(y / z, -(cy / fy + margin_y), (height - cy) / fy + margin_y)
-    axes = rotation_matrices(normalize_quats(quats[rows])) * scales[rows, None, :]
-    p0 = ((fx / z)[:, None] * (rotation[0] - tan_x[:, None] * rotation[2]))[:, None] @ axes
-    p1 = ((fy / z)[:, None] * (rotation[1] - tan_y[:, None] * rotation[2]))[:, None] @ axes
-    p0, p1 = p0[:, 0], p1[:, 0]
-    a, b, c = (p0 * p0).sum(1), (p0 * p1).sum(1), (p1 * p1).sum(1)
-    # ac − b² cancels for needles; the cross product does not
-    det0 = torch.linalg.cross(p0, p1).square().sum(1)
+    a, b, c, det0 = _covariances(points[front], normalize_quats(quats[rows]), scales[rows], view)
     det = det0 + DILATION * (a + c) + DILATION**2
     opacity = opacities[rows]
     if view.antialiased:
@@ -193,6 +187,99 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
             )
             totals.index_add_(0, splats.rows[members], sums)
     return totals
+
+
+def _covariances(
+    points: Tensor, unit_quats: Tensor, scales: Tensor, view: RasterView
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Covariances [[a, b], [b, c]] in pixels before the dilation, and their determinants. All float64.
+
+    Args:
+        points: centers, camera coordinates. [V,3]
+    """
+    rotation, K = view.viewmat[:3, :3].double(), view.K.double()
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    x, y, z = points.unbind(1)
+    # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * view.width / fx, FRUSTUM_MARGIN * 0.5 * view.height / fy
+    tan_x = torch.clamp(x / z, -(cx / fx + margin_x), (view.width - cx) / fx + margin_x)
+    tan_y = torch.clamp(y / z, -(cy / fy + margin_y), (view.height - cy) / fy + margin_y)
+    axes = rotation_matrices(unit_quats) * scales[:, None, :]
+    p0 = ((fx / z)[:, None] * (rotation[0] - tan_x[:, None] * rotation[2]))[:, None] @ axes
+    p1 = ((fy / z)[:, None] * (rotation[1] - tan_y[:, None] * rotation[2]))[:, None] @ axes
+    p0, p1 = p0[:, 0], p1[:, 0]
+    a, b, c = (p0 * p0).sum(1), (p0 * p1).sum(1), (p1 * p1).sum(1)
+    # ac − b² cancels for needles; the cross product does not
+    det0 = torch.linalg.cross(p0, p1).square().sum(1)
+    return a, b, c, det0
+
+
+def simplify(
+    gaussians: ActivatedGaussians, camera: Camera, budget: int, pixels: int = 1
+) -> tuple[ActivatedGaussians, Tensor]:
+    """See `progdf.rasterize.simplification.simplify`; and which of the Gaussians these are. [M] int64
+
+    Every number is that of the fast one but for rounding; the threshold is sought by halving.
+    """
+    rules, dilation = SIMPLIFY, DILATION / pixels**2
+    view = RasterView.of(camera, gaussians)
+    means, quats, scales, opacities, colors = (tensor.double() for tensor in gaussians.tensors)
+    rotation, translation = camera.viewmat[:3, :3].double(), camera.viewmat[:3, 3].double()
+    points = means @ rotation.T + translation
+    x, y, z = points.unbind(1)
+    fx, fy, cx, cy = (float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    px, py = fx * x / z + cx, fy * y / z + cy
+    longest = scales.abs().max(1).values / z
+    drawn = (z > camera.near) & (opacities >= ALPHA_MIN)
+    for place, extent, focal, center, side in (
+        (px, x / z, fx, cx, camera.width), (py, y / z, fy, cy, camera.height),
+    ):  # fmt: skip
+        margin = FRUSTUM_MARGIN * 0.5 * side / focal
+        tangent = extent.clamp(-(center / focal + margin), (side - center) / focal + margin)
+        reach2 = 1.001 * -2.0 * math.log(ALPHA_MIN) * ((focal * longest) ** 2 * (1 + tangent**2) + DILATION)
+        drawn &= torch.maximum(-place, place - side).clamp_min(0.0) ** 2 <= reach2
+    rows = drawn.nonzero()[:, 0]
+    px, py, z, opacities = px[rows], py[rows], z[rows], opacities[rows]
+    axes = scales[rows].abs()
+    face = axes.prod(1) / axes.min(1).values.clamp_min(1e-300)
+    weights = opacities * (face * fx * fy / z**2 + dilation)
+    shape = (-(-camera.height // rules.cell), -(-camera.width // rules.cell), rules.slices)
+    bits = (z / camera.near).float().view(torch.int32) - torch.tensor(1.0).view(torch.int32)
+    cells = (
+        py.clamp(0, camera.height - 1).long() // rules.cell,
+        px.clamp(0, camera.width - 1).long() // rules.cell,
+        (bits >> 19).long().clamp(0, rules.slices - 1),
+    )
+    density = torch.zeros(shape, dtype=torch.double)
+    density.index_put_(cells, weights * (2.0 * math.pi / rules.cell**2), accumulate=True)
+    threshold = 0.0
+    if len(rows) > budget:
+        before = density.cumsum(2) - density
+        before = -torch.nn.functional.max_pool2d(-before.permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
+        weights = weights * (-before[cells]).exp().clamp_min(rules.least_light)
+        low, high = 0.0, float(weights.sum()) / budget
+        for _ in range(100):
+            threshold = 0.5 * (low + high)
+            fewer = float((weights / threshold).clamp_max(1.0).sum()) < budget
+            low, high = (low, threshold) if fewer else (threshold, high)
+    kept = weights >= threshold * (rows.double() * GOLDEN % 1.0)
+    rows, weights, z, dense = rows[kept], weights[kept], z[kept], density[cells][kept]
+    enough = (rules.dense / dense.clamp_min(1e-6)).clamp_max(1.0)
+    times = (enough * threshold / weights).clamp(1.0, rules.most_times)
+    a, _, c, det0 = _covariances(points[rows], normalize_quats(quats[rows]), scales[rows], view)
+    fine = det0 + dilation * (a + c) + dilation**2
+    wider = (times * dilation - DILATION).clamp_min(0.0)
+    coarse = times**2 * det0 + (wider + DILATION) * times * (a + c) + (wider + DILATION) ** 2
+    opacity = opacities[kept] * times * (fine / coarse).sqrt()
+    if gaussians.antialiased:
+        opacity = opacity * (det0 / fine).clamp_min(ANTIALIAS_FLOOR).sqrt()
+    larger = (times[:, None] * scales[rows] ** 2 + (wider * z**2 / (fx * fy))[:, None]).sqrt()
+    rgb = colors[rows]
+    if view.sh_degree is not None:
+        direction = torch.nn.functional.normalize(means[rows] + rotation.T @ translation, dim=1, eps=1e-300)
+        rgb = shade(view.sh_degree, direction, rgb)
+    found = ActivatedGaussians(means[rows], quats[rows], larger, opacity, rgb)
+    return found.each(Tensor.float), rows
 
 
 def rotation_matrices(unit_quats: Tensor) -> Tensor:

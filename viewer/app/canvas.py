@@ -38,7 +38,7 @@ class Canvas:
         """Of the picture on screen."""
         self.pictures_drawn = 0
         """How many pictures were drawn."""
-        self._resolution = dynamic_resolution.DynamicResolution()
+        self._resolution = dynamic_resolution.first_known(len(engine.scene), engine.draws_with)
         self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
 
     def draw(
@@ -70,8 +70,13 @@ class Canvas:
         turned, slid = aim != self._last[0], edits != self._last[1]
         self._last = aim, edits
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
-        self._resolution = dynamic_resolution.before_draw(self._resolution, mode, held, turned, slid, now)
+        before = self._resolution
+        self._resolution = dynamic_resolution.before_draw(before, mode, held, turned, slid, now)
         self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap, pointed)
+        rests = mode != "off" and not (turned or slid)
+        waits = rests and dynamic_resolution.takes_long(before, self._resolution)
+        if waits and not self.comparer.prepare(view, size):
+            self._resolution = dynamic_resolution.keep_waiting(before, now)
         new = self.comparer.needs_draw(view, size, self.pixels)
         timings = self.comparer.draw(view, screen, size, self.pixels)
         if new:

@@ -91,6 +91,14 @@ class Comparer:
             return self._draw_sides(view, framebuffer, size, pixels)
         return self.engine.draw(view, framebuffer, size, pixels)
 
+    def prepare(self, view: ViewState, size: tuple[int, int]) -> bool:
+        """Begin in full what was drawn coarsely; whether `draw` now shows it at once."""
+        camera, mode = to_camera(view.camera, *size), view.compare.mode
+        camera = half_camera(camera) if mode == "beside" else camera
+        if not self.engine.prepare(view, camera):
+            return False
+        return mode == "off" or self._second(view).prepare(self._other_view(view), camera)
+
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
         """The same as an array, without labels. [H,W,3] float32, see `Engine.image`"""
         if view.compare.mode == "off":

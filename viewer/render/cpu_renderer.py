@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 
 import moderngl
 import numpy as np
@@ -13,7 +17,9 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, Crop, render
+from progdf.rasterize.cpu.parallel import stopped_by
 from progdf.rasterize.pixel_cells import area, dirty_rectangles, mark_cells, no_cells
+from progdf.rasterize.simplification import simplify
 from progdf.sh import C0
 from viewer.camera.up_axis import Vec3
 from viewer.gl.layout import SPLATS_PER_ROW
@@ -37,6 +43,13 @@ CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
 """Pixels that take as long as another call of the rasterizer, and as its look at one more Gaussian."""
 
 
+BUDGETS = 60_000, 140_000, 500_000
+"""How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
+
+MOVING_MS = 40.0, 65.0
+"""What such a picture shall take; with more or less time, the next one has fewer or more Gaussians."""
+
+
 @dataclass(frozen=True)
 class _Kept:
     """The last picture, what shines through it, 0..1 [H,W], and what it shows."""
@@ -47,13 +60,41 @@ class _Kept:
     background: Vec3
 
     def shows(self, camera: Camera, background: Vec3) -> bool:
-        mine = self.camera
-        return (
-            self.background == background
-            and (mine.width, mine.height) == (camera.width, camera.height)
-            and torch.equal(mine.viewmat, camera.viewmat)
-            and torch.equal(mine.K, camera.K)
-        )
+        return _same(self.camera, self.background, camera, background)
+
+
+class _Begun:
+    """A picture that is being made by another thread.
+
+    Args:
+        gaussians: what it shows
+        camera, background: how
+    """
+
+    def __init__(self, gaussians: ActivatedGaussians, camera: Camera, background: Vec3) -> None:
+        self._camera, self._background = camera, background
+        self._stop, self._ms = threading.Event(), 0.0
+        self._found: Future[tuple[Image, Image]] = _worker().submit(self._draw, gaussians)
+
+    def shows(self, camera: Camera, background: Vec3) -> bool:
+        return self._camera is camera or _same(self._camera, self._background, camera, background)
+
+    def done(self) -> bool:
+        return self._found.done()
+
+    def result(self) -> tuple[tuple[Image, Image], float]:
+        """The picture, as `_draw`, waited for, and the milliseconds it took."""
+        return self._found.result(), self._ms
+
+    def drop(self) -> None:
+        self._stop.set()
+
+    def _draw(self, gaussians: ActivatedGaussians) -> tuple[Image, Image]:
+        began = time.perf_counter()
+        with stopped_by(self._stop):
+            found = _draw(gaussians, self._camera, self._background)
+        self._ms = 1e3 * (time.perf_counter() - began)
+        return found
 
 
 class CpuRenderer:
@@ -80,9 +121,13 @@ class CpuRenderer:
         self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
         self._highlights: Image | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
+        self._begun: _Begun | None = None
+        self._budget = BUDGETS[1]
+        self.begun_ms = 0.0
 
     def upload(self, scene: Gaussians) -> None:
         """Take a whole scene. The renderer's copies are what was drawn, when `scene` is written in place."""
+        self._drop()
         self._drawn = ActivatedGaussians(
             means=torch.from_numpy(_copy(scene.means)),
             quats=torch.from_numpy(_copy(scene.quats)),
@@ -96,8 +141,11 @@ class CpuRenderer:
         nobody = np.zeros(0, np.int64)  # compiled now, and not under the first touch of a slider
         camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
         mark_cells(no_cells(1, 1), self._drawn, nobody, camera)
+        if len(scene.means) > BUDGETS[2]:
+            simplify(self._drawn.select(torch.arange(2)), camera, 1)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
+        self._drop()
         self._scene, names = scene, tuple(attributes)
         highlighted = self._highlights is not None and any(name in SH for name in names)
         names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
@@ -128,8 +176,21 @@ class CpuRenderer:
         if not self._highlights[:, 3].any():
             self._highlights = None
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
-        """Make the picture; `order` is not used, the rasterizer sorts by itself. Gives the share drawn."""
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> float:
+        """Make the picture; `order` is not used, the rasterizer sorts by itself. Gives the share drawn.
+
+        With more `pixels` than one of fewer Gaussians, and always as a whole.
+        """
+        begun, found, self.begun_ms = self._begun, None, 0.0
+        if pixels > 1:
+            found = self._draw_fewer(camera, background, pixels)
+        elif begun is not None and begun.shows(camera, background):
+            found, self.begun_ms = begun.result()
+        self._drop()
+        if found is not None:
+            self._keep(_Kept(*found, camera, background))
+            self._last, self._cells = None, None if pixels > 1 else no_cells(camera.width, camera.height)
+            return 1.0
         whole = camera.width * camera.height
         crops = [(0, 0, camera.width, camera.height)]
         kept = self._kept if self._kept is not None and self._kept.shows(camera, background) else None
@@ -138,10 +199,10 @@ class CpuRenderer:
             crops = dirty_rectangles(self._cells, (camera.width, camera.height), worth)
         share = area(crops) / whole
         if kept is None or share > WORTH_DRAWING_APART:
-            share, self._kept = 1.0, _Kept(*self._draw(camera, background, None), camera, background)
-            self._stale, self._lent, self._covers = None, False, False
+            share = 1.0
+            self._keep(_Kept(*_draw(self._drawn, camera, background), camera, background))
         elif crops:
-            parts = [self._draw(camera, background, crop) for crop in crops]
+            parts = [_draw(self._drawn, camera, background, crop) for crop in crops]
             if self._lent:
                 kept, self._lent = replace(kept, image=kept.image.copy()), False
             for (x0, y0, x1, y1), (image, through) in zip(crops, parts, strict=True):
@@ -153,8 +214,31 @@ class CpuRenderer:
         self._cells = no_cells(camera.width, camera.height)
         return share
 
+    def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> tuple[Image, Image]:
+        began = time.perf_counter()
+        fewer = simplify(self._drawn, camera, self._budget, pixels)
+        found = _draw(fewer, camera, background)
+        taken, (low, high) = 1e3 * (time.perf_counter() - began), MOVING_MS
+        if taken > high or (taken < low and len(fewer.means) > 0.9 * self._budget):
+            wanted = int(self._budget * (0.85 if taken > high else 1.15))
+            self._budget = min(max(wanted, BUDGETS[0]), BUDGETS[2])
+        return found
+
+    def prepare(self, camera: Camera, background: Vec3) -> bool:
+        """See `Renderer.prepare`."""
+        if self._begun is None or not self._begun.shows(camera, background):
+            self._drop()
+            self._begun = _Begun(self._drawn, camera, background)
+        return self._begun.done()
+
+    def _drop(self) -> None:
+        if self._begun is not None:
+            self._begun.drop()
+            self._begun = None
+
     def forget(self) -> None:
         """Draw the next picture as a whole, whatever the last one was."""
+        self._drop()
         self._kept = self._cells = self._last = None
 
     def pixels(self) -> Image:
@@ -200,16 +284,16 @@ class CpuRenderer:
 
     def release(self) -> None:
         """Give back what it holds."""
+        self._drop()
         for texture in (self._texture, self._coverage):
             if texture is not None:
                 texture.release()
         if self._presenter is not None:
             self._presenter.release()
 
-    def _draw(self, camera: Camera, background: Vec3, crop: Crop | None) -> tuple[Image, Image]:
-        with torch.no_grad():
-            found = render(self._drawn, camera, background, crop=crop)
-        return found.image.numpy(), found.transmittance.numpy()
+    def _keep(self, picture: _Kept) -> None:
+        """A whole new picture."""
+        self._kept, self._stale, self._lent, self._covers = picture, None, False, False
 
     def _where(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """The cells of the kept picture that `rows` touch as they are. While one slider is dragged, where
@@ -250,6 +334,30 @@ class CpuRenderer:
         if self._kept is None:
             raise ValueError("there is no picture yet; draw first")
         return self._kept
+
+
+def _draw(
+    gaussians: ActivatedGaussians, camera: Camera, background: Vec3, crop: Crop | None = None
+) -> tuple[Image, Image]:
+    """The picture and what shines through it."""
+    with torch.no_grad():
+        found = render(gaussians, camera, background, crop=crop)
+    return found.image.numpy(), found.transmittance.numpy()
+
+
+def _same(camera: Camera, background: Vec3, other: Camera, other_background: Vec3) -> bool:
+    """Whether two cameras take the same picture, on the same background."""
+    return (
+        background == other_background
+        and (camera.width, camera.height) == (other.width, other.height)
+        and torch.equal(camera.viewmat, other.viewmat)
+        and torch.equal(camera.K, other.K)
+    )
+
+
+@cache
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="picture")
 
 
 def _copy(values: torch.Tensor) -> Image:

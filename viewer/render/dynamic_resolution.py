@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,14 @@ if TYPE_CHECKING:
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""
 
-REST_S = 0.15
-"""How long nothing moves before the picture is drawn in full: more than between two steps of a hand."""
+REST_S = 0.06
+"""How long nothing moves before the picture in full is begun. What is begun keeps nobody waiting."""
+
+POLL_S = 0.02
+"""Between two looks whether it is done."""
+
+MANY = 300_000
+"""Gaussians of which the CPU's pictures are taken for slow before the first one is known."""
 
 COARSE = 2
 """How many pixels of the window one pixel of a coarse picture covers, each way."""
@@ -33,6 +40,22 @@ class DynamicResolution:
     rest_at: float | None = None
     camera_ms: tuple[float, ...] = ()
     slider_ms: tuple[float, ...] = ()
+
+
+def first_known(count: int, draws_with: str) -> DynamicResolution:
+    """What is known of a scene of which nothing was drawn yet."""
+    slow = draws_with == "cpu" and count >= MANY
+    return DynamicResolution(camera_ms=(math.inf, math.inf) if slow else ())
+
+
+def takes_long(known: DynamicResolution, full: DynamicResolution) -> bool:
+    """Whether the picture in full that comes after a coarse one should be made beside the window's work."""
+    return known.rest_at is not None and full.rest_at is None and _slow(known.camera_ms)
+
+
+def keep_waiting(known: DynamicResolution, now: float) -> DynamicResolution:
+    """The picture in full is not done yet: go on with the coarse one."""
+    return replace(known, rest_at=now + POLL_S)
 
 
 def before_draw(

@@ -143,11 +143,17 @@ class ViewEngine:
         if half is not None:
             camera, size = half_camera(camera), (max(size[0] // 2, 1), size[1])
             left = half * size[0]
-        self.timings = self._update_picture(view, camera, self.highlight)
+        self.timings = self._update_picture(view, camera, self.highlight, pixels)
         self.renderer.show(framebuffer, size, left)
         if view.grid and self.ctx is not None:
             self._draw_grid(view, camera, framebuffer, size, left)
         return self.timings
+
+    def prepare(self, view: ViewState, camera: Camera) -> bool:
+        """Begin a picture of `view` without waiting for it; whether `draw` now shows it at once."""
+        if _edits(view) != self._edits or not self.needs_draw(view, (camera.width, camera.height), camera):
+            return True
+        return self.renderer.prepare(replace(camera, near=self.near), view.background)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
         """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colors are.
@@ -244,7 +250,7 @@ class ViewEngine:
         )
 
     def _update_picture(
-        self, view: ViewState, camera: Camera, highlight: Highlight | None = None
+        self, view: ViewState, camera: Camera, highlight: Highlight | None = None, pixels: int = 1
     ) -> FrameTimings:
         """Do what lies between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
@@ -259,14 +265,14 @@ class ViewEngine:
             self.order = back_to_front(self.editing.means, camera)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
-        share = self.renderer.draw(camera, view.background, self.order)
+        share = self.renderer.draw(camera, view.background, self.order, pixels)
         drawn_at = time.perf_counter()
         self._picture = wanted
         return FrameTimings(
             compose_ms,
             upload_ms + highlight_ms,
             1e3 * (sorted_at - started),
-            1e3 * (drawn_at - sorted_at),
+            1e3 * (drawn_at - sorted_at) + self.renderer.begun_ms,
             changed,
             len(self.order) if self.renderer.wants_order else len(self.scene),
             share,

@@ -27,6 +27,9 @@ class Renderer(Protocol):
     wants_order: bool
     """Whether `draw` uses the order it is given."""
 
+    begun_ms: float
+    """What the last picture took before `draw` was called for it, milliseconds."""
+
     def upload(self, scene: Gaussians) -> None:
         """Take a whole scene."""
 
@@ -41,15 +44,20 @@ class Renderer(Protocol):
                 hides the Gaussian. [R,4]
         """
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> float:
         """Make the picture and wait until it is done.
 
         Args:
             order: farthest first, from `depth_sort.back_to_front`
+            pixels: of the picture at rest that one of this one stands for, each way
 
         Returns:
             The share of its pixels that had to be drawn, 0..1.
         """
+
+    def prepare(self, camera: Camera, background: Vec3) -> bool:
+        """Begin the picture, if making it may take long, without waiting for it; whether `draw` now has it at
+        once. Any other call drops what was begun."""
 
     def forget(self) -> None:
         """Draw the next picture as a whole, whatever the last one was."""
@@ -80,6 +88,7 @@ class GlRenderer:
     """
 
     wants_order = True
+    begun_ms = 0.0
 
     def __init__(self, ctx: moderngl.Context, editable: bool = False) -> None:
         self._ctx, self._editable = ctx, editable
@@ -110,11 +119,14 @@ class GlRenderer:
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         self._renderer.highlight(rows, highlights)
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32]) -> float:
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> float:
         self._renderer.set_order(order)
         self._picture = self._renderer.draw(camera, background)
         self._ctx.finish()
         return 1.0
+
+    def prepare(self, camera: Camera, background: Vec3) -> bool:
+        return True
 
     def forget(self) -> None:
         pass  # as it does every time

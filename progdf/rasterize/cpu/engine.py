@@ -111,7 +111,7 @@ def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
     _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES)
 
 
-def _share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
+def share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
     """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
     return _share(kernel, count, BLOCK)
 
@@ -151,7 +151,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
         project(begin, end, scene, camera, splats, np.empty(16))
         return find(begin, end, TILE_ROOM * (end - begin))
 
-    tiles = np.concatenate(_share_gaussians(project_and_find, n))
+    tiles = np.concatenate(share_gaussians(project_and_find, n))
     total = int(counts.sum(dtype=np.int64))
     if total > MOST_INTERSECTIONS:
         raise ProgdfError(
@@ -159,7 +159,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
             f"{MOST_INTERSECTIONS}; draw a smaller image or a crop, or take giant Gaussians out of the scene"
         )
     if len(tiles) < total:  # no room for those of some chunk
-        again = _share_gaussians(lambda begin, end: find(begin, end, int(counts[begin:end].sum())), n)
+        again = share_gaussians(lambda begin, end: find(begin, end, int(counts[begin:end].sum())), n)
         tiles = np.concatenate(again)
     order = depth_order(splats.depths, splats.visible)
     return splats, bin_splats(order, tiles, counts, camera.grid[2] * camera.grid[3], with_slots)
@@ -205,7 +205,7 @@ class _Rasterize(torch.autograd.Function):
 
         with compilation("backward", 5):
             share_tiles(blend_backward, camera, splats, lists, camera, background, out, by_out, wanted, sums)
-            _share_gaussians(backward_chunk, len(scene.means))
+            share_gaussians(backward_chunk, len(scene.means))
         results: list[Tensor | None] = [torch.from_numpy(array) for array in gradients]
         if camera.degree < 0:
             results[4] = torch.from_numpy(gradients.colors.reshape(-1, 3))

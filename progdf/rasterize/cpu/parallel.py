@@ -7,15 +7,16 @@ import itertools
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from typing import TypeVar
 
 _T = TypeVar("_T")
 _thread_count: int | None = None
 _left = threading.local()
+_stops = threading.local()
 
 
 def set_threads(count: int | None) -> None:
@@ -34,6 +35,20 @@ def threads() -> int:
     return _cores() if _thread_count is None else _thread_count
 
 
+class StoppedError(Exception):
+    """Nobody wants the result any more."""
+
+
+@contextmanager
+def stopped_by(event: threading.Event) -> Iterator[None]:
+    """Let what this thread does be given up, between two chunks, once the event is set: StoppedError."""
+    _stops.event = event
+    try:
+        yield
+    finally:
+        del _stops.event
+
+
 def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
     """Call `kernel(chunk)` for chunks 0, 1, …, each once, on this thread and those of the pool.
 
@@ -43,15 +58,22 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
     Returns:
         what the calls returned, by chunk
     """
+    stop: threading.Event | None = getattr(_stops, "event", None)
+
+    def run(chunk: int) -> _T:
+        if stop is not None and stop.is_set():
+            raise StoppedError
+        return kernel(chunk)
+
     if min(threads(), chunks) <= 1:
-        return [kernel(chunk) for chunk in range(chunks)]
+        return [run(chunk) for chunk in range(chunks)]
     results: dict[int, _T] = {}
     following = itertools.count()
     core = _current_core()
 
     def work() -> None:
         while (chunk := next(following)) < chunks:
-            results[chunk] = kernel(chunk)
+            results[chunk] = run(chunk)
 
     def work_elsewhere() -> None:
         _leave(core)

@@ -246,7 +246,7 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
 
 
 @kernel(contract=True, inline=True)
-def _shade(scene: Scene, i: int, degree: int, eye: Vec, basis: Array) -> Vec:
+def shade_splat(scene: Scene, i: int, degree: int, eye: Vec, basis: Array) -> Vec:
     """The color of a Gaussian; basis: scratch, [16] float64"""
     if degree < 0:
         return vec(scene.colors[i], 0)
@@ -290,7 +290,7 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
         in_x = px + extent_x >= x0 and px - extent_x <= x1
         if not (opacity >= ALPHA_MIN and in_x and py + extent_y >= y0 and py - extent_y <= y1):
             continue
-        red, green, blue = _shade(scene, i, camera.degree, eye, basis)
+        red, green, blue = shade_splat(scene, i, camera.degree, eye, basis)
         if not abs(red) + abs(green) + abs(blue) < np.inf:
             continue
         if camera.degree >= 0:

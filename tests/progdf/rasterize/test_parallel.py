@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from progdf.rasterize import set_threads
-from progdf.rasterize.cpu.parallel import run_chunks
+from progdf.rasterize.cpu.parallel import StoppedError, run_chunks, stopped_by
 from progdf.rasterize.cpu.sort import depth_order
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -112,6 +112,21 @@ def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
     rows = np.flatnonzero(visible)
     expected = rows[np.argsort(depths[visible], kind="stable")]
     np.testing.assert_array_equal(depth_order(depths, visible), expected)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_nobody_wants_any_more_is_given_up_between_two_chunks(count: int) -> None:
+    set_threads(count)
+    stop, done = threading.Event(), []
+
+    def one(chunk: int) -> None:
+        done.append(chunk)
+        stop.set()
+
+    with stopped_by(stop), pytest.raises(StoppedError):
+        run_chunks(one, 100)
+    assert len(done) <= count
+    assert run_chunks(lambda chunk: chunk, 3) == [0, 1, 2], "the next one is wanted"
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="threads cannot be placed here")

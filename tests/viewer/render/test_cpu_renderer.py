@@ -66,6 +66,19 @@ def wandering(scene: Gaussians) -> Gdf:
     return Gdf("wandering", Region("wandering", members, score), field, fingerprint(scene))
 
 
+def test_a_picture_that_was_begun_is_the_one_that_is_drawn_unless_something_changed(stack: Stack) -> None:
+    engine, afresh = (ViewEngine(None, stack.scene, stack.gdfs) for _ in range(2))
+    views = [view_of(stack, strength) for strength in (0.2, 0.9)]
+    for begun in views:
+        camera = to_camera(begun.camera, *SIZE)
+        engine.image(begun, (SIZE[0] // 2, SIZE[1] // 2))
+        while not engine.prepare(begun, camera):
+            pass
+        for shown in (begun, *views):
+            np.testing.assert_array_equal(engine.image(shown, SIZE), afresh.image(shown, SIZE))
+            engine.prepare(shown, replace(camera, viewmat=camera.viewmat + 0.01))  # which nobody asks for
+
+
 def test_a_random_session_of_sliders_gives_the_bits_of_whole_pictures(stack: Stack) -> None:
     edits = (*stack.gdfs, wandering(stack.scene))
     kept = ViewEngine(None, stack.scene, edits)
