@@ -14,7 +14,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.files import document, session
 from viewer.files.session import WindowSession
 from viewer.state import paint, snapshots
-from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
+from viewer.state.view_state import Comparison, Keyframe, LayerGroup, SnapshotPair, Timeline, ViewState
 
 
 def full_view() -> ViewState:
@@ -23,13 +23,23 @@ def full_view() -> ViewState:
     ears = bear().gdfs[1].region
     painted = paint.encode(np.linspace(0, 1, len(ears)))
     layers = (
-        replace(view.layers[1], name="ears → gold", gains=Gains(0.5, 0.25, 0.125), solo=True, paint=painted),
+        replace(
+            view.layers[1],
+            name="ears → gold",
+            gains=Gains(0.5, 0.25, 0.125),
+            solo=True,
+            paint=painted,
+            group="warm",
+        ),
         replace(view.layers[0], enabled=False),
     )
     camera = replace(view.camera, azimuth=33.5, mode="fly")
     film = Timeline((Keyframe(3, ((0, 0.5),), camera, "linear"),), length=30)
     compare = Comparison("split", 0.3, 8.0)
-    return replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
+    view = replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
+    groups = (LayerGroup("warm", enabled=False, strength=0.5),)
+    pair = SnapshotPair("original", "1", 0.25)
+    return replace(view, groups=groups, collapsed=("warm",), cards="compact", pair=pair)
 
 
 def bear_files(folder: Path) -> Path:

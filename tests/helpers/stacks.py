@@ -57,6 +57,31 @@ class Stack:
         return paths
 
 
+EDITS = (
+    *(
+        "jacket blue",
+        "jacket rust",
+        "helmet gold",
+        "helmet stripes",
+        "gloves",
+        "boots",
+        "visor",
+        "dusk",
+        "wet road",
+    ),
+    *("tank chrome", "tank flames", "seat", "wheel glow", "mirror", "exhaust", "lamp", "silk scarf", "plate"),
+    *("copper fork", "grips"),
+)
+
+
+def many_edits(stack: Stack, count: int = len(EDITS)) -> tuple[Stack, ViewState]:
+    """The stack with up to 20 edits of names of their own, in turn its scarf and its ears, all half way."""
+    gdfs = tuple(replace(stack.gdfs[i % 2], name=name) for i, name in enumerate(EDITS[:count]))
+    view = view_of(stack)
+    layers = tuple(LayerState(i, gdf.name, 0.5) for i, gdf in enumerate(gdfs))
+    return Stack(stack.demo, gdfs), replace(view, layers=layers, dynamic_resolution="off")
+
+
 def recording_of(gdf: Gdf) -> Trajectory:
     """What a run that led to this edit may have recorded: on the way, more of it than the field shows."""
     s = torch.tensor(gdf.field.recorded)

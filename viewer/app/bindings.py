@@ -137,10 +137,7 @@ def _describe_keys(keys: Sequence[controls.KeyBinding]) -> tuple[tuple[str, str]
 
 _NAMES = {
     "1": "1–9",
-    "Shift+1": "Shift+1–9",
     "Right": "← →",
-    "Shift+Right": "Shift+← →",
-    "Ctrl+Right": "Ctrl+← →",
     "Escape": "Esc",
     "Num1": "Numpad 1 3 7",
     "Alt+Down": "Alt+↑ ↓",
@@ -149,6 +146,7 @@ _NAMES = {
     "J": "Shift+R J I",
     "Ctrl+]": "Ctrl+[ ]",
     ".": ", .",
+    "Ctrl+C": "Ctrl+C, V, R",
     "Shift+.": "Shift+, .",
 }
 

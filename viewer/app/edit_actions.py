@@ -10,6 +10,7 @@ from progdf.gdf.file import Gdf, load_gdf
 from viewer.render.threads import all_threads
 from viewer.state import layers as stack
 from viewer.state.view_state import ViewState
+from viewer.state.workspace import focus_layer
 
 from .application import Application
 
@@ -80,4 +81,4 @@ class EditActions:
         """The changed stack, and the layer that it is about."""
         main_view = self._app.main_view
         main_view.change(view)
-        main_view.work = replace(main_view.work, focus=focus)
+        main_view.work = focus_layer(main_view.work, focus)

@@ -10,10 +10,10 @@ from imgui_bundle import imgui
 
 from viewer.panel import brush, panel, timeline_bar
 from viewer.panel.new_edit_form import FormInput
-from viewer.panel.snapshot_cards import SnapshotCard
+from viewer.panel.snapshot_cards import SnapshotCard, SnapshotSlider
 from viewer.pictures.compare_labels import Labels
 from viewer.select import outline
-from viewer.state import workspace
+from viewer.state import snapshots, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
@@ -58,16 +58,29 @@ def panels(
         work.jobs,
         work.deliveries,
         recent,
+        work.selected,
+        work.search,
+        work.searching,
+        _snapshot_slider(work, pointer) if cards else SnapshotSlider(),
     )
     result = panel.draw(work.view, shown, pointer.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
     form = result.form or work.form
     work = replace(work, overlap=result.overlap, pointed=result.pointed, form=form)
+    work = replace(work, search=result.search, searching=False, cards_fit=result.cards_fit)
     work = perform_actions(work, result.actions, pointer)
     if work.player.shown:
         asked = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
         work = perform_actions(work, asked, pointer)
     return work
+
+
+def _snapshot_slider(work: Workspace, pointer: PointerContext) -> SnapshotSlider:
+    """Which two snapshots there is a slider between, and where it stands."""
+    view, kept = work.view, snapshots.with_original(work.snapshots, work.view)
+    current = snapshots.is_blend(view, kept, lambda gdf: pointer.facts.rows[gdf].count)
+    compared = snapshots.compare_sides(work.snapshots, view) is not None
+    return SnapshotSlider(*snapshots.pair_of(kept, view.pair), view.pair.share, current, compared)
 
 
 def _form_input(work: Workspace, count: int, preview: tuple[str, bool]) -> FormInput:

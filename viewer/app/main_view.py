@@ -24,7 +24,7 @@ from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.select import hand
-from viewer.state import comparison, playback, workspace
+from viewer.state import comparison, layer_selection, playback, workspace
 from viewer.state.layers import shown_edits
 from viewer.state.recordings import RecordingFile
 from viewer.state.selection import NOBODY
@@ -341,7 +341,8 @@ class MainView:
 
     def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         """Serve the requests for files that the main view can make by itself."""
-        served = [request for request in self.work.requests if request in saved_files.REQUESTS]
+        known = (*saved_files.REQUESTS, "copy_values", "paste_values")
+        served = [request for request in self.work.requests if request in known]
         left = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=left)
         for request in served:
@@ -352,6 +353,12 @@ class MainView:
 
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
         title, view = self.facts.title, self._shown_view()
+        if request == "copy_values":
+            imgui.set_clipboard_text(layer_selection.copy_values(self.work))
+            return f"Copied the values of {len(layer_selection.selected_layers(self.work))} layers"
+        if request == "paste_values":
+            self.work, count = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
+            return f"Pasted to {count} layers"
         if request == "timeline_file":
             return saved_files.timeline(self.pictures, title, view)
         if request == "window_picture":

@@ -172,17 +172,17 @@ TAP_S = 0.25
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
 KEYS = (
-    *(KeyBinding(str(i), f"focus:{i}", "select layer 1–9" if i == 1 else "") for i in range(1, 10)),
     *(
-        KeyBinding(f"Shift+{i}", f"toggle:{i}", "show or hide layer 1–9" if i == 1 else "")
+        KeyBinding(str(i), f"focus:{i}", "select a layer; with Shift show or hide" if i == 1 else "")
         for i in range(1, 10)
     ),
+    *(KeyBinding(f"Shift+{i}", f"toggle:{i}", "") for i in range(1, 10)),
     *(
         KeyBinding(f"{held}{arrow}", f"nudge:{sign * step:g}", help_, repeats=True)
         for held, step in NUDGES
         for arrow, sign, help_ in (
             ("Left", -1, ""),
-            ("Right", 1, f"strength or gain ±{100 * step:g} %"),
+            ("Right", 1, "strength or gain; Shift coarse, Ctrl fine" if not held else ""),
             ("Down", -1, ""),
             ("Up", 1, ""),
         )
@@ -193,12 +193,21 @@ KEYS = (
     KeyBinding("Shift+H", "solo", "solo (Alt+click the eye)"),
     KeyBinding("Alt+H", "show_all", "show all"),
     KeyBinding("Shift+L", "lock", "lock"),
-    KeyBinding("G", "fold", "show gains and curve"),
+    KeyBinding("G", "fold", "gains and curve; with Alt compact rows"),
     KeyBinding("Enter", "rename", "rename (double-click the name)"),
     KeyBinding("Ctrl+D", "duplicate", "duplicate"),
     KeyBinding("Ctrl+Delete", "remove", "delete"),
     KeyBinding("Alt+Up", "move:-1", ""),
     KeyBinding("Alt+Down", "move:1", "move up or down (drag the name)"),
+    KeyBinding("Ctrl+Alt+A", "select_layers", "select all (Ctrl+click, Shift+click)"),
+    KeyBinding("Ctrl+G", "group", "group; with Shift ungroup"),
+    KeyBinding("Ctrl+Shift+G", "ungroup", ""),
+    KeyBinding("Ctrl+C", "copy_values", "copy, paste, reset strength and gains"),
+    KeyBinding("Ctrl+V", "paste_values", ""),
+    KeyBinding("Ctrl+R", "reset", ""),
+    KeyBinding("Ctrl+Shift+R", "reset_all", ""),
+    KeyBinding("Ctrl+F", "search", "search layers"),
+    KeyBinding("Alt+G", "cards", ""),
     KeyBinding("B", "brush", "paint strength (left drag)"),
     KeyBinding("X", "brush_mode", "brush: erase, smooth, add"),
     KeyBinding("Shift+B", "brush_through", "brush: front surface or all depths"),
@@ -263,8 +272,8 @@ KEYS = (
     KeyBinding("F2", "picture", "save the picture as PNG"),
     KeyBinding("Ctrl+F2", "take_view", "take this view without edits, to change it"),
     KeyBinding("Shift+F2", "window_picture", "save the whole window as PNG"),
-    KeyBinding("F3", "snapshot", "add a snapshot of the sliders"),
-    KeyBinding("Shift+F3", "compare_snapshots", "compare two snapshots"),
+    KeyBinding("F3", "snapshot", "add a snapshot; with Shift compare two"),
+    KeyBinding("Shift+F3", "compare_snapshots", ""),
     KeyBinding("F4", "camera", "save this view as a camera"),
     KeyBinding("Ctrl+N", "new_edit", "new edit"),
     KeyBinding("Ctrl+S", "save", "save the session"),
@@ -281,7 +290,7 @@ KEYS = (
 )
 
 
-OPENS_TEXT = ("rename", "save", "save_as", "open", "export", "render_picture", "render_film")
+OPENS_TEXT = ("rename", "search", "save", "save_as", "open", "export", "render_picture", "render_film")
 """Actions after which one types."""
 
 

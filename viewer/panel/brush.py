@@ -34,7 +34,7 @@ def obstacle(view: ViewState, focus: int | None) -> str:
     layer = view.layers[focus]
     if layer.locked:
         return f"{layer.name} is locked; press Shift+L to unlock it"
-    if layer not in stack.visible_layers(view):
+    if not stack.is_visible(view, layer):
         return f"{layer.name} is hidden; press H to show it"
     return ""
 

@@ -11,17 +11,22 @@ from dataclasses import dataclass, replace
 from imgui_bundle import imgui
 
 from progdf.compose.reference import BLENDS
+from viewer.panel import group_row, layer_bar
 from viewer.panel.layer_card import Cards, draw_card
 from viewer.state import layers as stack
-from viewer.state.view_state import OVERSHOOT, ViewState
+from viewer.state.layer_selection import filter_layers
+from viewer.state.view_state import OVERSHOOT, LayerGroup, ViewState
 from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.widgets import (
     right_edge,
     section,
+    small,
     tip,
 )
 
+HEADING_PX = 34.0  # at 1×: above the cards
+INSET_PX = 10.0  # of a group's layers, at 1×
 BLEND_HELP = {
     "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
@@ -33,7 +38,7 @@ BLEND_HELP = {
 class CardsResult:
     """What became of the state: the focused layer, the one being renamed, those asked about.
 
-    `actions`: those of the cards' menus, as in `actions.perform`.
+    `actions`: those of the cards' menus, as in `actions.perform`; `search`: the words that are looked for.
     """
 
     state: ViewState
@@ -42,6 +47,7 @@ class CardsResult:
     overlap: int | None = None
     pointed: Pointed | None = None
     actions: tuple[str, ...] = ()
+    search: str = ""
 
 
 def heading(state: ViewState, form_open: bool, ui: UiContext) -> tuple[ViewState, str]:
@@ -101,7 +107,7 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
 
 
 def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) -> CardsResult:
-    """All cards. `expected`: layers are about to come."""
+    """All cards, under the rows of their groups. `expected`: layers are about to come."""
     if not state.layers and not expected:
         imgui.push_text_wrap_pos(0.0)
         imgui.text_disabled("No edits yet. Make one (Ctrl+N), or drop a .gdf file on the window.")
@@ -109,32 +115,65 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
     focus, renaming, overlap = cards.focus, None, None
     pointed: Pointed | None = None
     actions: list[str] = []
-    dragged: int | None = None  # rows, as seen: the top layer, which is the last one, is row 0
+    search = layer_bar.search(state, cards, ui, actions) if state.layers else ""
+    texts = [f"{row.region} {row.instruction}" for row in cards.rows]
+    found = filter_layers(state, texts, search)[::-1]  # as seen: the top layer, which is the last one, first
+    dragged: int | None = None  # a place among the listed ones
     dropped = False
     spans: list[tuple[float, float]] = []
-    for at in range(len(state.layers)):
-        i = stack.index_of(state, at)
-        top = imgui.get_cursor_screen_pos().y
+    listed: list[int] = []
+    group = ""
+    for i in found:
+        layer = state.layers[i]
+        if layer.group and layer.group != group:
+            state = _group(state, layer.group, ui, actions)
+            _tighten(cards, ui)
+        group = layer.group
+        if group in state.collapsed and not search:
+            continue
+        inset = INSET_PX * ui.scale * bool(group)
+        top, left = imgui.get_cursor_screen_pos().y, imgui.get_cursor_pos_x()
+        imgui.set_cursor_pos_x(left + inset)
         card = draw_card(state, i, cards, ui)
         state = card.state
         spans.append((top, imgui.get_item_rect_max().y))
+        _tighten(cards, ui)
         if cards.reveal and cards.focus == i:
             imgui.set_scroll_here_y(0.5)
-        focus = i if card.touched else focus
+        focus = i if card.touched and card.press in ("", "one", "keep") else focus
+        if card.press and (cards.selected or card.press in ("toggle", "range")):
+            actions.append(f"press_layer:{card.press}:{i}:{','.join(str(i) for i in found)}")
         renaming = i if card.renaming else renaming
         overlap = i if card.overlap else overlap
         pointed = ("layer", i) if card.pointed else pointed
         actions += [card.action] if card.action else []
         if card.drag:
-            dragged, dropped = at, card.drag == "dropped"
+            dragged, dropped = len(listed), card.drag == "dropped"
+        listed.append(i)
+    if state.layers and not found:
+        small("No layer has these words", PALETTE.dim)
     if dragged is not None:
         to = _place(dragged, spans, imgui.get_mouse_pos().y)
-        if dropped:
-            was, focus = stack.index_of(state, dragged), stack.index_of(state, to)
-            state = stack.move_layer(state, was, focus)
-        else:
+        if dropped and to != dragged:
+            focus = listed[to]
+            state = stack.move_layer(state, listed[dragged], focus)
+        elif not dropped:
             _show_place(dragged, to, spans, ui)
-    return CardsResult(state, focus, renaming, overlap, pointed, tuple(actions))
+    return CardsResult(state, focus, renaming, overlap, pointed, tuple(actions), search)
+
+
+def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> ViewState:
+    """The row of a group; one that only its layers know is as any other, from the first change on."""
+    group = next((group for group in state.groups if group.name == name), LayerGroup(name))
+    if group not in state.groups:
+        state = replace(state, groups=(*state.groups, group))
+    return group_row.draw(state, group, sum(layer.group == name for layer in state.layers), ui, actions)
+
+
+def _tighten(cards: Cards, ui: UiContext) -> None:
+    """Compact rows lie closer together."""
+    if cards.compact:
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * ui.scale)
 
 
 def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from viewer.state import layers as stack
-from viewer.state.change_curve import STEPS
-from viewer.state.layer_facts import LayerRow
+from viewer.state.layer_facts import STEPS, LayerRow
 from viewer.state.view_state import LayerState
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.widgets import label, tip, value_slider

@@ -15,7 +15,7 @@ from viewer.jobs.delivery import Delivery
 from viewer.jobs.new_edit import NewEdit
 from viewer.jobs.training_job import TrainingJob
 from viewer.state.layer_facts import LayerRow
-from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
+from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState, cards_shown
 from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.widgets import (
@@ -33,17 +33,17 @@ from viewer.ui.widgets import (
 
 from . import (
     brush,
+    layer_bar,
     layer_card,
     layer_cards,
     main_menu,
     new_edit_form,
-    region_rows,
     selection_section,
     snapshot_cards,
     training_cards,
 )
 from .new_edit_form import FormInput
-from .snapshot_cards import SnapshotCard
+from .snapshot_cards import SnapshotCard, SnapshotSlider
 
 WIDTH_PX = 300.0  # at 1×
 
@@ -75,6 +75,8 @@ class PanelInput:
         jobs: what is being trained
         deliveries: what is being exported and rendered
         recent: files opened before, the last one first
+        selected, search, searching: as in `Cards`
+        snapshot_slider: between two snapshots
     """
 
     title: str
@@ -93,6 +95,10 @@ class PanelInput:
     jobs: Sequence[TrainingJob] = ()
     deliveries: Sequence[Delivery] = ()
     recent: Sequence[Path] = ()
+    selected: frozenset[int] = frozenset()
+    search: str = ""
+    searching: bool = False
+    snapshot_slider: SnapshotSlider = SnapshotSlider()
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,8 @@ class PanelResult:
     """The changed state, the focused layer, the one being renamed, and the actions asked for.
 
     `overlap`: the layer of which to show what it shares with the others, while the mouse rests on that line;
-    `pointed`: what else it rests on that the picture shows.
+    `pointed`: what else it rests on that the picture shows; `search`: what layers are filtered by;
+    `cards_fit`: whether there is room for a whole card of each layer.
     Actions are named as in `controls.KEYS`.
     """
 
@@ -111,6 +118,8 @@ class PanelResult:
     overlap: int | None = None
     pointed: Pointed | None = None
     form: NewEdit | None = None
+    search: str = ""
+    cards_fit: bool = True
 
 
 def width(ui: UiContext) -> float:
@@ -137,7 +146,10 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
     actions: list[str] = []
     actions += _title(state, shown, ui)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
-    _begin_body(footer)
+    chosen = [i for i, l in enumerate(state.layers) if i == shown.focus or l.gdf in shown.selected]
+    room = imgui.get_content_region_avail().y - footer - layer_cards.HEADING_PX * ui.scale
+    fit = len(state.layers) * layer_card.CARD_PX * ui.scale <= room
+    _begin_body(footer + layer_bar.selection_height(chosen, ui))
     state, asked = layer_cards.heading(state, shown.form is not None, ui)
     actions += [asked] if asked else []
     form = shown.form
@@ -146,7 +158,17 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         actions += [asked] if asked else []
     actions += training_cards.draw(shown.jobs, ui)
     actions += training_cards.draw_deliveries(shown.deliveries, ui)
-    cards = layer_card.Cards(shown.rows, shown.focus, shown.reveal, shown.active_slider, shown.renaming)
+    cards = layer_card.Cards(
+        shown.rows,
+        shown.focus,
+        shown.reveal,
+        shown.active_slider,
+        shown.renaming,
+        shown.selected,
+        cards_shown(state, fit) == "compact",
+        shown.search,
+        shown.searching,
+    )
     expected = bool(shown.jobs or shown.deliveries) or form is not None
     drawn = layer_cards.draw(state, cards, ui, expected)
     state, focus = drawn.state, drawn.focus
@@ -155,14 +177,17 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         state, asked = brush.section(state, focus, ui)
         actions += [asked] if asked else []
     state, selected = selection_section.draw(state, ui, actions)
-    region = region_rows.draw(state.selection.regions, ui, actions)
+    region = selection_section.draw_regions(state.selection.regions, ui, actions)
     state = _view(state, shown.unrecorded, len(shown.snapshots) > 1, ui, actions)
-    snapshot_cards.draw(shown.snapshots, ui, actions)
+    snapshot_cards.draw(shown.snapshots, shown.snapshot_slider, ui, actions)
     _end_body()
+    layer_bar.selection(state, chosen, ui, actions)
     _footer(state, shown, ui, actions)
     imgui.end()
     pointed = drawn.pointed or selected or region
-    return PanelResult(state, focus, tuple(actions), drawn.renaming, drawn.overlap, pointed, form)
+    return PanelResult(
+        state, focus, tuple(actions), drawn.renaming, drawn.overlap, pointed, form, drawn.search, fit
+    )
 
 
 def _begin_body(footer: float) -> None:

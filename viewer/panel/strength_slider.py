@@ -42,6 +42,9 @@ def draw(
     fill: Rgba,
     active: bool = True,
     most: float = 1.0,
+    height: float = HEIGHT_PX,
+    default: float = DEFAULT,
+    help_: str = TIP,
 ) -> float:
     """Draw the slider at the cursor and return the value it now has.
 
@@ -54,12 +57,15 @@ def draw(
         fill: color of the track up to the handle
         active: False draws it muted (a hidden layer); it still works
         most: upper end; beyond 1 the track lies on warning ground
+        height: at 1×; ticks are drawn where it has room for them
+        default: where a double click goes
+        help_: what it is for, shown when the mouse rests on it
     """
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "typing")):
         return _text_field(label, value, width, most)
     left, top = imgui.get_cursor_screen_pos()
-    imgui.invisible_button(label, imgui.ImVec2(width, HEIGHT_PX * scale))
+    imgui.invisible_button(label, imgui.ImVec2(width, height * scale))
     hovered, held = imgui.is_item_hovered(), imgui.is_item_active()
     radius = 7.0 * scale
     start, span = left + radius, max(width - 2 * radius, 1.0) / most
@@ -71,7 +77,7 @@ def draw(
             return _text_field(label, value, width, most)  # at once: what is typed next is not lost
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
-        value = DEFAULT if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
+        value = default if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
         _anchor(label, mouse, value)
     elif held or is_released():  # a slow frame may hold the last move and the release
         was_fine = storage.get_bool(_slot(label, "fine"))
@@ -80,8 +86,9 @@ def draw(
         if was_fine != imgui.get_io().key_shift:
             _anchor(label, mouse, value)  # after the move: a slow frame holds both
     if not held:
-        tip(TIP)
+        tip(help_)
     color = fill if active else PALETTE.faint
+    ticks = ticks if height >= HEIGHT_PX else ()
     _paint(start, top, span, radius, value, ticks, scale, color, hovered or held, most)
     return value
 

@@ -82,7 +82,7 @@ def requested_highlight(
         return Highlight(region=view.layers[index].gdf)
     if view.brush.active:
         layer = None if focus is None or focus >= len(view.layers) else view.layers[focus]
-        if layer is None or layer not in stack.visible_layers(view):
+        if layer is None or not stack.is_visible(view, layer):
             return None
         return Highlight(layer.gdf, layer.paint, thin=not view.brush.weights)
     tinted = [

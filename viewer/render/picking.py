@@ -18,7 +18,7 @@ from progdf.rasterize import reference
 from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN
 from progdf.rasterize.engines import RasterView, activate
 from viewer.camera.up_axis import Vec3
-from viewer.state.layers import visible_layers
+from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
 
 HALF = 0.5
@@ -80,15 +80,16 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
         A shown layer goes before a hidden one, of equal ones the later; None where no layer has
         `LEAST_SHARE` of the pixel.
     """
-    visible, best, chosen = visible_layers(view), (False, 0.0), None
+    best, chosen = (False, 0.0), None
     for i, layer in enumerate(view.layers):
         members = gdfs[layer.gdf].region.members.numpy()  # sorted
         if not len(members):
             continue
         own = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
         share = float(seen.shares[own].sum())
-        if share >= LEAST_SHARE and (layer in visible, share) >= best:
-            best, chosen = (layer in visible, share), i
+        ranked = is_visible(view, layer), share
+        if share >= LEAST_SHARE and ranked >= best:
+            best, chosen = ranked, i
     return chosen
 
 

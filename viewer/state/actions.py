@@ -17,10 +17,10 @@ from viewer.camera.named_views import look_at_view
 from viewer.camera.view_camera import FARTHEST
 from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED
 from viewer.state import comparison as compare
-from viewer.state import history, paint, playback, selection, snapshots
+from viewer.state import history, layer_selection, paint, playback, selection, snapshots
 from viewer.state import layers as stack
 from viewer.state.history import History
-from viewer.state.view_state import ViewState, next_resolution_mode
+from viewer.state.view_state import ViewState, cards_shown, next_resolution_mode
 from viewer.state.workspace import SceneFacts, Workspace, focus_layer, loses_strengths, with_camera
 
 FEATHER = 0.1
@@ -55,6 +55,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         state = workspace.view.selection
         changed = selection.change(state, name, argument, facts.count, facts.neighborhood)
         return replace(workspace, view=replace(workspace.view, selection=changed))
+    if name == "blend_snapshots":
+        return _blend_snapshots(workspace, argument, facts)
     if name == "next_slider":
         return _select_slider(workspace, int(argument), facts)
     return ACTIONS[name](workspace, argument)
@@ -90,19 +92,10 @@ def _focus(workspace: Workspace, number: str) -> Workspace:
     return focus_layer(workspace, stack.index_of(workspace.view, int(number) - 1))
 
 
-def _toggle_shown(view: ViewState, index: int) -> ViewState:
-    return stack.change_layer(view, index, lambda layer: replace(layer, enabled=not layer.enabled))
-
-
 def _toggle(workspace: Workspace, number: str) -> Workspace:
     index = stack.index_of(workspace.view, int(number) - 1)
-    return replace(workspace, view=_toggle_shown(workspace.view, index))
-
-
-def _nudge(workspace: Workspace, by: str) -> Workspace:
-    return _change_focused(
-        workspace, lambda view, i: stack.nudge(view, i, workspace.active_slider, float(by))
-    )
+    view = stack.change_layer(workspace.view, index, lambda layer: replace(layer, enabled=not layer.enabled))
+    return replace(workspace, view=view)
 
 
 def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
@@ -118,34 +111,9 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
     return replace(workspace, active_slider=slider, view=view)
 
 
-def _move(workspace: Workspace, by: str) -> Workspace:
-    """The focused layer up (−1) or down in the panel's list; the focus goes with it."""
-    if workspace.focus is None:
-        return workspace
-    to = max(0, min(workspace.focus - int(by), len(workspace.view.layers) - 1))
-    return replace(workspace, view=stack.move_layer(workspace.view, workspace.focus, to), focus=to)
-
-
-def _remove(workspace: Workspace, index: str) -> Workspace:
-    """A layer, or the focused one, is taken out of the stack; the one below it is focused."""
-    at = int(index) if index else workspace.focus
-    if at is None or not 0 <= at < len(workspace.view.layers):
-        return workspace
-    view = stack.remove_layer(workspace.view, at)
-    focus = max(at - 1, 0) if view.layers else None
-    return replace(workspace, view=view, focus=focus, renaming=None, overlap=None)
-
-
 def _rename(workspace: Workspace, index: str) -> Workspace:
     """The name of a layer, or of the focused one, becomes a text field."""
     return replace(workspace, renaming=int(index) if index else workspace.focus)
-
-
-def _lock(workspace: Workspace, _: str) -> Workspace:
-    def toggle(view: ViewState, index: int) -> ViewState:
-        return stack.change_layer(view, index, lambda layer: replace(layer, locked=not layer.locked))
-
-    return _change_focused(workspace, toggle)
 
 
 def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
@@ -213,16 +181,34 @@ def _resize(workspace: Workspace, times: str) -> Workspace:
 
 
 def _step_back(workspace: Workspace, _: str) -> Workspace:
-    """The list of bindings goes, or the tool that selects, or the focus."""
+    """The list of bindings goes, or the tool that selects, or the other selected layers, or the focus."""
     if workspace.help:
         return replace(workspace, help=False)
-    tool = workspace.view.select.tool
-    return _take_tool(workspace, tool) if tool else replace(workspace, focus=None)
+    if tool := workspace.view.select.tool:
+        return _take_tool(workspace, tool)
+    if len(layer_selection.selected_layers(workspace)) > 1:
+        return replace(workspace, selected=frozenset())
+    return replace(workspace, focus=None)
 
 
 def _show_all(workspace: Workspace, _: str) -> Workspace:
     view = stack.show_all(workspace.view)
     return replace(workspace, view=replace(view, selection=selection.show_all(view.selection)))
+
+
+def _rename_group(workspace: Workspace, argument: str) -> Workspace:
+    """`INDEX:NAME`, of `view.groups`"""
+    index, _, name = argument.partition(":")
+    old, view = workspace.view.groups[int(index)].name, workspace.view
+    return replace(workspace, view=stack.change_group(view, old, lambda group: replace(group, name=name)))
+
+
+def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
+    """Rows of one line for cards, or back; by themselves where they would be so anyway."""
+    shown = cards_shown(workspace.view, workspace.cards_fit)
+    wanted = "full" if shown == "compact" else "compact"
+    alone = "full" if workspace.cards_fit else "compact"
+    return replace(workspace, view=replace(workspace.view, cards="auto" if wanted == alone else wanted))
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:
@@ -277,9 +263,32 @@ def _restore(workspace: Workspace, index: str) -> Workspace:
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """`INDEX:NAME`"""
+    """`INDEX:NAME`; the pair that is blended follows."""
     index, _, name = argument.partition(":")
-    return replace(workspace, snapshots=snapshots.rename(workspace.snapshots, int(index) - 1, name))
+    old, kept = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
+    was, now, pair = old[int(index) - 1].name, kept[int(index) - 1].name, workspace.view.pair
+    pair = replace(pair, a=now if pair.a == was else pair.a, b=now if pair.b == was else pair.b)
+    return replace(workspace, snapshots=kept, view=replace(workspace.view, pair=pair))
+
+
+def _move_snapshot(workspace: Workspace, argument: str) -> Workspace:
+    """`INDEX:TO`"""
+    index, to = (int(place) - 1 for place in argument.split(":"))
+    return replace(workspace, snapshots=snapshots.move(workspace.snapshots, index, to))
+
+
+def _choose_snapshot(workspace: Workspace, argument: str) -> Workspace:
+    """`SLOT:NAME`, of which SLOT is a or b"""
+    slot, _, name = argument.partition(":")
+    return replace(workspace, view=snapshots.choose(workspace.view, slot, name))
+
+
+def _blend_snapshots(workspace: Workspace, share: str, facts: SceneFacts) -> Workspace:
+    if not workspace.snapshots:
+        return workspace
+    kept = snapshots.with_original(workspace.snapshots, workspace.view)
+    view = snapshots.blend(workspace.view, kept, float(share), lambda gdf: facts.rows[gdf].count)
+    return _with_layers_of(workspace, view)
 
 
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
@@ -310,7 +319,7 @@ REQUESTS = (
         "demo",
     ),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
-    *("save_region", "rename_region"),
+    *("save_region", "rename_region", "copy_values", "paste_values"),
 )
 """What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
 afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
@@ -320,15 +329,25 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": _step_back,
     "toggle": _toggle,
-    "hide": lambda w, _: _change_focused(w, _toggle_shown),
-    "nudge": _nudge,
-    "move": _move,
-    "solo": lambda workspace, _: _change_focused(workspace, stack.toggle_solo),
+    "hide": lambda workspace, _: layer_selection.switch_selected(workspace, "enabled"),
+    "nudge": lambda workspace, by: layer_selection.nudge(workspace, float(by)),
+    "move": lambda workspace, by: layer_selection.move(workspace, int(by)),
+    "solo": lambda workspace, _: layer_selection.switch_selected(workspace, "solo"),
     "show_all": _show_all,
-    "lock": _lock,
+    "lock": lambda workspace, _: layer_selection.switch_selected(workspace, "locked"),
     "fold": lambda workspace, _: _change_focused(workspace, stack.toggle_details),
     "rename": _rename,
-    "remove": _remove,
+    "remove": layer_selection.remove,
+    "press_layer": layer_selection.press,
+    "select_layers": layer_selection.select_layers,
+    "master": lambda workspace, strength: layer_selection.set_master(workspace, float(strength)),
+    "reset": lambda workspace, _: layer_selection.reset(workspace, everything=False),
+    "reset_all": lambda workspace, _: layer_selection.reset(workspace, everything=True),
+    "group": layer_selection.group,
+    "ungroup": layer_selection.ungroup,
+    "rename_group": _rename_group,
+    "search": lambda workspace, _: replace(workspace, searching=bool(workspace.view.layers)),
+    "cards": _toggle_cards,
     "blend": _blend,
     "select_tool": _take_tool,
     "select_through": lambda w, _: replace(
@@ -347,6 +366,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "restore": _restore,
     "forget": lambda w, at: replace(w, snapshots=snapshots.remove(w.snapshots, int(at) - 1)),
     "name_snapshot": _name_snapshot,
+    "move_snapshot": _move_snapshot,
+    "choose_snapshot": _choose_snapshot,
     "undo": lambda w, _: _back(w, history.undo(w.past)),
     "redo": lambda w, _: _back(w, history.redo(w.past)),
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from .selection import SelectionState
-from .view_state import Blend, LayerState, Timeline, ViewState
+from .view_state import Blend, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 
 LONGEST = 1000  # entries; each is a few hundred bytes, with a selection some kilobytes
 
@@ -20,6 +20,8 @@ class Edit:
     overshoot: bool = False
     timeline: Timeline = Timeline()
     selection: SelectionState = SelectionState()
+    groups: tuple[LayerGroup, ...] = ()
+    pair: SnapshotPair = SnapshotPair()
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,15 @@ class History:
 
 
 def edit_of(state: ViewState) -> Edit:
-    return Edit(state.layers, state.blend, state.overshoot, state.timeline, state.selection)
+    return Edit(
+        state.layers,
+        state.blend,
+        state.overshoot,
+        state.timeline,
+        state.selection,
+        state.groups,
+        state.pair,
+    )
 
 
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
@@ -100,4 +110,6 @@ def apply_edit(state: ViewState, edit: Edit) -> ViewState:
         overshoot=edit.overshoot,
         timeline=edit.timeline,
         selection=edit.selection,
+        groups=edit.groups,
+        pair=edit.pair,
     )

@@ -1,14 +1,14 @@
-"""The stack of layers as pure functions: which of them show, their order, names, and what a lock keeps.
+"""The stack of layers as pure functions: which of them show, order, names, groups, and what a lock keeps.
 
 `ViewState.layers` begins with the lowest layer; the panel shows the last one, which lies on top, at the top.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
-from .view_state import OVERSHOOT, LayerState, ViewState
+from .view_state import OVERSHOOT, LayerGroup, LayerState, ViewState
 
 SLIDERS = ("strength", "geometry", "opacity", "color")
 """What the arrow keys move: the strength, or a gain."""
@@ -17,9 +17,27 @@ LONGEST_NAME = 60
 
 
 def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
-    """The layers that take part, in their order: the soloed ones where there are any, else the enabled."""
+    """The layers that take part, in their order, each at its strength times its group's.
+
+    They are the soloed ones where there are any, else the enabled of enabled groups.
+    """
+    groups = {group.name: group for group in view.groups}
     alone = tuple(layer for layer in view.layers if layer.solo)
-    return alone or tuple(layer for layer in view.layers if layer.enabled)
+    shown = alone or tuple(
+        layer
+        for layer in view.layers
+        if layer.enabled and (layer.group not in groups or groups[layer.group].enabled)
+    )
+    factors = {name: group.strength for name, group in groups.items() if group.strength != 1.0}
+    return tuple(
+        replace(layer, strength=layer.strength * factors[layer.group]) if layer.group in factors else layer
+        for layer in shown
+    )
+
+
+def is_visible(view: ViewState, layer: LayerState) -> bool:
+    """Whether a layer of `view` takes part."""
+    return any(shown.name == layer.name for shown in visible_layers(view))
 
 
 def shown_edits(view: ViewState) -> list[str]:
@@ -71,12 +89,15 @@ def nudge(view: ViewState, index: int, slider: str, by: float) -> ViewState:
 
 
 def move_layer(view: ViewState, index: int, to: int) -> ViewState:
-    """The layer at `index` taken out and put in at `to`; the ends of the stack stop it."""
+    """The layer at `index` taken out and put in at `to`; the ends of the stack stop it.
+
+    Between two layers of a group it joins them, away from those of its own it leaves them.
+    """
     if not 0 <= index < len(view.layers):
         return view
-    layers = list(view.layers)
-    layers.insert(max(0, min(to, len(layers) - 1)), layers.pop(index))
-    return replace(view, layers=tuple(layers))
+    layers, to = list(view.layers), max(0, min(to, len(view.layers) - 1))
+    layers.insert(to, layers.pop(index))
+    return _join_neighbors(replace(view, layers=tuple(layers)), to)
 
 
 def rename_layer(view: ViewState, index: int, text: str) -> ViewState:
@@ -106,7 +127,7 @@ def remove_layer(view: ViewState, index: int) -> ViewState:
     """Without one layer; as it was where there is no such layer."""
     if not 0 <= index < len(view.layers):
         return view
-    return replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :]))
+    return tidy_groups(replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :])))
 
 
 def duplicate_layer(view: ViewState, index: int, gdf: int) -> ViewState:
@@ -146,7 +167,7 @@ def with_paint(view: ViewState, index: int, paint: str) -> ViewState:
 def show_all(view: ViewState) -> ViewState:
     """Every eye open, no layer alone."""
     layers = tuple(replace(layer, enabled=True, solo=False) for layer in view.layers)
-    return replace(view, layers=layers)
+    return replace(view, layers=layers, groups=tuple(replace(g, enabled=True) for g in view.groups))
 
 
 def with_overshoot(view: ViewState, on: bool) -> ViewState:
@@ -166,3 +187,87 @@ def toggle_details(view: ViewState, index: int) -> ViewState:
     if gdf in view.unfolded:
         return replace(view, unfolded=tuple(g for g in view.unfolded if g != gdf))
     return replace(view, unfolded=(*view.unfolded, gdf))
+
+
+def group_layers(view: ViewState, indices: Collection[int], name: str = "Group") -> ViewState:
+    """A group of these layers, at the place of the topmost; they leave the groups they were in."""
+    if not indices:
+        return view
+    taken, free, number = {group.name for group in view.groups}, name, 2
+    while free in taken:
+        free, number = f"{name} {number}", number + 1
+    members = [replace(view.layers[i], group=free) for i in sorted(indices)]
+    rest = [layer for i, layer in enumerate(view.layers) if i not in indices]
+    at = sum(i not in indices for i in range(max(indices)))
+    if 0 < at < len(rest) and rest[at - 1].group and rest[at - 1].group == rest[at].group:
+        at = max(i + 1 for i, layer in enumerate(rest) if layer.group == rest[at].group)  # not into a group
+    layers = (*rest[:at], *members, *rest[at:])
+    return tidy_groups(replace(view, layers=layers, groups=(*view.groups, LayerGroup(free))))
+
+
+def move_to_group(view: ViewState, indices: Collection[int], name: str) -> ViewState:
+    """These layers at the bottom of a group there is."""
+    moved = [replace(view.layers[i], group=name) for i in sorted(indices) if view.layers[i].group != name]
+    rest = [layer for i, layer in enumerate(view.layers) if i not in indices or layer.group == name]
+    at = next((i for i, layer in enumerate(rest) if layer.group == name), None)
+    if at is None:
+        return view
+    return tidy_groups(replace(view, layers=(*rest[:at], *moved, *rest[at:])))
+
+
+def ungroup(view: ViewState, names: Collection[str]) -> ViewState:
+    """The layers of these groups by themselves, as they showed within them."""
+    groups = {group.name: group for group in view.groups if group.name in names}
+
+    def alone(layer: LayerState) -> LayerState:
+        group = groups.get(layer.group)
+        if group is None:
+            return layer
+        enabled = layer.enabled and group.enabled
+        return replace(layer, group="", enabled=enabled, strength=layer.strength * group.strength)
+
+    return tidy_groups(replace(view, layers=tuple(map(alone, view.layers))))
+
+
+def change_group(view: ViewState, name: str, change: Callable[[LayerGroup], LayerGroup]) -> ViewState:
+    """`view` with one group changed; a changed name is one line, no other group's, and its layers follow."""
+    old = next((group for group in view.groups if group.name == name), None)
+    if old is None:
+        return view
+    new = change(old)
+    wanted = " ".join(new.name.split())[:LONGEST_NAME]
+    if not wanted or any(group.name == wanted for group in view.groups if group is not old):
+        wanted = name
+    return replace(
+        view,
+        layers=tuple(replace(l, group=wanted) if l.group == name else l for l in view.layers),
+        groups=tuple(replace(new, name=wanted) if group is old else group for group in view.groups),
+        collapsed=tuple(wanted if collapsed == name else collapsed for collapsed in view.collapsed),
+    )
+
+
+def toggle_collapsed(view: ViewState, name: str) -> ViewState:
+    """The layers of a group listed, or not."""
+    rest = tuple(collapsed for collapsed in view.collapsed if collapsed != name)
+    return replace(view, collapsed=rest if name in view.collapsed else (*rest, name))
+
+
+def tidy_groups(view: ViewState) -> ViewState:
+    """Without the groups that have no layer."""
+    names = {layer.group for layer in view.layers}
+    return replace(
+        view,
+        groups=tuple(group for group in view.groups if group.name in names),
+        collapsed=tuple(name for name in view.collapsed if name in names),
+    )
+
+
+def _join_neighbors(view: ViewState, index: int) -> ViewState:
+    """The layer at `index` in the group that lies around it, or beside it where that is its own."""
+    below = view.layers[index - 1].group if index else ""
+    above = view.layers[index + 1].group if index + 1 < len(view.layers) else ""
+    own = view.layers[index].group
+    group = below if below == above else own if own in (below, above) else ""
+    others = {layer.group for i, layer in enumerate(view.layers) if i != index}
+    group = own if own and own not in others and below != above else group  # a group of one moves with it
+    return tidy_groups(change_layer(view, index, lambda layer: replace(layer, group=group)))

@@ -82,7 +82,7 @@ def encode(weights: Floats) -> str:
     return base64.b64encode(zlib.compress(levels.tobytes(), 1)).decode()
 
 
-@lru_cache(maxsize=16)  # the composer knows weights by their identity
+@lru_cache(maxsize=48)  # the composer knows weights by their identity
 def decode(paint: str, members: int) -> Tensor | None:
     """Weight of every member, None for `FULL`. [M] float32
 
@@ -181,6 +181,20 @@ def invert(paint: str, members: int) -> str:
     """
     weights = decode(paint, members)
     return encode(np.zeros(members, np.float32) if weights is None else (1.0 - weights).numpy())
+
+
+@lru_cache(maxsize=48)
+def blend(first: str, second: str, share: float, members: int) -> str:
+    """The paint whose weights lie between those of two others: (1 − share) · first + share · second.
+
+    Raises:
+        ProgdfError: see `decode`.
+    """
+    if first == second:
+        return first
+    ends = (decode(paint, members) for paint in (first, second))
+    a, b = (np.ones(members, np.float32) if weights is None else weights.numpy() for weights in ends)
+    return encode(a + np.float32(share) * (b - a))
 
 
 def feather(paint: str, points: Floats, width: float) -> str:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+from progdf.compose.layers import Gains
 from viewer.camera.view_camera import ViewCamera
 
-from . import history
+from . import history, paint
 from .history import Edit
-from .layers import LONGEST_NAME
+from .layers import LONGEST_NAME, SLIDERS, visible_layers
 from .selection import SelectionState
-from .view_state import SnapshotPair, Timeline, ViewState
+from .view_state import LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 
 MOST = 200
+ORIGINAL = "original"
+"""The name of the first."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +57,17 @@ def remove(snapshots: Sequence[SliderSnapshot], index: int) -> tuple[SliderSnaps
 
 
 def rename(snapshots: Sequence[SliderSnapshot], index: int, name: str) -> tuple[SliderSnapshot, ...]:
-    """One under another name, on one line; no name changes nothing."""
-    name = " ".join(name.split())[:LONGEST_NAME]
+    """One under another name, on one line, with a number where it is taken; no name changes nothing."""
+    name = " ".join(name.split())[:LONGEST_NAME] or snapshots[index].name
+    taken = {ORIGINAL, *(kept.name for i, kept in enumerate(snapshots) if i != index)}
+    free = next(n for n in (name, *(f"{name}-{i}" for i in range(2, MOST + 3))) if n not in taken)
+    return (*snapshots[:index], replace(snapshots[index], name=free), *snapshots[index + 1 :])
+
+
+def move(snapshots: Sequence[SliderSnapshot], index: int, to: int) -> tuple[SliderSnapshot, ...]:
+    """One at another place; the ends stop it."""
     kept = list(snapshots)
-    kept[index] = replace(kept[index], name=name or kept[index].name)
+    kept.insert(max(0, min(to, len(kept) - 1)), kept.pop(index))
     return tuple(kept)
 
 
@@ -65,14 +76,14 @@ def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple
     layers = tuple(replace(layer, strength=0.0) for layer in view.layers)
     edit = _sliders(replace(view, layers=layers))
     first = snapshots[0].camera if snapshots else view.camera
-    return SliderSnapshot("original", edit, first), *snapshots
+    return SliderSnapshot(ORIGINAL, edit, first), *snapshots
 
 
 def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     """`view` edited as it was then; edits that were opened since stay in the stack, at 0."""
     kept = {layer.gdf for layer in snapshot.edit.layers}
-    later = tuple(replace(layer, strength=0.0) for layer in view.layers if layer.gdf not in kept)
-    back = history.apply_edit(view, snapshot.edit)
+    later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in kept)
+    back = replace(history.apply_edit(view, snapshot.edit), pair=view.pair)
     return replace(back, layers=(*back.layers, *later), timeline=view.timeline, selection=view.selection)
 
 
@@ -91,9 +102,116 @@ def compare_sides(snapshots: Sequence[SliderSnapshot], view: ViewState) -> Snaps
     return SnapshotSides(restore(view, a), restore(view, b), (a.name, b.name))
 
 
+def choose(view: ViewState, slot: str, name: str) -> ViewState:
+    """Another snapshot as A or B ("a" or "b") of the pair; the slider between them goes back to A."""
+    changes: dict[str, Any] = {slot: name, "share": 0.0}
+    return replace(view, pair=replace(view.pair, **changes))
+
+
+def blend(
+    view: ViewState, kept: Sequence[SliderSnapshot], share: float, counts: Callable[[int], int]
+) -> ViewState:
+    """`view` between A and B of its pair: as A at 0, as B at 1, each exactly.
+
+    Strengths, gains, group strengths and painted weights lie between those of the two, in a straight line; a
+    layer that only one of them shows fades with that one's gains and paint. The order of layers, the blend
+    rule and locks cannot lie between: they change half way.
+
+    Args:
+        kept: the snapshots with the original
+        counts: gives how many members an edit has
+
+    Raises:
+        ProgdfError: painted weights do not fit their edit.
+    """
+    share = min(1.0, max(0.0, share))
+    a, b = pair_of(kept, view.pair)
+    pair = replace(view.pair, a=kept[a].name, b=kept[b].name, share=share)
+    ends = [restore(view, kept[i] if i else _faded(kept[j])) for i, j in ((a, b), (b, a))]
+    if share in (0.0, 1.0):
+        return replace(ends[round(share)], pair=pair)
+    near, far = ends if share < 0.5 else ends[::-1]
+    known = {layer.gdf for layer in near.layers}
+    stack = (*near.layers, *(replace(layer, group="") for layer in far.layers if layer.gdf not in known))
+    members = [_members(end) for end in ends]
+    shared = {name for name in members[0] if members[0][name] == members[1].get(name)}  # groups of both
+    if any(layer.solo for end in ends for layer in end.layers):
+        shared = set()  # soloed layers are shown whatever becomes of their groups
+    groups = (
+        _group_between(group, ends, share) if group.name in shared else LayerGroup(group.name)
+        for group in near.groups
+    )
+    own = [{layer.gdf: layer for layer in end.layers} for end in ends]
+    seen = [{layer.gdf: layer.strength for layer in visible_layers(end)} for end in ends]
+
+    def between(layer: LayerState) -> LayerState:
+        first, second = (of.get(layer.gdf, replace(layer, strength=0.0, enabled=False)) for of in own)
+        shown = [layer.gdf in of for of in seen]
+        strengths = [of.get(layer.gdf, end.strength) for of, end in zip(seen, (first, second), strict=True)]
+        if layer.group in shared:
+            shown, strengths = [first.enabled, second.enabled], [first.strength, second.strength]
+        strength = _fade(shown, strengths, share)
+        on = [here and s != 0.0 for here, s in zip(shown, strengths, strict=True)]
+        if on[0] != on[1]:
+            first = second = first if on[0] else second
+        gains = {
+            kind: _lerp(getattr(first.gains, kind), getattr(second.gains, kind), share)
+            for kind in SLIDERS[1:]
+        }
+        weights = paint.blend(first.paint, second.paint, share, counts(layer.gdf))
+        return replace(
+            layer, strength=strength, enabled=any(shown), solo=False, gains=Gains(**gains), paint=weights
+        )
+
+    return replace(
+        near,
+        layers=tuple(map(between, stack)),
+        groups=tuple(groups),
+        overshoot=near.overshoot or far.overshoot,
+        pair=pair,
+    )
+
+
+def is_blend(view: ViewState, kept: Sequence[SliderSnapshot], counts: Callable[[int], int]) -> bool:
+    """Whether `view` is still what its slider between two snapshots made of it."""
+    made = blend(view, kept, view.pair.share, counts)
+    return (made.layers, made.groups, made.blend) == (view.layers, view.groups, view.blend)
+
+
+def _faded(snapshot: SliderSnapshot) -> SliderSnapshot:
+    """The original as the other end of a slider: that snapshot with every strength at 0."""
+    layers = tuple(replace(layer, strength=0.0) for layer in snapshot.edit.layers)
+    return replace(snapshot, edit=replace(snapshot.edit, layers=layers))
+
+
+def _members(view: ViewState) -> dict[str, frozenset[int]]:
+    """The edits in each group."""
+    return {
+        group.name: frozenset(layer.gdf for layer in view.layers if layer.group == group.name)
+        for group in view.groups
+    }
+
+
+def _group_between(group: LayerGroup, ends: Sequence[ViewState], share: float) -> LayerGroup:
+    both = [next(g for g in end.groups if g.name == group.name) for end in ends]
+    on = [g.enabled for g in both]
+    return replace(group, enabled=any(on), strength=_fade(on, [g.strength for g in both], share))
+
+
+def _fade(on: Sequence[bool], values: Sequence[float], share: float) -> float:
+    """Between two values; what is off at one end is 0 there, unless it is off at both."""
+    a, b = (value if here or not any(on) else 0.0 for here, value in zip(on, values, strict=True))
+    return _lerp(a, b, share)
+
+
+def _lerp(a: float, b: float, share: float) -> float:
+    return a + share * (b - a)
+
+
 def _sliders(view: ViewState) -> Edit:
-    """What a snapshot keeps: all that undo knows but the film and the selection."""
-    return replace(history.edit_of(view), timeline=Timeline(), selection=SelectionState())
+    """What a snapshot keeps: all that undo knows but the film, the selection and the blend of snapshots."""
+    whole = history.edit_of(view)
+    return replace(whole, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())
 
 
 def _name(snapshots: Sequence[SliderSnapshot]) -> str:

@@ -24,6 +24,8 @@ COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "recorded", "snapshots")
 MOST_AMPLIFIED = 64.0
 LONGEST, FASTEST = 9999, 120  # frames, frames per second
+CARD_MODES = ("auto", "full", "compact")
+"""`ViewState.cards`: rows of one line where cards would not fit, never, always."""
 RESOLUTION_MODES = ("auto", "on", "off")
 """`ViewState.dynamic_resolution`: where it pays, always, never."""
 
@@ -49,6 +51,7 @@ class LayerState:
         solo: only soloed layers are shown while there are any
         locked: strength, gains and paint stay as they are
         paint: a weight per member, as `paint.encode` writes it; empty is 1 everywhere
+        group: the name of the group it is in, "" for none; those of a group lie next to each other
     """
 
     gdf: int
@@ -59,6 +62,22 @@ class LayerState:
     solo: bool = False
     locked: bool = False
     paint: str = ""
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class LayerGroup:
+    """Layers that are switched and dimmed together.
+
+    Args:
+        name: no two groups share one
+        enabled: the eye; a soloed layer is shown all the same
+        strength: what the strengths of its layers are multiplied by
+    """
+
+    name: str
+    enabled: bool = True
+    strength: Share = 1.0
 
 
 @dataclass(frozen=True)
@@ -130,10 +149,12 @@ class SnapshotPair:
 
     Args:
         a, b: what is compared, and what lies at the ends of the slider between them
+        share: where that slider was left, 0 at A
     """
 
     a: str = ""
     b: str = ""
+    share: Share = 0.0
 
 
 @dataclass(frozen=True)
@@ -181,9 +202,12 @@ class ViewState:
         dynamic_resolution: of `RESOLUTION_MODES`: when the window draws coarsely while something moves
         selection: what is selected and hidden, and the regions
         select: what selects
-        pair: the snapshots that are compared
         grid: the window draws a grid on the ground; pictures and films never have it
         axes: the window shows where the axes of the world point
+        pair: the snapshots that are compared and blended
+        groups: of layers, in no order
+        collapsed: names of the groups whose layers the panel does not list
+        cards: of `CARD_MODES`
     """
 
     camera: ViewCamera = ViewCamera()
@@ -203,6 +227,14 @@ class ViewState:
     pair: SnapshotPair = SnapshotPair()
     grid: bool = False
     axes: bool = True
+    groups: tuple[LayerGroup, ...] = ()
+    collapsed: tuple[str, ...] = ()
+    cards: Annotated[str, one_of(CARD_MODES)] = "auto"
+
+
+def cards_shown(view: ViewState, fit: bool) -> str:
+    """ "full" or "compact": how the panel shows layers, where whole cards `fit` or do not."""
+    return view.cards if view.cards != "auto" else "full" if fit else "compact"
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

@@ -110,6 +110,10 @@ class Workspace:
         past: undo and redo
         home: the first camera
         focus: the focused layer, an index into `view.layers`, or None
+        selected: `LayerState.gdf` of the layers that are selected with it, empty where it is alone
+        search: what the panel's layers are filtered by, "" for all
+        searching: its field was asked for and has no keyboard yet
+        cards_fit: whether the panel has room for a whole card of each layer
         active_slider: which of `stack.SLIDERS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
         help: whether the list of bindings is shown
@@ -133,6 +137,10 @@ class Workspace:
     past: History
     home: ViewCamera
     focus: int | None = None
+    selected: frozenset[int] = frozenset()
+    search: str = ""
+    searching: bool = False
+    cards_fit: bool = True
     active_slider: str = "strength"
     renaming: int | None = None
     help: bool = False
@@ -235,5 +243,6 @@ def glide_from(workspace: Workspace, start: ViewCamera) -> Workspace:
 
 
 def focus_layer(workspace: Workspace, index: int) -> Workspace:
-    """With another layer focused; as it was where there is no such layer."""
-    return replace(workspace, focus=index) if 0 <= index < len(workspace.view.layers) else workspace
+    """With another layer focused, and it alone selected; as it was where there is no such layer."""
+    found = 0 <= index < len(workspace.view.layers)
+    return replace(workspace, focus=index, selected=frozenset()) if found else workspace

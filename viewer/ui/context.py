@@ -74,6 +74,11 @@ class Icon:
     DELETE = icons.ICON_FA_TRASH
     BARS = icons.ICON_FA_BARS
     OPEN = icons.ICON_FA_FOLDER_OPEN
+    COMPACT = icons.ICON_FA_LIST
+    FULL = icons.ICON_FA_TABLE_LIST
+    FOLDED = icons.ICON_FA_CARET_RIGHT
+    UNFOLDED = icons.ICON_FA_CARET_DOWN
+    SPLIT = icons.ICON_FA_CIRCLE_HALF_STROKE
 
 
 @dataclass(frozen=True)

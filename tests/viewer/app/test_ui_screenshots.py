@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 
+from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys
 from viewer.panel import panel
 from viewer.render.timings import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
-from viewer.state.view_state import Brush, LayerState, ViewState
+from viewer.state.view_state import Brush, LayerGroup, LayerState, ViewState
 from viewer.state.workspace import Dialog
 
 Compare = Callable[[str, np.ndarray], None]
@@ -153,6 +154,34 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
         hand.main_view.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())
+
+
+def test_twenty_layers_as_rows_with_a_group_and_several_selected(screenshot: Compare) -> None:
+    stack, view = many_edits(bear())
+    layers = [replace(layer, strength=i * 7 % 20 / 19) for i, layer in enumerate(view.layers)]
+    layers[2], layers[6] = replace(layers[2], enabled=False), replace(layers[6], locked=True)
+    groups = (LayerGroup("Tank and frame", strength=0.8),)
+    layers[9:12] = [replace(layer, group=groups[0].name) for layer in layers[9:12]]
+    with rig(replace(view, layers=tuple(layers), groups=groups), (1024, 800), stack=stack) as hand:
+        hand.click(815.0, 132.0)
+        hand.modifier(imgui.Key.mod_shift)
+        hand.click(815.0, 244.0)
+        hand.modifier(imgui.Key.mod_shift, False)
+        hand.move(300.0, 700.0)
+        hand.frame(3)
+        screenshot("ui_rows", the_panel(hand))
+
+
+def test_a_blend_between_two_snapshots(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
+        for chord in ("F3", *["Shift+Right"] * 10, "2", *["Shift+Left"] * 10, "F3"):
+            hand.key(chord)
+        hand.wheel(900.0, 400.0, -100.0)
+        hand.rest()
+        hand.drag((743.0, 485.0), (860.0, 485.0))
+        hand.move(300.0, 600.0)
+        hand.frame(20)
+        screenshot("ui_blend", hand.image())
 
 
 def test_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:

@@ -24,7 +24,7 @@ from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.selection import SelectionState
-from viewer.state.view_state import Comparison
+from viewer.state.view_state import Comparison, SnapshotPair
 
 
 @pytest.fixture
@@ -71,6 +71,22 @@ def test_regions_come_back_with_their_files_wherever_the_folder_went(folder: Pat
     elsewhere.rename(tmp_path)
     assert again.members == kept.members
     assert [region.path for region in again.regions] == [moved / "third.region.npy"]
+
+
+def test_a_session_from_before_groups_opens_without_any(saved: Path) -> None:
+    table = json.loads(saved.read_text())
+    for state in (table["view"], *(kept["edit"] for kept in table["snapshots"])):
+        for key in ("groups", "pair", "collapsed", "cards"):
+            state.pop(key, None)
+        for layer in state["layers"]:
+            del layer["group"]
+    saved.write_text(json.dumps(table))
+    again = session.open_session(saved).view
+    assert (again.groups, again.pair, [layer.group for layer in again.layers]) == (
+        (),
+        SnapshotPair(),
+        ["", ""],
+    )
 
 
 def test_a_session_from_before_selections_opens_with_nothing_selected(saved: Path) -> None:

@@ -24,7 +24,7 @@ from viewer.commands.layer_arguments import stack_of
 from viewer.panel import layer_details as layer_fold
 from viewer.panel import panel
 from viewer.panel.strength_slider import parse_strength
-from viewer.state import change_curve, timeline
+from viewer.state import layer_facts, timeline
 from viewer.state import layers as stack
 from viewer.state.layer_facts import layer_rows
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
@@ -328,19 +328,19 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
 def test_the_curve_begins_at_nothing_reaches_all_at_one_and_goes_beyond() -> None:
     made = bear()
     curve = layer_rows(made.scene, made.gdfs)[1].curve()
-    assert len(curve) == round(OVERSHOOT * change_curve.STEPS) + 1
-    assert (curve[0], curve[change_curve.STEPS]) == (0.0, 1.0)
+    assert len(curve) == round(OVERSHOOT * layer_facts.STEPS) + 1
+    assert (curve[0], curve[layer_facts.STEPS]) == (0.0, 1.0)
     assert curve[-1] > 1.0
-    assert layer_fold.value_at(curve, 0.5) == curve[change_curve.STEPS // 2]
+    assert layer_fold.value_at(curve, 0.5) == curve[layer_facts.STEPS // 2]
     assert layer_fold.value_at((0.0, 1.0), 0.01) == pytest.approx(0.2)
     assert layer_fold.value_at((0.0, 1.0), 5.0) == 1.0
 
 
 def test_a_large_region_is_measured_by_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made = bear()
-    whole = change_curve.visible_changes(made.scene, made.gdfs[0])
-    monkeypatch.setattr(change_curve, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
-    assert change_curve.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
+    whole = layer_facts.visible_changes(made.scene, made.gdfs[0])
+    monkeypatch.setattr(layer_facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
+    assert layer_facts.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,149 @@
+"""Long stacks in the panel: compact rows, several selected layers, groups, search: a window for each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+
+from progdf.compose.composer import Composer
+from tests.helpers.count import Count
+from tests.helpers.stacks import EDITS, many_edits
+from tests.helpers.ui_rig import Rig, bear, rig
+from viewer.panel import panel
+from viewer.state import layer_selection
+from viewer.state.view_state import LayerGroup
+
+pytestmark = pytest.mark.gl
+SIZE = (1024, 800)
+LEFT = SIZE[0] - panel.WIDTH_PX
+TOP, STEP = 132.0, 28.0  # the middle of the first compact row, and from row to row
+NAME, TRACK, SPAN = LEFT + 90.0, LEFT + 166.5, 78.0
+MASTER = (LEFT + 12.0 + 7.0, 740.0, 219.0)  # where its track begins, and how long it is
+
+
+def row(layer: int, count: int = len(EDITS)) -> float:
+    return TOP + STEP * (count - 1 - layer)
+
+
+def click_with(hand: Rig, key: imgui.Key, x: float, y: float) -> None:
+    hand.modifier(key)
+    hand.click(x, y)
+    hand.modifier(key, False)
+
+
+def type_text(hand: Rig, text: str, end: imgui.Key) -> None:
+    hand.frame(2)
+    hand.io.add_input_characters_utf8(text)
+    hand.settle()
+    hand.modifier(end)
+    hand.modifier(end, False)
+    hand.settle()
+
+
+def selected(hand: Rig) -> list[str]:
+    work = hand.main_view.work
+    return [work.view.layers[i].name for i in layer_selection.selected_layers(work)]
+
+
+def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stack, view = many_edits(bear())
+    with rig(view, SIZE, stack=stack) as hand:
+        assert not hand.main_view.work.cards_fit
+        hand.click(TRACK + 0.25 * SPAN, row(0))
+        assert hand.strengths[0] == pytest.approx(0.25, abs=0.01), "the last row is in reach"
+        hand.click(LEFT + 250.0, 70.0)
+        hand.click(LEFT + 220.0, 121.0)
+        assert hand.main_view.work.view.blend == "sum", "and so is the blend rule"
+        hand.click(NAME, row(0))
+        click_with(hand, imgui.Key.mod_shift, NAME, row(19))
+        assert len(selected(hand)) == 20
+        entries, start = len(hand.main_view.work.past.past), (MASTER[0] + 0.5 * MASTER[2], MASTER[1])
+        composed, drawn = Count(monkeypatch, Composer, "update"), hand.main_view.canvas.pictures_drawn
+        hand.move(*start)
+        hand.press()
+        for share in (0.45, 0.3, 0.6, 0.8):
+            hand.move(MASTER[0] + share * MASTER[2], MASTER[1])
+        hand.release()
+        assert hand.strengths == pytest.approx([0.4, *[0.8] * 19], abs=0.01), "in proportion"
+        assert composed.calls == 4, "once per change"
+        assert hand.main_view.canvas.pictures_drawn == drawn + 4
+        assert len(hand.main_view.work.past.past) == entries + 1
+        hand.key("Ctrl+Z")
+        assert hand.strengths == pytest.approx([0.25, *[0.5] * 19], abs=0.01)
+        hand.key("Escape")
+        hand.key("Alt+G")
+        assert hand.main_view.work.view.cards == "full"
+        hand.key("Alt+G")
+        click_with(hand, imgui.Key.mod_ctrl, NAME, row(3))
+        assert selected(hand) == [EDITS[0], EDITS[3]]
+        hand.click(TRACK + 0.7 * SPAN, row(3))
+        assert len(selected(hand)) == 2, "a slider moves alone and leaves the selection"
+        assert hand.strengths[3] == pytest.approx(0.7, abs=0.01)
+        hand.click(NAME, row(5))
+        assert selected(hand) == [EDITS[5]]
+
+
+def test_values_are_copied_as_text_and_the_search_finds_names_and_regions() -> None:
+    stack, view = many_edits(bear(), 12)
+    with rig(view, SIZE, stack=stack) as hand:
+        hand.click(TRACK + 0.9 * SPAN, row(11, 12))
+        hand.key("Ctrl+C")
+        assert f'"name": "{EDITS[11]}"' in imgui.get_clipboard_text()
+        assert "Copied" in (hand.main_view.work.message or pytest.fail("no word")).text
+        hand.key("Ctrl+F")
+        type_text(hand, "TANK", imgui.Key.enter)
+        assert hand.main_view.work.search == "TANK"
+        for y in (TOP, TOP + STEP):
+            click_with(hand, imgui.Key.mod_ctrl, NAME, y)
+        click_with(hand, imgui.Key.mod_ctrl, NAME, row(0, 1))
+        assert "tank flames" not in selected(hand)
+        click_with(hand, imgui.Key.mod_ctrl, NAME, row(0, 1))
+        assert selected(hand) == ["tank chrome", "tank flames", EDITS[11]]
+        hand.key("Ctrl+V")
+        assert hand.strengths[9:] == pytest.approx([hand.strengths[11]] * 3)
+        assert hand.strengths[0] == 0.5
+        hand.key("Ctrl+Z")
+        assert hand.strengths[9:11] == [0.5, 0.5]
+        imgui.set_clipboard_text("a poem")
+        hand.key("Ctrl+V")
+        assert hand.main_view.work.message is not None
+        assert hand.main_view.work.message.error
+        hand.key("Ctrl+F")
+        type_text(hand, "scarf", imgui.Key.enter)
+        hand.key("Ctrl+Alt+A")
+        hand.key("Ctrl+R")
+        assert hand.strengths[9:11] == [0.0, 0.0], "also what the search does not show, as all means all"
+
+
+def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
+    stack, view = many_edits(bear(), 12)
+    with rig(view, SIZE, stack=stack) as hand:
+        hand.click(NAME, row(11, 12))
+        click_with(hand, imgui.Key.mod_shift, NAME, row(9, 12))
+        bright = hand.picture()
+        hand.key("Ctrl+G")
+        assert hand.main_view.work.view.groups == (LayerGroup("Group"),)
+        assert np.array_equal(hand.picture(), bright), "a group changes nothing by itself"
+        hand.click(TRACK + 0.5 * SPAN, TOP)
+        assert hand.main_view.work.view.groups[0].strength == pytest.approx(0.5, abs=0.03)
+        assert not np.array_equal(hand.picture(), bright)
+        hand.click(LEFT + 20.0, TOP)
+        assert hand.main_view.work.view.collapsed == ("Group",)
+        hand.click(NAME, TOP + STEP)
+        assert selected(hand) == [EDITS[8]], "the next row is the one below the group"
+        hand.click(NAME, TOP)
+        assert selected(hand) == list(EDITS[9:12])
+        hand.frame(30)
+        hand.double_click(NAME, TOP)
+        type_text(hand, "tank", imgui.Key.enter)
+        assert hand.main_view.work.view.groups[0].name == "tank"
+        hand.key("Ctrl+Shift+G")
+        assert hand.main_view.work.view.groups == ()
+        assert hand.strengths[11] == pytest.approx(0.25, abs=0.02)
+        for _ in range(4):
+            hand.key("Ctrl+Z")
+        hand.move(5.0, 5.0)  # a name that the mouse rests on shows its region
+        assert np.array_equal(hand.picture(), bright)

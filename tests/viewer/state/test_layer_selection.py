@@ -1,0 +1,182 @@
+"""Several layers at once: selected, dimmed in proportion, reset, copied, moved, grouped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from progdf.compose.layers import Gains
+from progdf.errors import ProgdfError
+from viewer.camera.view_camera import Bounds
+from viewer.state import layer_selection, layers, workspace
+from viewer.state.actions import perform
+from viewer.state.layer_facts import LayerRow
+from viewer.state.view_state import LayerGroup, LayerState, ViewState
+from viewer.state.workspace import SceneFacts, Workspace
+
+NAMES = "abcdef"
+FACTS = SceneFacts("bear.ply", 100, Bounds(), [LayerRow(10, (0.5, 0.5, 0.5), (0.0, 1.0), "", Bounds())] * 6)
+
+
+def six(*strengths: float) -> Workspace:
+    """Layers a to f, of which a is the lowest, f the topmost and focused."""
+    known = (*strengths, *[0.5] * (len(NAMES) - len(strengths)))
+    rows = tuple(LayerState(i, name, known[i]) for i, name in enumerate(NAMES))
+    return workspace.new_workspace(ViewState(layers=rows))
+
+
+def act(work: Workspace, *actions: str) -> Workspace:
+    """After these actions, each a gesture of its own."""
+    for action in actions:
+        work = workspace.record_undo(perform(work, action, FACTS))
+    return work
+
+
+def press(work: Workspace, how: str, name: str) -> Workspace:
+    index = [layer.name for layer in work.view.layers].index(name)
+    return act(work, f"press_layer:{how}:{index}:5,4,3,2,1,0")
+
+
+def selected(work: Workspace) -> str:
+    return "".join(work.view.layers[i].name for i in layer_selection.selected_layers(work))
+
+
+def strengths(work: Workspace) -> list[float]:
+    return [layer.strength for layer in work.view.layers]
+
+
+def order(work: Workspace) -> str:
+    return "".join(layer.name for layer in work.view.layers)
+
+
+def groups(work: Workspace) -> list[str]:
+    return [layer.group for layer in work.view.layers]
+
+
+def test_presses_select_one_toggle_and_take_what_lies_between() -> None:
+    work = press(six(), "range", "c")
+    assert selected(work) == "cdef"
+    assert work.focus == 5, "the range begins there, also of the next one"
+    assert selected(press(work, "range", "d")) == "def"
+    work = press(work, "toggle", "d")
+    assert selected(work) == "cef"
+    assert selected(press(work, "keep", "c")) == "cef", "a slider of a selected card is moved alone"
+    assert selected(press(work, "keep", "a")) == "a"
+    work = press(work, "toggle", "f")
+    assert (selected(work), work.view.layers[work.focus or 0].name) == ("ce", "e")
+    assert selected(press(work, "one", "e")) == "e"
+    assert selected(act(six(), "select_layers")) == NAMES
+    assert selected(act(work, "unfocus")) == "e", "Esc leaves the others first"
+    assert selected(act(work, "unfocus", "unfocus")) == ""
+
+
+def test_the_master_keeps_proportions_through_zero_within_a_gesture_and_is_one_undo_entry() -> None:
+    work = press(six(0.0, 0.0, 0.0, 0.2, 0.4, 0.8), "range", "d")
+    entries, before = len(work.past.past), work.view
+    moved = work
+    for strength in (0.4, 0.0, 0.6):
+        moved = perform(moved, f"master:{strength}", FACTS)
+    assert strengths(moved) == pytest.approx([0.0, 0.0, 0.0, 0.15, 0.3, 0.6])
+    moved = workspace.record_undo(moved)
+    assert len(moved.past.past) == entries + 1
+    assert act(moved, "undo").view == before
+    locked = replace(work.view.layers[5], locked=True)
+    held = workspace.record_undo(
+        replace(work, view=replace(work.view, layers=(*work.view.layers[:5], locked)))
+    )
+    assert strengths(act(held, "master:1"))[3:] == [0.5, 1.0, 0.8], "a locked one neither moves nor counts"
+    assert strengths(act(press(six(0, 0), "toggle", "a"), "master:0.25"))[0] == pytest.approx(0.0)
+    bottom = press(press(six(0, 0), "one", "a"), "toggle", "b")
+    assert strengths(act(bottom, "master:0.25"))[:2] == [0.25, 0.25], "from 0 all rise together"
+    assert strengths(act(work, "nudge:0.1"))[3:] == pytest.approx([0.225, 0.45, 0.9])
+
+
+def test_switches_resets_and_deletions_are_for_all_that_are_selected() -> None:
+    work = press(six(), "range", "d")
+    assert [layer.enabled for layer in act(work, "hide").view.layers] == [True] * 3 + [False] * 3
+    assert [layer.locked for layer in act(work, "lock").view.layers] == [False] * 3 + [True] * 3
+    assert strengths(act(work, "reset")) == [0.5] * 3 + [0.0] * 3
+    assert strengths(act(work, "lock", "reset_all")) == [0.0] * 3 + [0.5] * 3
+    gone = act(work, "remove")
+    assert (order(gone), gone.focus) == ("abc", 2)
+    assert order(act(work, "remove:0")) == "bcdef", "a layer outside of the selection goes alone"
+
+
+def test_values_go_from_one_layer_to_all_selected_ones_and_from_several_by_name() -> None:
+    work = six(0.1, 0.2)
+    gained = replace(work.view.layers[1], gains=Gains(0.5, 1.0, 0.25))
+    work = workspace.new_workspace(
+        replace(work.view, layers=(work.view.layers[0], gained, *work.view.layers[2:]))
+    )
+    one = layer_selection.copy_values(press(work, "one", "b"))
+    pasted, count = layer_selection.paste_values(press(press(work, "one", "d"), "toggle", "f"), one)
+    assert count == 2
+    assert [pasted.view.layers[i].gains for i in (3, 5)] == [gained.gains] * 2
+    assert strengths(pasted) == [0.1, 0.2, 0.5, 0.2, 0.5, 0.2]
+    two = layer_selection.copy_values(press(press(act(work, "blend"), "one", "a"), "toggle", "b"))
+    other, count = layer_selection.paste_values(six(), two)
+    assert (count, strengths(other)[:3], other.view.blend) == (2, [0.1, 0.2, 0.5], "sum")
+    for text in (
+        "",
+        "hello",
+        "[]",
+        '{"layers": []}',
+        two.replace("0.1", "7"),
+        two.replace('"b"', '"b", "x": 1'),
+    ):
+        with pytest.raises(ProgdfError, match="the clipboard holds no values"):
+            layer_selection.paste_values(work, text)
+    with pytest.raises(ProgdfError, match="no layer takes these values"):
+        layer_selection.paste_values(work, two.replace('"a"', '"x"').replace('"b"', '"y"'))
+
+
+def test_a_group_gathers_its_layers_switches_and_dims_them_and_dissolves() -> None:
+    work = act(press(press(six(), "one", "b"), "toggle", "e"), "group")
+    assert (order(work), groups(work)) == ("acdbef", ["", "", "", "Group", "Group", ""])
+    assert selected(work) == "be"
+    dimmed = replace(work, view=replace(work.view, groups=(LayerGroup("Group", strength=0.5),)))
+    assert [l.strength for l in layers.visible_layers(dimmed.view)] == [0.5, 0.5, 0.5, 0.25, 0.25, 0.5]
+    loose = act(dimmed, "ungroup")
+    assert strengths(loose) == [0.5, 0.5, 0.5, 0.25, 0.25, 0.5]
+    assert (groups(loose), loose.view.groups) == ([""] * 6, ())
+    off = replace(work, view=replace(work.view, groups=(LayerGroup("Group", enabled=False),)))
+    assert [l.name for l in layers.visible_layers(off.view)] == ["a", "c", "d", "f"]
+    assert not layers.is_visible(off.view, off.view.layers[3])
+    named = act(work, "rename_group:0: warm  light ")
+    assert groups(named)[3:5] == ["warm light"] * 2
+    two = act(press(press(named, "one", "a"), "toggle", "c"), "group")
+    assert act(two, "rename_group:1:warm light").view.groups == two.view.groups, "no two of one name"
+    assert groups(act(press(named, "one", "a"), "group:warm light")) == ["", "", *["warm light"] * 3, ""]
+    assert act(named, "remove:4", "remove:3").view.groups == ()
+    assert [
+        work.view.layers[i].name for i in layer_selection.filter_layers(work.view, ["red"] * 6, "GROUP Red")
+    ] == [
+        "b",
+        "e",
+    ]
+
+
+def test_a_layer_that_moves_joins_the_group_around_it_and_leaves_its_own_behind() -> None:
+    work = act(press(press(six(), "one", "c"), "toggle", "d"), "group")
+    view = layers.move_layer(work.view, 0, 2)
+    assert [(l.name, l.group) for l in view.layers][:4] == [
+        ("b", ""),
+        ("c", "Group"),
+        ("a", "Group"),
+        ("d", "Group"),
+    ]
+    view = layers.move_layer(work.view, 3, 5)
+    assert [(l.name, l.group) for l in view.layers][2:] == [("c", "Group"), ("e", ""), ("f", ""), ("d", "")]
+    up = act(act(work, "select_layers:Group"), "move:-1")
+    assert (order(up), groups(up)) == ("abecdf", ["", "", "", "Group", "Group", ""])
+    assert order(act(up, "move:-1", "move:-1")) == "abefcd", "the end stops all of them"
+
+
+def test_compact_rows_come_by_themselves_and_a_switch_turns_them_round() -> None:
+    work = six()
+    assert act(work, "cards").view.cards == "compact"
+    assert act(work, "cards", "cards").view.cards == "auto"
+    full = replace(work, cards_fit=False)
+    assert act(full, "cards").view.cards == "full"
+    assert act(full, "cards", "cards").view.cards == "auto"

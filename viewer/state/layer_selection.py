@@ -1,0 +1,268 @@
+"""Which layers are selected, and what is done to all of them at once: strength, values, order, groups.
+
+The focused layer is always selected; `Workspace.selected` names the others beside it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+from msgspec import Meta
+
+from progdf.compose.layers import Gains
+from progdf.errors import ProgdfError
+from progdf.io.json_values import convert_json, decode_json, plain
+
+from . import layers as stack
+from .view_state import Blend, LayerState, Strength, ViewState
+from .workspace import Workspace
+
+PRESSES = ("one", "keep", "toggle", "range")
+"""What a press does to the selection: this card alone; alone unless among several; with Ctrl; with Shift."""
+
+
+def selected_layers(workspace: Workspace) -> tuple[int, ...]:
+    """Places of the selected layers in `view.layers`, the lowest first; none where none is focused."""
+    layers, focus = workspace.view.layers, workspace.focus
+    if focus is None:
+        return ()
+    return tuple(i for i, layer in enumerate(layers) if i == focus or layer.gdf in workspace.selected)
+
+
+def press(workspace: Workspace, argument: str) -> Workspace:
+    """The focus and the selection after a press on the card of a layer.
+
+    Args:
+        argument: `HOW:INDEX:LISTED`, of `PRESSES`; LISTED are the places of the layers that the panel lists,
+            with commas, as a range is of what one sees
+    """
+    how, at, listed = argument.split(":")
+    index, shown = int(at), [int(i) for i in listed.split(",") if i]
+    layers, focus = workspace.view.layers, workspace.focus
+    chosen = selected_layers(workspace)
+    if how == "range" and focus is not None:
+        low, high = sorted((focus, index))
+        return replace(workspace, selected=frozenset(layers[i].gdf for i in shown if low <= i <= high))
+    if how == "toggle" and index in chosen:
+        rest = [i for i in chosen if i != index]
+        if not rest:
+            return workspace
+        near = min(rest, key=lambda i: abs(i - index)) if focus == index else focus
+        return replace(workspace, focus=near, selected=frozenset(layers[i].gdf for i in rest))
+    if how == "toggle":
+        return replace(workspace, focus=index, selected=frozenset(layers[i].gdf for i in (*chosen, index)))
+    if how == "keep" and index in chosen:
+        return replace(workspace, focus=index, selected=frozenset(layers[i].gdf for i in chosen))
+    return replace(workspace, focus=index, selected=frozenset())
+
+
+def select_layers(workspace: Workspace, group: str = "") -> Workspace:
+    """All layers of a group selected, or all there are; the topmost is focused where none of them was."""
+    layers = workspace.view.layers
+    chosen = [i for i, layer in enumerate(layers) if not group or layer.group == group]
+    if not chosen:
+        return workspace
+    focus = workspace.focus if workspace.focus in chosen else chosen[-1]
+    return replace(workspace, focus=focus, selected=frozenset(layers[i].gdf for i in chosen))
+
+
+def master_strength(view: ViewState, chosen: Sequence[int]) -> float:
+    """Where the slider over several layers stands: at the strongest of those that are not locked."""
+    free = [view.layers[i].strength for i in chosen if not view.layers[i].locked]
+    return max(free, default=0.0)
+
+
+def set_master(workspace: Workspace, strength: float) -> Workspace:
+    """The strongest of the selected layers at this strength, the others in proportion; locked ones stay.
+
+    Proportions are those before the gesture, so that a drag over 0 and back loses nothing. Layers that were
+    all at 0 rise together.
+    """
+    chosen, view = selected_layers(workspace), workspace.view
+    upper = stack.largest_strength(view)
+    strength = min(upper, max(0.0, strength))
+    before = {layer.gdf: layer.strength for layer in workspace.past.present.edit.layers}
+    base = {i: before.get(view.layers[i].gdf, view.layers[i].strength) for i in chosen}
+    most = max((s for i, s in base.items() if not view.layers[i].locked), default=0.0)
+
+    def scale(index: int) -> float:
+        return strength if not most else min(upper, base[index] / most * strength)
+
+    return change_selected(
+        workspace, lambda i, layer: stack.with_slider_value(layer, "strength", scale(i), upper)
+    )
+
+
+def change_selected(workspace: Workspace, change: Callable[[int, LayerState], LayerState]) -> Workspace:
+    """Every selected layer changed."""
+    layers = list(workspace.view.layers)
+    for i in selected_layers(workspace):
+        layers[i] = change(i, layers[i])
+    return replace(workspace, view=replace(workspace.view, layers=tuple(layers)))
+
+
+def switch_selected(workspace: Workspace, name: str) -> Workspace:
+    """A switch of the focused layer turned, and that of all selected ones with it."""
+    if workspace.focus is None:
+        return workspace
+    on = not getattr(workspace.view.layers[workspace.focus], name)
+    changes: dict[str, Any] = {name: on}
+    return change_selected(workspace, lambda _, layer: replace(layer, **changes))
+
+
+def nudge(workspace: Workspace, by: float) -> Workspace:
+    """The slider that the arrow keys move a step further; several strengths in proportion."""
+    chosen, slider = selected_layers(workspace), workspace.active_slider
+    if len(chosen) > 1 and slider == "strength":
+        return set_master(workspace, round(master_strength(workspace.view, chosen) + by, 6))
+    view = workspace.view
+    for i in chosen:
+        view = stack.nudge(view, i, slider, by)
+    return replace(workspace, view=view)
+
+
+def reset(workspace: Workspace, everything: bool) -> Workspace:
+    """Strengths to 0 and gains to 1, of the selected layers, or of all with their groups; no locked ones."""
+
+    def default(_: int, layer: LayerState) -> LayerState:
+        return layer if layer.locked else replace(layer, strength=0.0, gains=Gains())
+
+    if not everything:
+        return change_selected(workspace, default)
+    view = workspace.view
+    layers = tuple(default(i, layer) for i, layer in enumerate(view.layers))
+    groups = tuple(replace(group, strength=1.0) for group in view.groups)
+    return replace(workspace, view=replace(view, layers=layers, groups=groups))
+
+
+def move(workspace: Workspace, by: int) -> Workspace:
+    """The selected layers up (−1) or down in the panel's list; the focus goes with them."""
+    chosen, view, focus = selected_layers(workspace), workspace.view, workspace.focus
+    if focus is None:
+        return workspace
+    if len(chosen) == 1:
+        to = max(0, min(focus - by, len(view.layers) - 1))
+        return replace(workspace, view=stack.move_layer(view, focus, to), focus=to)
+    names = {view.layers[i].name for i in chosen}
+    layers = list(view.layers)
+    for i in reversed(chosen) if by < 0 else chosen:
+        to = i - by
+        if 0 <= to < len(layers) and layers[to].name not in names:
+            layers[i], layers[to] = layers[to], layers[i]
+    loose = {layer.group for layer in layers if layer.name not in names} - {""}  # groups that stay behind
+    moved = tuple(
+        replace(layer, group="") if layer.name in names and layer.group in loose else layer
+        for layer in layers
+    )
+    return _with_focus(workspace, stack.tidy_groups(replace(view, layers=moved)))
+
+
+def remove(workspace: Workspace, index: str) -> Workspace:
+    """A layer, or all selected ones, taken out of the stack; the one below is focused."""
+    chosen = selected_layers(workspace)
+    at = int(index) if index else workspace.focus
+    if at is None or not 0 <= at < len(workspace.view.layers):
+        return workspace
+    view, gone = workspace.view, chosen if at in chosen else (at,)
+    for i in reversed(gone):
+        view = stack.remove_layer(view, i)
+    focus = max(gone[0] - 1, 0) if view.layers else None
+    return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None, overlap=None)
+
+
+@dataclass(frozen=True)
+class LayerValues:
+    """What is copied of a layer."""
+
+    name: str
+    strength: Strength
+    gains: Gains = Gains()
+
+
+@dataclass(frozen=True)
+class CopiedValues:
+    """What the clipboard holds, as JSON. `blend`: the rule of the stack they are from"""
+
+    layers: Annotated[tuple[LayerValues, ...], Meta(min_length=1)]
+    blend: Blend = "normalized"
+    progdf_values: Annotated[int, Meta(ge=1, le=1)] = 1
+
+
+def copy_values(workspace: Workspace) -> str:
+    """Strengths and gains of the selected layers as a text, "" where none is selected."""
+    view = workspace.view
+    chosen = tuple(view.layers[i] for i in selected_layers(workspace))
+    values = tuple(LayerValues(layer.name, layer.strength, layer.gains) for layer in chosen)
+    return json.dumps(plain(CopiedValues(values, view.blend)), ensure_ascii=False) if values else ""
+
+
+def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, int]:
+    """With what `copy_values` gave, and how many layers took it.
+
+    One layer's values go to all selected layers; those of several go by name, with the blend rule. Locked
+    layers stay.
+
+    Raises:
+        ProgdfError: the text holds something else, or no layer has its names.
+    """
+    try:
+        copied = convert_json(decode_json(text), CopiedValues, closed=True)
+    except ValueError:
+        raise ProgdfError("the clipboard holds no values of layers; copy some with Ctrl+C first") from None
+    view, upper = workspace.view, stack.largest_strength(workspace.view)
+    if len(copied.layers) == 1:
+        taken = {view.layers[i].name: copied.layers[0] for i in selected_layers(workspace)}
+    else:
+        taken = {values.name: values for values in copied.layers}
+        view = replace(view, blend=copied.blend)
+
+    def take(layer: LayerState) -> LayerState:
+        values = taken.get(layer.name)
+        if values is None or layer.locked:
+            return layer
+        return replace(layer, strength=min(upper, values.strength), gains=values.gains)
+
+    count = sum(layer.name in taken and not layer.locked for layer in view.layers)
+    if not count:
+        raise ProgdfError("no layer takes these values: none has their names, or those that do are locked")
+    return replace(workspace, view=replace(view, layers=tuple(map(take, view.layers)))), count
+
+
+def group(workspace: Workspace, name: str) -> Workspace:
+    """The selected layers as a new group, or at the bottom of the one of this name."""
+    view, chosen = workspace.view, selected_layers(workspace)
+    grouped = stack.move_to_group(view, chosen, name) if name else stack.group_layers(view, chosen)
+    return _with_focus(workspace, grouped)
+
+
+def ungroup(workspace: Workspace, name: str) -> Workspace:
+    """A group, or those of the selected layers, dissolved."""
+    view = workspace.view
+    names = {name} if name else {view.layers[i].group for i in selected_layers(workspace)}
+    return replace(workspace, view=stack.ungroup(view, names - {""}))
+
+
+def _with_focus(workspace: Workspace, view: ViewState) -> Workspace:
+    """Other layers, or in another order; the focus stays on its layer."""
+    focus = workspace.focus
+    if focus is not None:
+        name = workspace.view.layers[focus].name
+        focus = next((i for i, layer in enumerate(view.layers) if layer.name == name), None)
+    return replace(workspace, view=view, focus=focus)
+
+
+def filter_layers(view: ViewState, texts: Sequence[str], search: str) -> tuple[int, ...]:
+    """Places of the layers in which all words of a search are found.
+
+    Args:
+        texts: what is known of each edit besides, by `LayerState.gdf`: its region, what was asked for
+    """
+    words = search.casefold().split()
+    return tuple(
+        i
+        for i, layer in enumerate(view.layers)
+        if all(word in f"{layer.name} {layer.group} {texts[layer.gdf]}".casefold() for word in words)
+    )
