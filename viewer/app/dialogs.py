@@ -49,7 +49,7 @@ _HINTS = {
     "delivery": "{} is not finished. What is stopped now is not kept.",
     "log": "{}",
     "export": "A plain 3DGS .ply of what the sliders show, which any viewer opens.",
-    "render_picture": "This view at any size.",
+    "render_picture": "This view at any size; what stands at its upper and lower edge stays there.",
     "render_film": "It is rendered beside your work; the panel shows how far it is.",
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }

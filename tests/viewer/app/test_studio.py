@@ -164,16 +164,32 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     Trainer.ended = 0
     turn(window)
     assert window.main_view.work.deliveries == ()
+    Trainer.ended = None
+    press(window, "Ctrl+P")
+    (tmp_path / "bear_edited.png").touch()
+    press(window, "Enter")
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert asked.error == "bear_edited.png exists; give another name, or press again to replace it"
+    press(window, "Enter")
+    assert window.main_view.work.dialog is None
+    assert Trainer.said[0] == "render"
     press(window, "Ctrl+Shift+P")
     assert window.main_view.work.message is not None
     assert "nothing to move" in window.main_view.work.message.text
 
 
-def test_quitting_asks_while_something_is_written(window: application.App) -> None:
-    press(window, "Ctrl+E", "Enter", "Ctrl+Q")
+def test_quitting_asks_while_something_is_written(window: application.App, tmp_path: Path) -> None:
+    (tmp_path / "bear_edited.ply").touch()
+    press(window, "Ctrl+E", "Enter")
+    press(window, "Ctrl+E")
     asked = window.main_view.work.dialog
     assert asked is not None
-    assert (asked.kind, asked.text) == ("delivery", "Exporting bear_edited.ply")
+    assert asked.text == str(tmp_path / "bear_edited-3.ply"), "one is there, one is being written"
+    press(window, "Escape", "Ctrl+Q")
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert (asked.kind, asked.text) == ("delivery", "Exporting bear_edited-2.ply")
     press(window, "Enter")
     assert not window.is_closed
     press(window, "Ctrl+Q", "S")

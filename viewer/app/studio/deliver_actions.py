@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +34,7 @@ class DeliverActions:
         self._app = app
         self.deliveries = Deliveries()
         self._leaves = False
+        self._asked: dict[str, DeliverOptions] = {}  # the last of each kind, for the next
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
@@ -81,7 +82,7 @@ class DeliverActions:
         if document.path is None:
             raise ProgdfError("there is no scene yet; open one first")
         view = main_view.work.view
-        options = DeliverOptions()
+        options = self._asked.get(name, DeliverOptions())
         if name == "render_film":
             keys = ("timeline",) if len(view.timeline.keys) > 1 else ()
             moving = (*keys, *(layer.name for layer in reversed(view.layers)))
@@ -91,11 +92,13 @@ class DeliverActions:
                 )
             focus = main_view.work.focus
             chosen = moving[0] if keys or focus is None else view.layers[focus].name
-            fps = view.timeline.fps if keys else DeliverOptions.fps
-            options = replace(options, moves=chosen, can_move=moving, fps=fps, width=1280, height=720)
+            options = self._asked.get(name, DeliverOptions(width=1280, height=720))
+            fps = view.timeline.fps if keys else options.fps
+            options = replace(options, moves=chosen, can_move=moving, fps=fps)
         beside = document.path.resolve().parent
         folder = beside if takes_files(beside) else Path.cwd()
-        path = _free(folder / f"{document.path.stem}_edited{ASKS[name]}")
+        suffix = options.format if name == "render_film" else ASKS[name]
+        path = _free(folder / f"{document.path.stem}_edited{suffix}", self._written())
         main_view.ask(Dialog(name, str(path), options=options))
 
     def _deliver(self, kind: str) -> None:
@@ -114,6 +117,11 @@ class DeliverActions:
             out = out.with_name(out.name + suffix) if suffix else out
         if not out.parent.is_dir():
             raise ProgdfError(f"the folder {out.parent} does not exist; create it first")
+        if out in self._written():
+            raise ProgdfError(f"{out.name} is being written already; choose another name")
+        exists = f"{out.name} exists; give another name, or press again to replace it"
+        if out.exists() and asked.error != exists:
+            raise ProgdfError(exists)
         view = self._app.main_view.work.view
         if kind == "render_film" and options.moves != "timeline":
             view = _slider_film(view, options)
@@ -127,6 +135,11 @@ class DeliverActions:
             "render_film": ["render", stack, f"--out={out}", size, f"--timeline={stack}"],
         }
         self.deliveries.start(f"{_TITLES[kind]} {out.name}", out, words[kind])
+        self._asked[kind] = options
+
+    def _written(self) -> set[Path]:
+        """What is being written just now."""
+        return {shown.out for shown in self.deliveries.shown if shown.status in ("running", "stopping")}
 
     def _save_stack(self, view: ViewState) -> str:
         """A session of what the window shows, for a command; without the comparison."""
@@ -157,9 +170,9 @@ def _slider_film(view: ViewState, options: DeliverOptions) -> ViewState:
     return replace(view, timeline=Timeline(keys, length, options.fps, ping_pong=True))
 
 
-def _free(path: Path) -> Path:
-    """The path, or one with a number where something has its name."""
+def _free(path: Path, taken: Container[Path]) -> Path:
+    """The path, or one with a number where something has its name, or will have."""
     free, number = path, 2
-    while free.exists():
+    while free.exists() or free in taken:
         free, number = path.with_stem(f"{path.stem}-{number}"), number + 1
     return free

@@ -11,7 +11,7 @@ from viewer.jobs.delivery import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptio
 from viewer.ui.context import UiContext
 from viewer.ui.widgets import choice, label, tip
 
-COLUMN_PX = 84.0
+COLUMN_PX = 100.0
 _LARGEST = 16_384
 
 
