@@ -129,7 +129,7 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     """(sign, part) for each part of a spec, the first one with '+'; a step's sign is '|'."""
     words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
     bare = "|".join(("all", *BARE))
-    part, step = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])", rf"(?:{steps})(?::[0-9]+)?\s*(?:$|[+&|-])"
+    part, step = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])", rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
     joint = re.compile(rf"\s*([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))\s*")
     pieces = joint.split(spec.strip())
     if not all(pieces[0::2]):

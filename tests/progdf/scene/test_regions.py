@@ -195,6 +195,7 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("color:#ff0000,2", "tolerance"),
         ("flood:1,2", "write flood:x,y,z"),
         ("all|grow:1000", "no step of a region"),
+        ("sphere:0,0,0,1|grow:-3", "'grow:-3' is no step of a region"),
         ("all|largest:2", "no step of a region"),
     ],
 )
