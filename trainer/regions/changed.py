@@ -21,6 +21,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
+from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from trainer.editors.pictures import mend_background, transmittance
 from trainer.store.images import read_picture
@@ -40,7 +41,8 @@ _CHANGED = 0.05  # of color: more differs than noise, JPEG and another renderer 
 _SPECK, _GAP = 2, 5  # pixels: what is narrower is none; what is wider than a gap is not closed
 _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
 _LEAST = 0.5  # of a member's visible share lies where the pictures differ
-_PIECE = 0.03  # of the largest connected piece: smaller ones are strays
+_RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thinner
+_INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
 
 
 def changed_region(
@@ -72,7 +74,7 @@ def changed_region(
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
     found = lift_masks(scene, small, masks, "changed", "share", least)
-    region = _largest_pieces(scene, found)
+    region = _drop_strays(scene, found, small, masks)
     if not len(region):
         raise ProgdfError(
             "no Gaussian lies mostly where the pictures differ; change more, or name the region with --region"
@@ -82,7 +84,7 @@ def changed_region(
         strays = len(found) - len(region)
         say(
             f"changed: {share:.1%} of the pictures differ, which {format_count(len(region))} show"
-            + (f"; {format_count(strays)} in small pieces left out" if strays else "")
+            + (f"; {format_count(strays)} along its rim left out" if strays else "")
         )
     return region
 
@@ -128,13 +130,27 @@ def _moved(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
     return moved
 
 
-def _largest_pieces(scene: Gaussians, region: Region) -> Region:
-    """The region without pieces that are small beside its largest."""
+def _drop_strays(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], masks: Sequence[Tensor]
+) -> Region:
+    """The region without connected pieces that show along the rim of what changed, and nowhere else."""
     if not len(region):
         return region
-    piece = connected_pieces(scene.means[region.members])
-    sizes = np.bincount(piece)
-    kept = torch.from_numpy((sizes >= _PIECE * sizes.max())[piece])
+    sums = torch.zeros(len(region), 4, dtype=torch.float64)
+    for camera, mask in zip(cameras, masks, strict=True):
+        sums += alpha_weights(scene, camera, _within_rim(mask))[region.members]
+    piece = connected_pieces(scene[region.members])
+    inside, shown = (np.bincount(piece, sums[:, column].numpy()) for column in (0, 2))
+    kept = (inside > _INNER * shown) | (inside == inside.max())
+    kept = torch.from_numpy(kept[piece])
     score = region.score.clone()
     score[region.members[~kept]] = 0.0
     return Region(region.name, region.members[kept], score)
+
+
+def _within_rim(mask: Tensor) -> Tensor:
+    """The pixels of a mask that do not lie along its rim. [H,W] bool -> [H,W] bool"""
+    depth = ndimage.distance_transform_edt(mask.numpy())
+    pieces, count = ndimage.label(mask.numpy())
+    deepest = ndimage.maximum(depth, pieces, np.arange(count + 1))
+    return torch.from_numpy(depth > np.minimum(_RIM, 0.5 * np.asarray(deepest))[pieces])

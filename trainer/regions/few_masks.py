@@ -21,8 +21,9 @@ from progdf.scene.neighbors import nearest_rows
 FEW = 8
 """Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""
 
-_LINKS, _REACH = 8, 2.5
-"""A member is linked to its 8 nearest that are nearer than 2.5 times what is usual for the eighth."""
+_LINKS, _REACH, _WIDE = 8, 2.5, 2.0
+"""A member is linked to those of its 8 nearest that are nearer than 2.5 times what is usual for the eighth,
+or whose 2 σ touch its own: flat surfaces are of few, large Gaussians."""
 
 _PIECE = 0.1
 """Of the largest connected surface: smaller ones are strays."""
@@ -59,7 +60,7 @@ def drop_strays(
     if not bool(twice.any()):
         return twice
     rows = twice.nonzero()[:, 0]
-    piece = connected_pieces(scene.means[rows])
+    piece = connected_pieces(scene[rows])
     sizes = np.bincount(piece)
     # what two masks hold counts, not what one view alone shows: a tree may be larger than the bear
     sure = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
@@ -105,13 +106,15 @@ def find_holes(
     return holes
 
 
-def connected_pieces(points: Tensor) -> np.ndarray:
-    """Which connected piece each point belongs to. [P,3] -> [P] int"""
-    count = len(points)
+def connected_pieces(gaussians: Gaussians) -> np.ndarray:
+    """Which connected piece each of P Gaussians belongs to. [P] int"""
+    count = len(gaussians)
     if count < 2:
         return np.zeros(count, np.int64)
-    near, apart = nearest_rows(points, torch.arange(count), _LINKS)
+    near, apart = nearest_rows(gaussians.means, torch.arange(count), _LINKS)
+    width = gaussians.scales.median(dim=1).values
     linked = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
+    linked |= apart <= _WIDE * (width[:, None] + width[near])
     first, second = torch.arange(count)[:, None].expand_as(near)[linked], near[linked]
     links = coo_matrix((np.ones(len(first), np.bool_), (first.numpy(), second.numpy())), (count, count))
     pieces: np.ndarray = connected_components(links, directed=False)[1]

@@ -8,7 +8,7 @@ import torch
 
 from progdf.gaussians import Gaussians
 from tests.helpers.scenes import random_gaussians
-from trainer.regions.few_masks import drop_strays, find_holes
+from trainer.regions.few_masks import connected_pieces, drop_strays, find_holes
 
 
 def grids(*places: tuple[float, int]) -> Gaussians:
@@ -66,3 +66,13 @@ def test_no_member_at_all_stays_none() -> None:
     nobody, views = torch.zeros(16, dtype=torch.bool), torch.zeros(16)
     assert not bool(drop_strays(scene, nobody, views, views).any())
     assert not len(find_holes(scene, nobody, views))
+
+
+def test_large_gaussians_that_touch_are_one_piece_beside_many_small_ones() -> None:
+    scene = grids((0.0, 10), (9.0, 30))
+    small = torch.arange(1000) >= 100
+    means = torch.where(small[:, None], scene.means * torch.tensor([0.01, 0.01, 1.0]), scene.means)
+    widths = torch.where(small, 0.0005, 0.05).log()[:, None].expand(1000, 3)
+    pieces = connected_pieces(replace(scene, means=means, log_scales=widths))
+    assert len(set(pieces[:100].tolist())) == len(set(pieces[100:].tolist())) == 1
+    assert pieces[0] != pieces[-1]
