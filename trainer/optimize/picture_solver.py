@@ -4,8 +4,9 @@ A few pictures leave most members undecided: a pixel is a mixture of many, some 
 no picture shows has no pixel at all. Least squares alone spreads the change over all of them. So neighbors on
 one surface are tied (a graph Laplacian over `surface_likeness`): they change alike where the pictures do not
 tell them apart, and a change travels along its surface to where no picture looks. A member behind others is
-not asked by the pixels through which it hardly shines. Colors change with the view as the paint that explains
-the edit says (`trainer.optimize.paint`), which one view cannot tell.
+not asked by the pixels through which it hardly shines. No color leaves what can be shown: sharper edges than
+the members can have would be bought with colors that shine from everywhere else. Colors change with the view
+as the paint that explains the edit says (`trainer.optimize.paint`), which one view cannot tell.
 """
 
 from __future__ import annotations
@@ -42,7 +43,15 @@ _TIES = 0.01
 _RIDGE = 1e-5
 """The same for being what the paint says, or as they were."""
 
-_ROUNDS, _STEPS, _EXACT = 4, 120, 1e-3
+_WEAKEST_TIE = 5e-3  # of all of a member's: most of its neighbors are hardly alike
+
+_BRIGHTEST = 0.99
+"""Quantile of the members' own channels which no member becomes brighter than, if it is above 1."""
+
+_PAINTS, _ROUNDS, _GAIN = 3, 12, 2e-3
+"""How often the paint is fitted; rounds of descent each time, until one gains less than this share."""
+
+_STEPS, _EXACT, _SHORTEST = 15, 1e-2, 0.05  # of conjugate gradients; of a round's way
 
 
 @dataclass(frozen=True)
@@ -79,18 +88,14 @@ class PictureSolver:
         """
         change, bands = start[:, 0].double() * C0, start[:, 1:].double()
         prior = torch.zeros_like(change)
-        for _ in range(_ROUNDS):
-            asked = self._gradient(self._offsets(change, bands), targets)
-            held = change - prior
-            change = change - self._conjugate_gradients(asked + self._tie(held))
+        for _ in range(_PAINTS):
+            change = self._descend(change, bands, prior, targets)
             paint = fit_paint(self.colors, change, self.shown)
             # where one function of color is the edit, what no picture shows follows it too
             prior = paint.full if paint.whole else torch.zeros_like(change)
             amounts = paint.trust * paint.amounts
             bands = amounts[:, None, None] * (self.bands @ paint.slope)
-        asked = self._gradient(self._offsets(change, bands), targets)
-        change = change - self._conjugate_gradients(asked + self._tie(change - prior))
-        return self._offsets(change, bands)
+        return self._offsets(self._descend(change, bands, prior, targets), bands)
 
     def left(self, offsets: Tensor, targets: Sequence[Tensor]) -> tuple[float, float]:
         """Mean squared and mean absolute difference from the targets."""
@@ -105,37 +110,84 @@ class PictureSolver:
     def _offsets(self, change: Tensor, bands: Tensor) -> Tensor:
         return torch.cat([change[:, None] / C0, bands], dim=1).float()
 
-    def _gradient(self, offsets: Tensor, targets: Sequence[Tensor]) -> Tensor:
-        """Of half the squared error, in the members' colors, pixels pulling back into range. [M,3] float64"""
-        total = torch.zeros(len(self.shown), 3, dtype=torch.float64)
+    def _descend(self, change: Tensor, bands: Tensor, prior: Tensor, targets: Sequence[Tensor]) -> Tensor:
+        """Projected Newton steps (Bertsekas 1982) to the change of color that fits best. [M,3] float64"""
+        low, high = self._limits()
+        change = change.clamp(low, high)
+        error, apart, free = self._look(change, bands, prior, targets)
+        for _ in range(_ROUNDS):
+            gradient = self._transpose(apart) + self._tie(change - prior)
+            held = ((change <= low) & (gradient > 0.0)) | ((change >= high) & (gradient < 0.0))
+            way = self._conjugate_gradients(gradient, ~held, free)
+            length, before = 1.0, error
+            while length > _SHORTEST:
+                tried = (change - length * way).clamp(low, high)
+                error, apart, free = self._look(tried, bands, prior, targets)
+                if error < before:
+                    change = tried
+                    break
+                length *= 0.5
+            if error > (1.0 - _GAIN) * before:
+                break
+        return change
+
+    def _limits(self) -> tuple[Tensor, Tensor]:
+        """How far the members' colors may change. [M,3] each"""
+        most = max(1.0, float(np.quantile(self.colors.numpy(), _BRIGHTEST)))
+        low, high = self.colors.clamp_max(0.0) - self.colors, self.colors.clamp_min(most) - self.colors
+        shown = (self.shown > 0)[:, None]  # the others shine in no picture
+        return torch.where(shown, low, -math.inf), torch.where(shown, high, math.inf)
+
+    def _look(
+        self, change: Tensor, bands: Tensor, prior: Tensor, targets: Sequence[Tensor]
+    ) -> tuple[float, list[Tensor], list[Tensor]]:
+        """What a change of color leaves: half the squared error with what the ties add to it; of each picture
+        the differences, and the channels in which it is not stuck at black or white. [h,w,3] each"""
+        differences, free = [], []
+        offsets = self._offsets(change, bands)
         for view, target in zip(self.views, targets, strict=True):
             rendered = view.picture(view.colors(offsets))
             apart = rendered.clamp(0.0, 1.0) - target
-            passed = ((rendered >= 0.0) | (apart < 0.0)) & ((rendered <= 1.0) | (apart > 0.0))
-            total += view.map.gradient(apart * passed)
+            # a clamp passes what leads back into range
+            free.append(((rendered >= 0.0) | (apart < 0.0)) & ((rendered <= 1.0) | (apart > 0.0)))
+            differences.append(apart)
+        held = change - prior
+        error = sum(float(apart.square().sum()) for apart in differences)
+        masked = [apart * passed for apart, passed in zip(differences, free, strict=True)]
+        return 0.5 * (error + float((held * self._tie(held)).sum())), masked, free
+
+    def _transpose(self, images: Sequence[Tensor]) -> Tensor:
+        """Of images of all views, in the colors of the members that are shown. [M,3] float64"""
+        total = torch.zeros(len(self.shown), 3, dtype=torch.float64)
+        for view, image in zip(self.views, images, strict=True):
+            total += view.map.gradient(image)
         return total * (self.shown > 0)[:, None]
 
     def _tie(self, x: Tensor) -> Tensor:
         return torch.from_numpy(self.ties @ x.numpy()) + self.ridge * x
 
-    def _apply(self, x: Tensor) -> Tensor:
-        asked = (self.shown > 0)[:, None]
-        total = torch.zeros_like(x)
-        for view in self.views:
-            total += view.map.gradient(view.map.picture(x * asked))
-        return total * asked + self._tie(x)
+    def _conjugate_gradients(self, b: Tensor, rows: Tensor, free: Sequence[Tensor]) -> Tensor:
+        """Nearly the solution x of H x = b, channel by channel, 0 but where `rows` is set. [M,3]
 
-    def _conjugate_gradients(self, b: Tensor) -> Tensor:
-        """The solution x of `_apply(x)` = b, channel by channel, to `_EXACT` of b. [M,3]"""
+        Args:
+            b: [M,3]
+            rows: [M,3] bool
+            free: channels that count, of each view. [h,w,3] bool
+        """
+        asked = (self.shown > 0)[:, None]
         diagonal = (self.shown + torch.from_numpy(self.ties.diagonal()) + self.ridge)[:, None]
-        x, r = torch.zeros_like(b), b.clone()
+        x, r = torch.zeros_like(b), b * rows
         z = r / diagonal
         p, rz = z.clone(), (r * z).sum(dim=0)
         enough = _EXACT**2 * rz
         for _ in range(_STEPS):
             if bool((rz <= enough).all()):
                 break
-            applied = self._apply(p)
+            shown = p * asked
+            pictures = [
+                view.map.picture(shown) * passed for view, passed in zip(self.views, free, strict=True)
+            ]
+            applied = rows * (self._transpose(pictures) + self._tie(p))
             length = rz / (p * applied).sum(dim=0).clamp_min(1e-300)
             x, r = x + length * p, r - length * applied
             z = r / diagonal
@@ -260,7 +312,8 @@ def _laplacian(region: Gaussians) -> csr_matrix:
     if count < 3:
         return csr_matrix((count, count))
     near, likeness = surface_likeness(region, torch.arange(count))
-    rows = np.repeat(np.arange(count), near.shape[1])
-    ties = csr_matrix((likeness.double().numpy().ravel(), (rows, near.numpy().ravel())), (count, count))
+    kept = (likeness >= _WEAKEST_TIE).numpy()
+    rows = np.repeat(np.arange(count), kept.sum(axis=1))
+    ties = csr_matrix((likeness.double().numpy()[kept], (rows, near.numpy()[kept])), (count, count))
     ties = 0.5 * (ties + ties.T)
     return csr_matrix(diags(np.asarray(ties.sum(axis=1)).ravel()) - ties)
