@@ -17,6 +17,7 @@ from viewer.ui.widgets import elide, section, tip
 KEYS = ("open", "quit", "full_screen", "window_picture", "help", "unfocus", "about")
 """Actions of keys that mean something here."""
 CARD_PX, GAP_PX, MARGIN_PX, DROP_PX = 168.0, 16.0, 28.0, 84.0
+ROW_GAP_PX = 8.0
 WIDEST_PX = 4 * CARD_PX + 3 * GAP_PX
 
 
@@ -88,6 +89,8 @@ def _grid(recent: Sequence[RecentFile], cards: int, ui: UiContext) -> list[str]:
     for i, file in enumerate(recent):
         if i % cards:
             imgui.same_line(0.0, GAP_PX * ui.scale)
+        elif i:
+            imgui.dummy(imgui.ImVec2(0.0, ROW_GAP_PX * ui.scale))
         imgui.push_id(i)
         if _card(file, ui):
             actions.append(f"open_file:{file.path}")
@@ -108,6 +111,10 @@ def _card(file: RecentFile, ui: UiContext) -> bool:
     if file.texture:
         zero, one, white = imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0), u32((1.0, 1.0, 1.0, 1.0))
         canvas.add_image_rounded(imgui.ImTextureRef(file.texture), at, end, zero, one, white, rounding)
+    else:
+        size = imgui.calc_text_size(Icon.PICTURE)
+        middle = imgui.ImVec2(round(at.x + (wide - size.x) / 2), round(at.y + (tall - size.y) / 2))
+        canvas.add_text(middle, u32(PALETTE.field_hovered), Icon.PICTURE)
     if hovered:
         canvas.add_rect(at, end, u32(PALETTE.accent), rounding, 2.0 * ui.scale)
     name = file.path.name.removesuffix(SUFFIX) if file.path.name.endswith(SUFFIX) else file.path.name
@@ -157,7 +164,7 @@ def _rows(recent: Sequence[RecentFile], cards: int) -> int:
 
 
 def _card_height(ui: UiContext) -> float:
-    return (0.75 * CARD_PX + 46.0) * ui.scale
+    return (0.75 * CARD_PX + 46.0 + ROW_GAP_PX) * ui.scale
 
 
 _WHOLE = (
