@@ -37,7 +37,7 @@ def full_view() -> ViewState:
     film = Timeline((Keyframe(3, ((0, 0.5),), camera, "linear"),), length=30)
     compare = Comparison("split", 0.3, 8.0)
     view = replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
-    groups = (LayerGroup("warm", enabled=False, strength=0.5),)
+    groups = (LayerGroup("warm", strength=0.5),)
     pair = SnapshotPair("original", "1", 0.25)
     return replace(view, groups=groups, collapsed=("warm",), cards="compact", pair=pair)
 

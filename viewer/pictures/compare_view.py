@@ -166,7 +166,8 @@ class Comparer:
     def _other_view(self, view: ViewState) -> ViewState:
         """What the other side of `view` shows."""
         if self.sides is not None:
-            return replace(view, layers=self.sides.left.layers, blend=self.sides.left.blend)
+            left = self.sides.left
+            return replace(view, layers=left.layers, groups=left.groups, blend=left.blend)
         recorded = self.against(view) == "recorded"
         return recordings.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
 

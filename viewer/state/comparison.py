@@ -33,7 +33,7 @@ def toggle_snapshots(view: ViewState) -> ViewState:
 
 def end_at_edit(before: ViewState, view: ViewState) -> ViewState:
     """No comparison of snapshots any more where layers have changed: one shall see what one does."""
-    edited = (view.layers, view.blend) != (before.layers, before.blend)
+    edited = (view.layers, view.groups, view.blend) != (before.layers, before.groups, before.blend)
     compare = view.compare
     if not edited or compare.mode == "off" or compare.against != "snapshots":
         return view

@@ -176,7 +176,7 @@ def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
 
 def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
     layers = tuple(LayerState(i % 2, f"layer {i}", 0.5) for i in range(9))
-    with rig(replace(first_view(bear()), layers=layers)) as hand:
+    with rig(replace(first_view(bear()), layers=layers, cards="full")) as hand:
         hand.key("9")
         hand.frame(5)
         accent = np.round(np.array(PALETTE.accent[:3]) * 255)

@@ -85,7 +85,7 @@ def test_an_export_says_which_layers_of_the_session_are_in_it(
 ) -> None:
     saved(here, full_view())
     assert run("export", "work.session.json", "-o", "edited.ply") == 0
-    assert "ears → gold 0.75; read back" in capsys.readouterr().out
+    assert "ears → gold 0.375; read back" in capsys.readouterr().out
 
 
 def test_a_strength_said_beside_the_session_wins_under_the_layers_name_or_its_edits(here: Path) -> None:
