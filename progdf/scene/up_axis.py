@@ -44,10 +44,12 @@ class UpAxis:
     Args:
         direction: in the world, unit length. [3] float32
         reason: for a person, as "the cameras"
+        certain: something in the scene or a person tells; else it is only what most scenes have
     """
 
     direction: Tensor
     reason: str
+    certain: bool = True
 
     @property
     def name(self) -> str:
@@ -89,7 +91,8 @@ def find_up(scene: Gaussians, cameras: Sequence[Camera] = (), asked: str = "auto
             return UpAxis(direction, "as the cameras are held")
     if (ground := _ground_axis(scene, CONVENTION)) is not None:
         return UpAxis(axis_direction(ground), "a ground lies across it")
-    return UpAxis(axis_direction(CONVENTION), "by convention, as no ground tells; --up says otherwise")
+    why = "by convention, as no ground tells; --up says otherwise"
+    return UpAxis(axis_direction(CONVENTION), why, certain=False)
 
 
 def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:

@@ -8,11 +8,13 @@ import sys
 from .paths import ROOT
 
 _CODE = """
+import numpy
 import torch
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
 from progdf.rasterize.color_maps import color_map
+from progdf.rasterize.lines import lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball, front_camera
 
@@ -24,6 +26,10 @@ for antialiased in (False, True):
     render(gaussians, camera).image.sum().backward()
     render(gaussians, camera, grad_rows=torch.arange(5)).image.sum().backward()
 alpha_weights(scene, camera, torch.ones(camera.height, camera.width))
+picture = render(scene, camera)
+lines = numpy.zeros((0, 14), numpy.float32)
+with lines_behind(picture.image.numpy(), picture.transmittance.numpy(), lines, 0.5):
+    pass
 rows = some_rows(scene, 20)
 weighed = color_map(activate(scene), camera, (0, 0, camera.width, camera.height), rows)
 weighed.gradient(weighed.picture(torch.ones(20, 3)))

@@ -22,6 +22,7 @@ from .studio.deliver_actions import DeliverActions
 from .studio.preview_actions import PreviewActions
 from .studio.start_actions import StartActions
 from .studio.training_actions import TrainingActions
+from .studio.up_actions import UpActions
 
 SIZE = (1280, 800)
 
@@ -93,6 +94,7 @@ class App:
         self.training = TrainingActions(self, memory)
         self.deliver = DeliverActions(self)
         self.start = StartActions(self, self.context, self.deliver.deliveries, memory)
+        self.up = UpActions(self, self.context, memory)
         self.preview = PreviewActions(
             self, self.context, lambda form, folder: self.training.region_spec(form, folder, "preview")
         )
@@ -108,6 +110,7 @@ class App:
         self.deliver.close()
         self.start.close()
         self.preview.close()
+        self.up.close()
         self.training.close()
         self.file_actions.release()
         self.main_view.ui.make_current()
@@ -151,7 +154,7 @@ class App:
         for request in self.main_view.take_requests():
             if request == "full_screen":
                 self.window.toggle_full_screen()
-            elif not any(part.handle(request) for part in (self.training, self.deliver, self.start)):
+            elif not any(part.handle(request) for part in (self.training, self.deliver, self.start, self.up)):
                 self.file_actions.handle(request)
 
     def _wait_times(self) -> tuple[float | None, ...]:
@@ -161,6 +164,7 @@ class App:
         return (
             self.file_actions.poll_dialog(),
             *looks,
+            self.up.poll(self.file_actions.path, self.engine),
             self.main_view.next_frame_delay(),
             self.file_actions.autosave(time.perf_counter()),
         )

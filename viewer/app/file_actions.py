@@ -11,11 +11,10 @@ from pathlib import Path
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from viewer.camera.up_axis import up_of
 from viewer.camera.view_camera import first_camera
 from viewer.files import autosave as autosaves
 from viewer.files import document as documents
-from viewer.files import recent, regions, session
+from viewer.files import known_ups, recent, regions, session
 from viewer.files.autosave import SessionAutosave
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path, session_file
@@ -236,7 +235,7 @@ class FileActions:
         self._app.show(opened)
         self.path = None
         main_view = self._app.main_view
-        camera = first_camera(opened.scene, up=up_of(opened.scene, path=path))
+        camera = first_camera(opened.scene, up=known_ups.up_of(opened, self._memory))
         main_view.restart(replace(main_view.work.view, camera=camera, layers=(), timeline=Timeline()))
         self.offer_autosave()
 

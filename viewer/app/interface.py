@@ -22,6 +22,8 @@ from viewer.ui.pointer import PointerContext
 
 from . import bindings, compare_overlay, dialogs, mouse
 from .mouse import MouseTool
+from .studio import up_strip
+from .studio.up_strip import UpStrip
 
 
 def panels(
@@ -97,6 +99,7 @@ def over_picture(
     said: Labels,
     figures: Sequence[tuple[str, str]],
     original: bool,
+    strip: UpStrip | None = None,
 ) -> Workspace:
     """The brush, the comparison, timings, bindings and the message, which leaves when its time is over.
 
@@ -105,6 +108,7 @@ def over_picture(
         said: over the comparison on screen
         figures: of the table of timings
         original: the key that shows it is held
+        strip: asks which way is up
     """
     area, ui, view = pointer.area, pointer.ui, work.view
     io = imgui.get_io()
@@ -120,9 +124,13 @@ def over_picture(
     if view.overlay:
         overlay.table(figures, ui)
     closed, free = False, imgui.get_io().display_size
+    bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
+    above = replace(area, height=area.height - bar)
+    if strip is not None:
+        work = replace(work, requests=(*work.requests, *up_strip.draw(strip, above, ui)))
+        above = replace(above, height=above.height - up_strip.height(strip, area, ui))
     if work.message is not None:
-        bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
-        closed, top = overlay.message(work.message, replace(area, height=area.height - bar), ui)
+        closed, top = overlay.message(work.message, above, ui)
         closed, free = closed or pointer.now >= work.message.until, imgui.ImVec2(free.x, top)
     if work.help:
         bindings.draw(free, ui)

@@ -42,6 +42,7 @@ from .mouse import MouseTool
 from .pending_keys import PendingKeys
 from .studio import cover, start_page
 from .studio.cover import Cover
+from .studio.up_strip import UpStrip
 
 FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
 
@@ -71,6 +72,7 @@ class MainView:
         self.canvas = Canvas(context, engine, facts.recordings)
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
         self.recent_files: tuple[start_page.RecentFile, ...] = ()  # those of the start page
+        self.up_strip: UpStrip | None = None  # asks which way is up
         self.cover: Cover | None = None  # what lies over the picture
         self.preview_said = ("", False)  # of the picture of a new edit, and whether it failed
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
@@ -233,6 +235,9 @@ class MainView:
         )
         self._tool = replace(self._tool, gesture=gesture)
         asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+        if self.up_strip is not None and not asks and any(p.chord == "Escape" for p in self._keys.pressed):
+            self._keys = replace(self._keys, pressed=())
+            self.request("keep_up")
         flies = self.work.view.camera.mode == "fly"
         self._taps, tapped = inputs.tapped_actions(self._taps, self._keys, self._clock, flies)
         self._keys = self._taps.without(self._keys)
@@ -307,7 +312,9 @@ class MainView:
             cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         said = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
-        self.work = interface.over_picture(self.work, pointer, self._tool, said, figures, original)
+        self.work = interface.over_picture(
+            self.work, pointer, self._tool, said, figures, original, self.up_strip
+        )
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()

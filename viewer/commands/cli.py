@@ -17,6 +17,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.io.atomic import atomic_write
 from progdf.terminal import print_line
 from viewer.camera.view_camera import first_camera
+from viewer.files import known_ups
 from viewer.files.document import empty
 from viewer.render.threads import one_thread
 from viewer.state.layers import visible_layers
@@ -38,9 +39,10 @@ def view(argv: Sequence[str]) -> int:
     )
     from viewer.app.app import run  # imgui and glfw, which render and export do without
 
-    state = found.view
+    state = found.view if found.session is not None else replace(found.view, grid=True)
     if found.session is None and options.scene != NO_SCENE:
-        state = replace(state, camera=first_camera(found.document.scene, up=found.up))
+        up = known_ups.up_of(found.document) if options.up == "auto" else found.up
+        state = replace(state, camera=first_camera(found.document.scene, up=up))
     return run(
         found.document,
         state,

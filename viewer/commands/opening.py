@@ -47,7 +47,7 @@ class OpenStack:
     def up(self) -> Vec3:
         """The direction that is up in the scene."""
         opened = self.document
-        return up_of(opened.scene, opened.gdfs, opened.path, self.asked_up)
+        return up_of(opened.scene, opened.gdfs, self.asked_up)
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import torch
@@ -14,6 +14,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.scene.neighborhood import Neighborhood
 from progdf.terminal import escape_text
+from viewer.camera.up_axis import SceneUp, find_scene_up
 from viewer.camera.view_camera import bounds_of, first_camera, fit, fit_all
 from viewer.render.threads import all_threads
 from viewer.state.layer_facts import layer_rows
@@ -38,6 +39,11 @@ class Document:
     gdfs: tuple[Gdf, ...] = ()
     path: Path | None = None
     gdf_paths: tuple[Path, ...] = ()
+
+    @cached_property
+    def found_up(self) -> SceneUp:
+        """Which way is up, as the scene and its edits tell."""
+        return find_scene_up(self.scene, self.gdfs)
 
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""

@@ -52,6 +52,10 @@ PROJECTED = np.dtype([("center", "<f4", 2), ("shape", "<f4", 3), ("r2", "<f4"), 
 ORDER = np.dtype("<u4")
 """One row index of the scene, in drawing order; `splat` in shaders/project.vert."""
 
+GRID_LINE = np.dtype([("ends", "<f4", 4), ("depths", "<f4", 2), ("cells", "<f4", 4), ("color", "<f4", 4)])
+"""A line of the grid on the ground: both ends in pixels of the picture, their depths, where they lie in the
+grid (at 1 it has faded), and its color with the share that it takes; read by shaders/grid.vert."""
+
 TARGETS = (*SPLAT_TEXTURES, "shN")
 """The textures that the edit pass writes, as include/edit_layers.glsl counts them."""
 

@@ -18,6 +18,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, Crop, render
 from progdf.rasterize.cpu.parallel import stopped_by
+from progdf.rasterize.lines import lines_behind
 from progdf.rasterize.pixel_cells import area, dirty_rectangles, mark_cells, no_cells
 from progdf.rasterize.simplification import simplify
 from progdf.sh import C0
@@ -26,6 +27,7 @@ from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.present import Presenter
 from viewer.gl.scene_textures import row_runs
 
+from .ground_grid import CLEAR, Lines
 from .highlight import HIDDEN
 
 Image = NDArray[np.float32]
@@ -115,8 +117,7 @@ class CpuRenderer:
         self._texture: moderngl.Texture | None = None
         self._stale: list[Crop] | None = None  # where the texture is behind the picture; None is everywhere
         self._kept: _Kept | None = None
-        self._coverage: moderngl.Texture | None = None
-        self._covers = False  # whether that is of the picture
+        self._grid: Lines | None = None  # what the texture shows of it
         self._lent = False  # whether the picture's array is in other hands
         self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
@@ -207,7 +208,7 @@ class CpuRenderer:
                 kept, self._lent = replace(kept, image=kept.image.copy()), False
             for (x0, y0, x1, y1), (image, through) in zip(crops, parts, strict=True):
                 kept.image[y0:y1, x0:x1], kept.through[y0:y1, x0:x1] = image, through
-            self._kept, self._covers = kept, False
+            self._kept = kept
             self._stale = None if self._stale is None else [*self._stale, *crops]
         if kept is None:
             self._last = None
@@ -246,54 +247,52 @@ class CpuRenderer:
         self._lent = True
         return self._picture().image
 
-    def coverage(self) -> moderngl.Texture:
-        """See `Renderer.coverage`."""
-        assert self._ctx is not None, "nothing to show on without a context"
-        through = self._picture().through
-        size = (through.shape[1], through.shape[0])
-        if self._coverage is None or self._coverage.size != size:
-            if self._coverage is not None:
-                self._coverage.release()
-            self._coverage, self._covers = self._ctx.texture(size, 1, dtype="f4"), False
-            self._coverage.swizzle = "000R"
-        if not self._covers:
-            self._coverage.write(1.0 - through)
-            self._covers = True
-        return self._coverage
-
     def show(
-        self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None, left: int = 0
+        self,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int] | None = None,
+        left: int = 0,
+        grid: Lines | None = None,
     ) -> None:
         """See `Renderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
         assert self._presenter is not None
-        image = self._picture().image
+        kept, image = self._picture(), self._picture().image
         pixels = (image.shape[1], image.shape[0])
         if self._texture is None or self._texture.size != pixels:
             if self._texture is not None:
                 self._texture.release()
             self._texture, self._stale = self._ctx.texture(pixels, 3, dtype="f4"), None
-        if self._stale is None:
-            self._texture.write(image)
-        else:
-            for x0, y0, x1, y1 in self._stale:
-                part = np.ascontiguousarray(image[y0:y1, x0:x1])
-                self._texture.write(part, viewport=(x0, y0, x1 - x0, y1 - y0))
-        self._stale = []
+        if grid is not self._grid:
+            self._grid, self._stale = grid, None
+        if grid is None or self._stale == []:
+            self._send(self._texture, image)
+        else:  # cheaper than another picture, or another pass of software GL
+            lines = grid.view(np.float32).reshape(len(grid), -1)
+            with lines_behind(image, kept.through, lines, CLEAR):
+                self._send(self._texture, image)
         self._presenter.show(self._texture, framebuffer, size, left)
+
+    def _send(self, texture: moderngl.Texture, image: Image) -> None:
+        """Bring the texture up to the picture."""
+        if self._stale is None:
+            texture.write(image)
+        for x0, y0, x1, y1 in self._stale or ():
+            part = np.ascontiguousarray(image[y0:y1, x0:x1])
+            texture.write(part, viewport=(x0, y0, x1 - x0, y1 - y0))
+        self._stale = []
 
     def release(self) -> None:
         """Give back what it holds."""
         self._drop()
-        for texture in (self._texture, self._coverage):
-            if texture is not None:
-                texture.release()
+        if self._texture is not None:
+            self._texture.release()
         if self._presenter is not None:
             self._presenter.release()
 
     def _keep(self, picture: _Kept) -> None:
         """A whole new picture."""
-        self._kept, self._stale, self._lent, self._covers = picture, None, False, False
+        self._kept, self._stale, self._lent = picture, None, False
 
     def _where(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """The cells of the kept picture that `rows` touch as they are. While one slider is dragged, where

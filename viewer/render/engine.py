@@ -24,7 +24,6 @@ from progdf.scene.bounds import near_plane
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import bounds_of, half_camera, to_camera
 from viewer.gl.edit_pass import EditPassError
-from viewer.gl.ground_grid import GroundGrid, GroundPlane, ground_plane
 from viewer.render.timings import EditsBy, FrameTimings
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
@@ -33,6 +32,7 @@ from viewer.state.view_state import ViewState
 from .attribute_updates import CpuEditing, Editing, GpuEditing, Stack
 from .cpu_renderer import CpuRenderer
 from .depth_sort import back_to_front
+from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .headless import is_software
 from .highlight import Highlight, highlight_colors
 from .renderers import GlRenderer, Image, Renderer
@@ -107,7 +107,7 @@ class ViewEngine:
         self._picture: _Picture | None = None
         self.highlight: Highlight | None = None
         """What `draw` shows over the scene; `image` never does, but for what is hidden."""
-        self._grid: GroundGrid | None = None
+        self._grid: tuple[object, Lines] | None = None  # what decides the lines, and they
         self._ground: tuple[Vec3, GroundPlane] | None = None  # the plane that is the ground where this is up
         self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # and its colors. [N,4]
         if edit_pass == "gpu" and self.draws_with == "cpu":
@@ -144,9 +144,7 @@ class ViewEngine:
             camera, size = half_camera(camera), (max(size[0] // 2, 1), size[1])
             left = half * size[0]
         self.timings = self._update_picture(view, camera, self.highlight, pixels)
-        self.renderer.show(framebuffer, size, left)
-        if view.grid and self.ctx is not None:
-            self._draw_grid(view, camera, framebuffer, size, left)
+        self.renderer.show(framebuffer, size, left, self._grid_lines(view, camera))
         return self.timings
 
     def prepare(self, view: ViewState, camera: Camera) -> bool:
@@ -202,28 +200,20 @@ class ViewEngine:
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
-        if self._grid is not None:
-            self._grid.release()
         self.editing.release()
         self.renderer.release()
 
-    def _draw_grid(
-        self,
-        view: ViewState,
-        camera: Camera,
-        framebuffer: moderngl.Framebuffer,
-        size: tuple[int, int],
-        left: int,
-    ) -> None:
-        """The grid on the ground, over what was shown."""
-        assert self.ctx is not None, "nothing to show on without a context"
-        up = view.camera.up
+    def _grid_lines(self, view: ViewState, camera: Camera) -> Lines | None:
+        """The grid on the ground in the picture, the same object as long as it is the same."""
+        if not view.grid:
+            return None
+        up, size = view.camera.up, (camera.width, camera.height)
         if self._ground is None or self._ground[0] != up:
             self._ground = up, ground_plane(self.scene, up)
-        self._grid = self._grid or GroundGrid(self.ctx)
-        self._grid.draw(
-            self._ground[1], camera, view.background, self.renderer.coverage(), framebuffer, size, left
-        )
+        seen = up, camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), size, view.background
+        if self._grid is None or self._grid[0] != seen:
+            self._grid = seen, grid_lines(self._ground[1], camera, view.background)
+        return self._grid[1]
 
     def _create(self, wants_pass: bool) -> tuple[Renderer, Editing]:
         """The renderer with the scene in it, and what edits it there."""

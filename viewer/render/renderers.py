@@ -14,8 +14,11 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from viewer.camera.up_axis import Vec3
 from viewer.gl.edit_pass import EditPass
+from viewer.gl.grid_pass import GridPass
 from viewer.gl.present import Presenter
 from viewer.gl.splats import SplatRenderer
+
+from .ground_grid import Lines
 
 Image = NDArray[np.float32]
 T = TypeVar("T")
@@ -65,15 +68,19 @@ class Renderer(Protocol):
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped. [H,W,3]"""
 
-    def coverage(self) -> moderngl.Texture:
-        """Of the picture: what the scene covers of each pixel, 0..1, in the alpha of a texture, upper row
-        first."""
-
     def show(
-        self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None, left: int = 0
+        self,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int] | None = None,
+        left: int = 0,
+        grid: Lines | None = None,
     ) -> None:
         """Fill the framebuffer's lower `size` pixels from `left` on with the picture; None: as many as it
-        has."""
+        has.
+
+        Args:
+            grid: lines behind the splats, in pixels of the picture
+        """
 
     def release(self) -> None:
         """Give back what it holds."""
@@ -95,6 +102,7 @@ class GlRenderer:
         self._renderer = SplatRenderer(ctx)
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
+        self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
         self._renderer.upload(scene, self._editable)
@@ -136,17 +144,24 @@ class GlRenderer:
         rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
-    def coverage(self) -> moderngl.Texture:
-        return _require_picture(self._picture)
-
     def show(
-        self, framebuffer: moderngl.Framebuffer, size: tuple[int, int] | None = None, left: int = 0
+        self,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int] | None = None,
+        left: int = 0,
+        grid: Lines | None = None,
     ) -> None:
-        self._presenter.show(_require_picture(self._picture), framebuffer, size, left)
+        picture = _require_picture(self._picture)
+        self._presenter.show(picture, framebuffer, size, left)
+        if grid is not None:
+            self._grid = self._grid or GridPass(self._ctx)
+            self._grid.draw(grid, picture, framebuffer, size or picture.size, left)
 
     def release(self) -> None:
         self._presenter.release()
         self._renderer.release()
+        if self._grid is not None:
+            self._grid.release()
 
 
 def _require_picture(thing: T | None) -> T:

@@ -319,7 +319,7 @@ REQUESTS = (
         "demo",
     ),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
-    *("save_region", "rename_region", "copy_values", "paste_values"),
+    *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up"),
 )
 """What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
 afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a

@@ -1,16 +1,26 @@
-"""Axes, named views, the grid on the ground, and moving while a tool is on: in one window each."""
+"""Axes, named views, the grid on the ground, which way is up, and moving while a tool is on."""
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from imgui_bundle import imgui
+from PIL import Image
 
+from progdf.formats.ply import save_ply
+from tests.helpers.null_app import null_app, press
+from tests.helpers.scenes import random_gaussians
 from tests.helpers.ui_rig import bear, first_view, rig
-from viewer.camera.view_camera import axes
+from viewer.camera.inputs import Keys, Press
+from viewer.camera.view_camera import axes, first_camera
+from viewer.files import known_ups
+from viewer.files.document import load
 from viewer.state import selection
+from viewer.state.view_state import ViewState
 from viewer.ui import axis_gizmo
 
 pytestmark = pytest.mark.gl
@@ -57,8 +67,6 @@ def test_numbers_look_from_the_sides_and_the_way_there_takes_a_moment() -> None:
             hand.key(chord)
             camera = hand.main_view.work.view.camera
             assert (camera.azimuth, camera.elevation) == angles
-        from viewer.camera.inputs import Keys, Press
-
         hand.frame(keys=Keys((Press("Num0"),)))
         hand.frame(4)
         under_way = hand.main_view.work.view.camera
@@ -93,3 +101,67 @@ def test_alt_turns_the_camera_while_a_tool_is_on(chord: str) -> None:
         after = hand.main_view.work.view
         assert after.camera.azimuth == pytest.approx(before.camera.azimuth - 12.0)
         assert (after.layers, after.selection) == (before.layers, before.selection)
+
+
+def test_the_grid_lies_behind_what_stands_on_it_whatever_draws_and_saved_pictures_have_none(
+    tmp_path: Path,
+) -> None:
+    head = selection.select(selection.SelectionState(), np.isin(bear().demo.labels.numpy(), (1, 2)))
+    bare, camera = selection.isolate(head, len(bear().scene)), first_view(bear()).camera
+    lined = {}
+    for draw in ("cpu", "gl"):
+        view = replace(first_view(bear()), selection=bare, camera=replace(camera, elevation=60.0))
+        with rig(view, draw=draw, pictures=tmp_path / draw) as hand:
+            (tmp_path / draw).mkdir()
+            plain = hand.picture().astype(int)
+            hand.key("Shift+G")
+            shown = hand.picture().astype(int)
+            hand.key("F2")
+            saved = np.asarray(Image.open(tmp_path / draw / "bear_001.png")).astype(int)
+            assert np.abs(saved - plain).max() == 0
+            sky = np.abs(plain - plain[0, 0]).max(axis=-1) == 0
+            lines = np.abs(shown - plain).max(axis=-1) > 8
+            assert lines[sky].sum() > 800
+            covered = np.abs(plain - plain[0, 0]).max(axis=-1) > 60
+            assert covered.sum() > 3000
+            assert lines[covered].sum() < 0.02 * lines.sum()
+            hand.drag((170.0, 300.0), (190.0, 300.0))
+            hand.key("Shift+G")
+            hand.key("Num0")
+            assert np.abs(hand.picture().astype(int) - plain)[:300].max() == 0, "above the message"
+            lined[draw] = shown
+    assert np.abs(lined["cpu"] - lined["gl"]).mean() < 0.5
+
+
+def test_a_scene_that_does_not_tell_which_way_is_up_is_asked_about_once(tmp_path: Path) -> None:
+    save_ply(tmp_path / "cloud.ply", random_gaussians(300, scale=0.2))
+    cloud = load(tmp_path / "cloud.ply")
+    up = known_ups.up_of(cloud, tmp_path / "memory")
+    first = ViewState(camera=first_camera(cloud.scene, up=up))
+    with null_app(cloud, first, tmp_path) as app:
+        for _ in range(6):
+            app._wait_times()
+            app.draw()
+        strip = app.main_view.up_strip
+        assert strip is not None
+        assert [choice.name for choice in strip.choices] == ["+Y", "−Y", "+Z", "−Z"]
+        assert strip.now == "−Y"
+        assert all(choice.texture for choice in strip.choices)
+        app.main_view.request("set_up:2")
+        app.draw()
+        assert app.main_view.up_strip is None
+        assert app.main_view.work.home.up == (0.0, 0.0, 1.0)
+        assert known_ups.up_of(cloud, tmp_path / "memory") == (0.0, 0.0, 1.0)
+        app.open(tmp_path / "cloud.ply")
+        app._wait_times()
+        app.draw()
+        assert app.main_view.up_strip is None
+        assert app.main_view.work.view.camera.up == (0.0, 0.0, 1.0)
+        shutil.copy(tmp_path / "cloud.ply", tmp_path / "other.ply")
+        app.open(tmp_path / "other.ply")
+        app._wait_times()
+        app.draw()
+        assert app.main_view.up_strip is not None
+        press(app, "Escape")
+        assert app.main_view.up_strip is None
+        assert known_ups.find(tmp_path / "other.ply", tmp_path / "memory") == (0.0, -1.0, 0.0)

@@ -16,6 +16,7 @@ from viewer.gl import programs
 from viewer.gl.layout import (
     EDIT_LAYER,
     EDIT_TARGET,
+    GRID_LINE,
     ORDER,
     PLACES,
     PROJECTED,
@@ -26,6 +27,7 @@ from viewer.gl.layout import (
 )
 from viewer.gl.programs import ShaderError, load_program, load_source
 from viewer.gl.splats import vertex_format
+from viewer.render.ground_grid import CLEAR
 
 STAGES = (
     "project.vert",
@@ -60,6 +62,11 @@ def test_the_projected_layout_is_what_one_stage_writes_and_the_next_reads() -> N
     assert declared("splat.vert", "in") == fields(PROJECTED)
     assert vertex_format(PROJECTED) == "2f 3f 1f 4f"
     assert PROJECTED.itemsize == 40, "tightly packed, as transform feedback writes it"
+
+
+def test_a_line_of_the_grid_is_read_as_it_is_laid_out() -> None:
+    assert declared("grid.vert", "in") == fields(GRID_LINE)
+    assert f"const float CLEAR = {CLEAR};" in text_of("grid.frag")
 
 
 def test_the_order_is_one_unsigned_integer_a_gaussian() -> None:

@@ -1,0 +1,94 @@
+"""Lines behind a picture: drawn into it where the background shines through, and taken out again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cpu.jit import kernel
+
+Array = NDArray[Any]
+
+
+@contextmanager
+def lines_behind(image: Array, transmittance: Array, lines: Array, clear: float) -> Iterator[None]:
+    """Have lines in a picture for a while, a pixel wide and smooth; then it is as before, bit for bit.
+
+    Args:
+        image: [H,W,3] float32
+        transmittance: share of the background that shines through it, 0..1. [H,W]
+        lines: of each both ends in pixels (4), their depths (2), both places in a disc of radius 1, beyond
+            which there is no line (4), and rgb with the share that it takes (4). [L,14] float32
+        clear: radius in that disc within which a line has not begun to fade, < 1
+    """
+    most = 2 * len(lines) * (max(transmittance.shape) + 1)
+    places, before = np.empty((most, 2), np.int32), np.empty((most, 3), np.float32)
+    count = _draw(lines, clear, image, transmittance, places, before)
+    try:
+        yield
+    finally:
+        _restore(image, places[:count], before)
+
+
+@kernel(cache=True, fast=True)
+def _draw(lines: Array, clear: float, image: Array, through: Array, places: Array, before: Array) -> int:
+    """Gives how many pixels were changed: which, and what they were."""
+    height, width = through.shape
+    count = 0
+    for i in range(len(lines)):
+        x0, y0 = lines[i, 0], lines[i, 1]
+        dx, dy = lines[i, 2] - x0, lines[i, 3] - y0
+        first, last = _cut(x0, dx, width, 0.0, 1.0)
+        first, last = _cut(y0, dy, height, first, last)
+        steps = int(np.ceil(max(abs(dx), abs(dy)) * max(last - first, 0.0)))
+        near, far = 1.0 / lines[i, 4], 1.0 / lines[i, 5]
+        steep = abs(dy) > abs(dx)
+        for step in range(min(steps, max(width, height) + 1)):
+            at = first + (step + 0.5) / steps * (last - first)
+            along = (
+                at * far / ((1.0 - at) * near + at * far)
+            )  # in the world, where it is not as in the picture
+            u = lines[i, 6] + along * (lines[i, 8] - lines[i, 6])
+            v = lines[i, 7] + along * (lines[i, 9] - lines[i, 7])
+            left = lines[i, 13] * min((1.0 - np.sqrt(u * u + v * v)) / (1.0 - clear), 1.0)
+            if not left > 0.0:
+                continue
+            x, y = x0 + at * dx, y0 + at * dy
+            beside = (x if steep else y) - 0.5
+            low = int(np.floor(beside))
+            for side in range(2):
+                column, row = (low + side, int(y)) if steep else (int(x), low + side)
+                if column < 0 or column >= width or row < 0 or row >= height:
+                    continue
+                share = left * (beside - low if side == 1 else 1.0 - beside + low) * through[row, column]
+                if not share > 0.0:
+                    continue
+                places[count, 0], places[count, 1] = row, column
+                for c in range(3):
+                    under = image[row, column, c]
+                    before[count, c] = under
+                    image[row, column, c] = under + share * (lines[i, 10 + c] - under)
+                count += 1
+    return count
+
+
+@kernel(inline=True)
+def _cut(start: float, way: float, size: float, first: float, last: float) -> tuple[float, float]:
+    """The part of first..last of a line in which it lies between 0 and `size`."""
+    if way == 0.0:
+        return (first, last) if 0.0 <= start < size else (0.0, 0.0)
+    a, b = -start / way, (size - start) / way
+    return max(first, min(a, b)), min(last, max(a, b))
+
+
+@kernel(cache=True)
+def _restore(image: Array, places: Array, before: Array) -> None:
+    """The last first, as lines cross."""
+    for k in range(len(places)):
+        i = len(places) - 1 - k
+        for c in range(3):
+            image[places[i, 0], places[i, 1], c] = before[i, c]

@@ -1,0 +1,39 @@
+"""Lines behind a picture: where they are seen, and that nothing of them stays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from progdf.rasterize.lines import lines_behind
+
+
+def line(x0: float, y0: float, x1: float, y1: float) -> list[float]:
+    return [x0, y0, x1, y1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_a_line_is_a_pixel_wide_seen_through_and_gone_afterwards_bit_for_bit() -> None:
+    image = np.random.default_rng(0).random((20, 30, 3), np.float32) + 1.0
+    through = np.ones((20, 30), np.float32)
+    through[:, 15:] = 0.0
+    before = image.copy()
+    lines = np.array([line(-1e7, 10.5, 1e7, 10.5), line(5.5, -3, 5.5, 400), line(0, 0, 30, 20)], np.float32)
+    with lines_behind(image, through, lines, 0.5):
+        assert (image[10, :15] == 0.0).all()
+        assert (image[:, 5] == 0.0).all()
+        assert np.array_equal(image[:, 15:], before[:, 15:]), "behind what covers it"
+        assert np.array_equal(image[15:, :5], before[15:, :5])
+        assert (image[4, 6] < before[4, 6]).all()
+    assert np.array_equal(image, before)
+
+
+def test_lines_fade_and_those_that_are_nowhere_draw_nothing() -> None:
+    image, through = np.ones((8, 64, 3), np.float32), np.ones((8, 64), np.float32)
+    fading = line(0, 4.5, 64, 4.5)
+    fading[8] = 1.0
+    with lines_behind(image, through, np.array([fading], np.float32), 0.25):
+        assert (np.diff(image[4, :, 0]) >= 0.0).all()
+        assert image[4, 0, 0] == 0.0
+        assert image[4, 63, 0] > 0.98
+    nowhere = [line(3, 3, 3, 3), line(-9, -9, -5, 90), line(9, 100, 90, 100)]
+    with lines_behind(image, through, np.array(nowhere, np.float32), 0.5):
+        assert (image == 1.0).all()

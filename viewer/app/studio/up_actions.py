@@ -1,0 +1,113 @@
+"""Which way is up, asked once of a scene that does not tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import moderngl
+import numpy as np
+
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import first_camera
+from viewer.files import known_ups
+from viewer.panel.panel import UPS
+from viewer.pictures.film import to_pixels
+from viewer.render.engine import ViewEngine
+from viewer.state import workspace
+from viewer.state.view_state import ViewState
+
+from .training_actions import StudioApplication
+from .up_strip import SIZE, UpChoice, UpStrip
+
+
+class UpActions:
+    """Asks, draws the pictures one by one, and remembers the answer. `close` it with the window.
+
+    Args:
+        app: the window
+        context: the GL context
+        memory: folder of the program's state; the user's own if None
+    """
+
+    def __init__(self, app: StudioApplication, context: moderngl.Context, memory: Path | None = None) -> None:
+        self._app, self._context, self._memory = app, context, memory
+        self._textures: list[moderngl.Texture] = []
+        self._path: Path | None = None  # the scene at the last look
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of ours."""
+        name, _, index = request.partition(":")
+        strip, main_view = self._app.main_view.up_strip, self._app.main_view
+        if name not in ("set_up", "keep_up"):
+            return False
+        before = main_view.work.view.camera
+        if strip is not None and name == "set_up":
+            home = strip.choices[int(index)].camera
+            work = workspace.with_camera(replace(main_view.work, home=home), replace(home, mode=before.mode))
+            main_view.work = workspace.glide_from(work, before)
+            self._answer(home.up)
+        elif strip is not None:
+            self._answer(before.up)
+        return True
+
+    def poll(self, session: Path | None, engine: ViewEngine) -> float | None:
+        """Ask where a scene was opened that does not tell; seconds until the next look, None for ever.
+
+        Args:
+            session: that is open, which knows
+            engine: draws the pictures
+        """
+        main_view, document = self._app.main_view, self._app.document
+        if document.path != self._path:
+            self.close()
+            self._path = document.path
+            if document.path is None or session is not None or known_ups.find(document.path, self._memory):
+                return None
+            found = document.found_up
+            if found.certain or main_view.work.view.camera.up != found.direction:
+                return None  # it tells, or somebody said
+            main_view.up_strip = self._question()
+        strip = main_view.up_strip
+        if strip is None:
+            return None
+        if main_view.work.view.camera.up != next(c.camera.up for c in strip.choices if c.name == strip.now):
+            self._answer(main_view.work.view.camera.up)  # as the panel was told
+            return None
+        missing = next((i for i, choice in enumerate(strip.choices) if not choice.texture), None)
+        if missing is None:
+            return None
+        choices = [*strip.choices]
+        choices[missing] = replace(choices[missing], texture=self._draw(choices[missing], engine))
+        main_view.up_strip = replace(strip, choices=tuple(choices))
+        main_view.wake()
+        return 0.0
+
+    def _answer(self, up: Vec3) -> None:
+        if self._path is not None:
+            known_ups.remember(self._path, up, self._memory)
+        self.close()
+        self._app.main_view.wake()
+
+    def close(self) -> None:
+        """No question any more."""
+        self._app.main_view.up_strip = None
+        for texture in self._textures:
+            texture.release()
+        self._textures.clear()
+
+    def _question(self) -> UpStrip:
+        scene, camera = self._app.document.scene, self._app.main_view.work.view.camera
+        choices = tuple(
+            UpChoice(name, first_camera(scene, aspect=SIZE[0] / SIZE[1], fov_y=camera.fov_y, up=up))
+            for name, up in UPS
+        )
+        return UpStrip(choices, next((name for name, up in UPS if up == camera.up), ""))
+
+    def _draw(self, choice: UpChoice, engine: ViewEngine) -> int:
+        background = self._app.main_view.work.view.background
+        pixels = to_pixels(engine.image(ViewState(choice.camera, background=background), SIZE))
+        texture = self._context.texture(SIZE, 3, np.ascontiguousarray(pixels).tobytes(), alignment=1)
+        texture.filter = moderngl.LINEAR, moderngl.LINEAR
+        self._textures.append(texture)
+        return int(texture.glo)
