@@ -14,16 +14,12 @@ from progdf.color.edits import parse_color, recolor_fully, typical_color
 from .paint import step
 
 _CREAM, _CHARCOAL = "#ece6dc", "#3a3638"
-_DARK = 0.36  # fur is brighter; eyes, nose and mouth are not
+_DARK = 0.36  # fur is brighter; nose and mouth are not
 
 # Where in space, how wide and tall in world units, and how far it leans, in radians.
 _PATCHES = (((0.185, 1.53, 0.44), (0.125, 0.165), 0.5), ((-0.185, 1.53, 0.44), (0.085, 0.157), -0.35))
-_FEATURES = (
-    ((0.17, 1.545, 0.46), (0.072, 0.085), 0.0),
-    ((-0.17, 1.545, 0.46), (0.066, 0.085), 0.0),
-    ((0.0, 1.44, 0.60), (0.118, 0.095), 0.0),
-    ((0.02, 1.31, 0.59), (0.118, 0.092), 0.0),
-)
+_EYES = (((0.17, 1.545, 0.46), (0.051, 0.058), 0.0), ((-0.17, 1.545, 0.46), (0.045, 0.058), 0.0))
+_NOSE_AND_MOUTH = (((0.0, 1.44, 0.60), (0.118, 0.095), 0.0), ((0.02, 1.31, 0.59), (0.118, 0.092), 0.0))
 
 
 def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...]], Tensor]) -> Tensor:
@@ -38,11 +34,13 @@ def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...
     """
     head = cover(("head",))
     patches = torch.maximum(*(_ellipse(camera, *patch) for patch in _PATCHES)) * head
-    features = torch.stack([_ellipse(camera, *feature) for feature in _FEATURES]).amax(dim=0)
+    eyes = torch.maximum(*(_ellipse(camera, *eye) for eye in _EYES))
+    features = torch.maximum(*(_ellipse(camera, *feature) for feature in _NOSE_AND_MOUTH))
     painted = _wash(picture, cover(("head", "body")), _CREAM)
     painted = _wash(painted, cover(("ears", "arms", "legs")), _CHARCOAL)
     painted = _wash(painted, patches, _CHARCOAL)
-    kept = features * head * (1 - step(picture.mean(dim=2), _DARK - 0.12, _DARK))
+    dark = 1 - step(picture.mean(dim=2), _DARK - 0.12, _DARK)
+    kept = torch.maximum(eyes, features * dark) * head
     return torch.lerp(painted, picture, kept[..., None])
 
 

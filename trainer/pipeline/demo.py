@@ -277,7 +277,7 @@ def _plan(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) ->
         editor=f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor,
         cameras=folder / "cameras.json" if show.inside else None,
         views=effort.views,
-        image_size=effort.image_size,
+        image_size=0 if painted and not options.quick else effort.image_size,
         steps=effort.steps,
         seed=options.seed,
     )
