@@ -269,9 +269,9 @@ def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bea
     assert float(picture[trunk].mean()) < 0.75
     rest = cover(("head", "body", "ears", "arms", "legs")) < 0.002
     assert torch.allclose(painted[rest], picture[rest], atol=0.01)
-    nose = (cover(("head",)) > 0.98) & (picture.amax(dim=2) < 0.15)
-    assert int(nose.sum()) > 20
-    assert torch.allclose(painted[nose], picture[nose], atol=0.05)
+    features = (cover(("head",)) > 0.98) & (picture.amax(dim=2) < 0.15)
+    assert int(features.sum()) > 20
+    assert float((painted - picture)[features].abs().mean()) < 0.03
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
