@@ -116,6 +116,7 @@ def draw_card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> Card
         child.auto_resize_y.value | child.always_use_window_padding.value,
         imgui.WindowFlags_.no_nav.value,
     )
+    imgui.pop_style_var()  # here, as tips and menus have paddings of their own
     right = right_edge()
     card = _head(CardResult(state), index, row, cards, active, ui)
     number_at, layer = imgui.get_item_rect_min(), card.state.layers[index]
@@ -161,7 +162,6 @@ def draw_card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> Card
     if selected:
         _focus_bar(clip, p.accent if focused else p.accent_dark, scale)
     imgui.end_child()
-    imgui.pop_style_var()
     imgui.pop_style_color()
     imgui.pop_id()
     return replace(card, touched=card.touched or touched or bool(press), press=press)

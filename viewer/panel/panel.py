@@ -276,18 +276,18 @@ def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions:
 def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, ui: UiContext) -> Comparison:
     """Off, beside each other or subtracted; with the original, what was recorded, or two snapshots.
 
-    `unrecorded`: why nothing is; `kept`: whether there are snapshots.
+    `unrecorded`: why nothing is recorded; `kept`: whether there are snapshots.
     """
     label("Compare", column)
     chosen = choice("compare", ("Off", "Side", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
     tip("Side by side (Y), split view (Shift+Y), or amplified difference (D)")
     if chosen is not None:
         shown = replace(shown, mode=COMPARE_MODES[chosen])
-    if shown.mode == "off":
+    if shown.mode == "off" and not kept:
         return shown
-    label("Against", column)
+    label("Against", column)  # also while nothing is compared where there are snapshots: theirs lie below it
     off = {i for i, no in ((1, unrecorded), (2, not kept)) if no}
-    against = AGAINST.index(shown.against)
+    against = None if shown.mode == "off" else AGAINST.index(shown.against)
     chosen = choice("against", ("Original", "Recorded", "A | B"), 0 if against in off else against, ui, off)
     told = f"\nNo recording: {unrecorded}" if unrecorded else ""
     tip(
@@ -295,7 +295,8 @@ def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, u
         + told
     )
     if chosen is not None:
-        shown = replace(shown, against=AGAINST[chosen])
+        mode = "split" if shown.mode == "off" else shown.mode
+        shown = replace(shown, mode=mode, against=AGAINST[chosen])
     if shown.mode == "difference":
         label("Amplify", column)
         imgui.set_next_item_width(-1.0)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
@@ -113,7 +114,7 @@ def free_name(view: ViewState, name: str) -> str:
     """A name for one more layer, with a number where a layer has it."""
     taken, free, number = {layer.name for layer in view.layers}, name, 2
     while free in taken:
-        free, number = f"{name}-{number}", number + 1
+        free, number = re.sub(r"-\d+\Z", "", name) + f"-{number}", number + 1
     return free
 
 
