@@ -25,7 +25,7 @@ class Refinements:
         slows: the last steps of a stage are short, see `PgsSettings.fall`
         sizes: steps are as long as a stage's way asks for, see `PgsSettings.reach`
         averages: a running mean of the parameters is recorded, not the bare iterates
-        leads_back: clamps of colors and pixels pass gradients that lead back into range (`views.clamp`)
+        leads_back: clamps of colors and pixels pass gradients that lead back into range (`views.crops`)
         prunes: attributes that do not pay are left out
         propagates: in an edit of colors, members that no view shows do what their neighbors do
     """

@@ -22,7 +22,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.atomic import atomic_write, make_folder
-from progdf.io.images import write_image
+from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json, plain
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, perceptual_loss
@@ -33,7 +33,6 @@ from trainer.pipeline.training import JointNetwork, optimize_members, retime_tra
 from trainer.plan import Plan, plan_optimization
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.setup.training_setup import Pictures, whole_views
-from trainer.store.images import read_picture
 from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json

@@ -15,7 +15,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from viewer.app.main_view import MainView
 from viewer.files.document import Document
-from viewer.gl.screen import read_rgb
+from viewer.gl.present import read_rgb
 from viewer.panel import panel
 from viewer.render.engine import ViewEngine
 from viewer.state.view_state import ViewState

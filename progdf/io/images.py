@@ -194,3 +194,17 @@ def _label_width(label: str, font: _Font, small: _Font) -> int:
 
 def _width(line: str, font: _Font) -> int:
     return round(font.getlength(line))
+
+
+def read_picture(path: Path, size: tuple[int, int] | None = None) -> Tensor:
+    """Read a picture as [H,W,3] float32 0..1; transparency counts as white.
+
+    Args:
+        path: the file
+        size: width and height to scale to
+
+    Raises:
+        ProgdfError: it is missing or no picture, or `size` has other proportions (by more than 2 %).
+    """
+    picture = flatten_onto(open_picture(path, size), "white", size)
+    return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)

@@ -19,8 +19,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.sh import rgb_to_sh0
 
-from . import render
-from .engines import Crop
+from .engines import Crop, render
 
 _SHOWN_SH = 16  # coefficients that a picture shows; one that is not finite hides its Gaussian
 

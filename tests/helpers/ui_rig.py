@@ -16,7 +16,7 @@ from viewer.app.main_view import MainView
 from viewer.camera.inputs import NO_KEYS, Keys, Press
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import Document
-from viewer.gl.screen import read_rgb
+from viewer.gl.present import read_rgb
 from viewer.panel import panel
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context

@@ -12,9 +12,9 @@ import pytest
 
 from progdf.__main__ import main
 from progdf.formats.ply import save_ply
+from progdf.io.images import read_picture
 from tests.helpers.demo_scenes import bear
 from trainer.preview import Previewer, answer, newest_line
-from trainer.store.images import read_picture
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,8 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
-from progdf.io.images import to_picture, write_image
+from progdf.io.images import read_picture, to_picture, write_image
 from progdf.io.json_values import decode_json
-from trainer.store.images import read_picture
 from trainer.store.picture_list import add_pictures
 
 Recipe = Mapping[str, str | int | float | None]

@@ -22,9 +22,9 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.io.images import read_picture
 from progdf.lens import undistort
 from progdf.region import Region
-from trainer.store.images import read_picture
 from trainer.views.view import View
 
 from .base import EditKind, EditorSettings

@@ -20,11 +20,10 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.images import picture_size
+from progdf.io.images import picture_size, read_picture
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import render
 from progdf.region import Region
-from trainer.store.images import read_picture
 from trainer.views.view import BACKGROUND, View
 
 from .base import EditKind, EditorSettings

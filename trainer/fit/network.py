@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from progdf.field.rendered import rendered_importance
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
-from trainer.optimize.losses import Perceptual
+from trainer.optimize.losses import Perceptual, l1, sharpness
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.settings import resolve_slider
 from trainer.options import FieldLoss, Slider
@@ -34,7 +34,6 @@ from trainer.views.crops import CropScene, crop_scene, render_all
 from .evaluate import Evaluator
 from .fit import visibility
 from .memory_bank import JointTraining
-from .picture_loss import RenderedLoss
 
 PART = "network"
 """Of the saved state: a network that was trained jointly, once the trajectory is recorded."""
@@ -212,3 +211,37 @@ def _rendered_loss(
     crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background) for v in setup.train]
     rows = pack(setup.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
     return RenderedLoss(crops, rows, tuple(moving_attributes(trajectory.end[None])), perceptual, sharpness)
+
+
+@dataclass(frozen=True)
+class RenderedLoss:
+    """L_GDF = L_pred + L_render: L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s, and
+    −∇²R of the former. A `PictureLoss`.
+
+    Args:
+        crops: the training views
+        rows: raw values of the members before the edit, packed. [M,C]
+        moving: attributes that differ from these
+        perceptual: LPIPS, or what stands in for it
+        sharpness: whether L_render is paid
+    """
+
+    crops: Sequence[CropScene]
+    rows: Tensor
+    moving: Collection[str]
+    perceptual: Perceptual
+    sharpness: bool = True
+
+    @property
+    def views(self) -> int:
+        """In how many views."""
+        return len(self.crops)
+
+    def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
+        """See `PictureLoss`. [M,C], [M,C] -> []"""
+        crop = self.crops[view]
+        with torch.no_grad():
+            expected, _ = crop.render(self.rows + recorded, self.moving)
+        image, _ = crop.render(self.rows + found, self.moving)
+        predicted = l1(image, expected) + self.perceptual(image, expected)
+        return predicted + sharpness(image, expected, "paper") if self.sharpness else predicted

@@ -16,8 +16,16 @@ from torch import Tensor
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, normalize_quats
 
 from .control_points import ControlPoints
-from .rotations import matrix_turns, multiply_quats, quat_matrices, quat_turns, rotate, turn_quats
-from .similarity import Motion, Parts
+from .similarity import (
+    Motion,
+    Parts,
+    matrix_turns,
+    multiply_quats,
+    quat_matrices,
+    quat_turns,
+    rotate,
+    turn_quats,
+)
 
 _COLUMNS = attribute_slices(BASE_CHANNELS)
 _MOVING = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row

@@ -16,7 +16,7 @@ import torch
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.sh import basis
-from trainer.views.visible_area import visible_area
+from trainer.views.choose import visible_area
 
 NEEDED = 0.04
 """Color (0..1) by which a region's must change with the view for the bands to pay."""

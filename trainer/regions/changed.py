@@ -21,10 +21,10 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
+from progdf.io.images import read_picture
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from trainer.editors.pictures import mend_background, transmittance
-from trainer.store.images import read_picture
 from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plane
 
 from .few_masks import connected_pieces

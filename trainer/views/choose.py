@@ -23,7 +23,6 @@ from progdf.rasterize import alpha_weights
 from progdf.region import Region
 
 from .view import View, fit_size, make_view
-from .visible_area import visible_area
 
 T = TypeVar("T")
 
@@ -228,3 +227,14 @@ def _relative_visibility(weights: Tensor) -> Tensor:
     """How well each sample shows, 1 where it shows as in the median view that shows it. [V,S] -> 0..1"""
     typical = torch.where(weights > 0, weights, torch.nan).nanmedian(dim=0).values.nan_to_num(1.0)
     return (weights / typical.clamp_min(1e-9)).clamp_max(1.0)
+
+
+_GIANT = 20.0
+"""Times the mean area at which one Gaussian counts no more."""
+
+
+def visible_area(gaussians: Gaussians) -> Tensor:
+    """Opacity times the two longer axes, cut off so that no giant speaks for all. [N] float64"""
+    _, middle, long = gaussians.scales.sort(dim=1).values.double().unbind(1)
+    areas = gaussians.opacities.double() * middle * long
+    return areas.clamp_max(_GIANT * float(areas.mean()))

@@ -22,7 +22,6 @@ from progdf.rasterize.color_maps import ColorMap, color_map
 from progdf.rasterize.cpu.parallel import threads
 from progdf.sh import C0, basis
 
-from .clamp import clamp_towards
 from .tiles import live_pixels, live_tiles, may_reach
 from .view import seen_colors
 
@@ -213,3 +212,29 @@ def moving_attributes(offsets: Tensor, among: Collection[str] = ATTRIBUTES) -> l
     """The attributes (`among` these) that these offsets [M,14] or [M,14+3K] move at all."""
     slices = attribute_slices(offsets.shape[1])
     return [name for name, columns in slices.items() if name in among and bool(offsets[:, columns].any())]
+
+
+class _ClampTowards(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor, low: float, high: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.bounds = (low, high)  # type: ignore[attr-defined]
+        return x.clamp(low, high)
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (x,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        low, high = ctx.bounds  # type: ignore[attr-defined]
+        # descent moves x against the gradient: below the range a negative one brings it back
+        useful = ((x >= low) | (gradient < 0)) & ((x <= high) | (gradient > 0))
+        return gradient * useful, None, None
+
+
+def clamp_towards(x: Tensor, low: float, high: float) -> Tensor:
+    """`x.clamp(low, high)` whose gradient also passes where descent would bring x back into the range.
+
+    A sixth of a trained scene's colors have a channel below 0; with the plain clamp they could never change
+    (docs/experiments.md, Rates and steps).
+    """
+    clamped: Tensor = _ClampTowards.apply(x, low, high)  # type: ignore[no-untyped-call]
+    return clamped

@@ -19,7 +19,7 @@ from viewer.camera import inputs
 from viewer.camera.inputs import NO_KEYS, Keys, Taps
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports as saved_files
-from viewer.gl.screen import read_rgb
+from viewer.gl.present import read_rgb
 from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size

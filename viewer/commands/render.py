@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
@@ -22,7 +24,6 @@ from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
-from viewer.pictures.transparent import transparent_image
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.render.threads import one_thread
@@ -32,7 +33,7 @@ from viewer.state.snapshots import compare_sides
 from viewer.state.view_state import Comparison, Timeline, ViewState
 
 from . import arguments, opening
-from .camera_arguments import choose_camera
+from .arguments import choose_camera
 from .opening import OpenStack
 from .options import RenderOptions
 
@@ -247,3 +248,18 @@ def _check_output(options: RenderOptions) -> None:
     if not moves and suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
     film.check_encoder(options.out)
+
+
+def transparent_image(engine: ViewEngine, view: ViewState, camera: Camera) -> NDArray[np.uint8]:
+    """The view with its coverage as alpha, colors not multiplied by it. [H,W,4]"""
+    black = engine.image(replace(view, background=(0.0, 0.0, 0.0)), camera=camera).copy()
+    white = engine.image(replace(view, background=(1.0, 1.0, 1.0)), camera=camera)
+    return unmix(black, white)
+
+
+def unmix(black: NDArray[np.float32], white: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Color and alpha of what gives these two pictures on black and on white. [H,W,3] twice -> [H,W,4]"""
+    alpha = np.clip(1.0 - (white - black).mean(axis=-1, keepdims=True), 0.0, 1.0)
+    color = np.clip(black / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    rgba: NDArray[np.uint8] = np.round(255.0 * np.concatenate([color, alpha], axis=-1)).astype(np.uint8)
+    return rgba

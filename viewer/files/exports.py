@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
+from progdf.io.atomic import atomic_write
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.io.session import SUFFIX
 from viewer.state.view_state import ViewState
 
 from . import timeline_file
-from .images import free_path, save_picture
 
 CAMERAS = ".cameras.json"
 
@@ -80,3 +81,29 @@ def _try_save(what: str, folder: Path, save: Callable[[], str]) -> str:
         return save()
     except OSError as error:
         raise ProgdfError(f"no {what} was saved in {folder.resolve()}: {error.strerror}") from None
+
+
+def save_picture(folder: Path, stem: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> Path:
+    """Write `image` [H,W,3] as STEM_001.png, or the next free number; returns the path.
+
+    Args:
+        folder, stem: where, and how it is named
+        image: pixels
+        info: what the file carries, see `camera_chunk`
+
+    Raises:
+        ProgdfError: the folder does not exist.
+        OSError: it cannot be written.
+    """
+    path = free_path(folder, stem, ".png")
+    with atomic_write(path) as temporary_file:
+        Image.fromarray(image).save(temporary_file, pnginfo=info)
+    return path
+
+
+def free_path(folder: Path, stem: str, suffix: str) -> Path:
+    """STEM_001 with `suffix`, or the next number that no file has."""
+    number = 1
+    while (path := folder / f"{stem}_{number:03d}{suffix}").exists():
+        number += 1
+    return path

@@ -22,7 +22,7 @@ from progdf.field.baked import AttributeBases
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 
-from .layout import EDIT_LAYER, PLACES, SHOWN_SH, TARGETS, Place
+from .layout import EDIT_LAYER, PLACES, SHOWN_SH, SPAN, SPLATS_PER_ROW, TARGETS, Place
 
 Floats = NDArray[np.float32]
 
@@ -231,3 +231,23 @@ def _numbers(bases: TargetBases, width: int, layer: Layer) -> Floats:
         lines[0, columns] = layer.gain(name)
         lines[1 : 1 + len(own), columns] = own
     return lines
+
+
+def spans_of(rows: NDArray[np.int64], slots: NDArray[np.int64]) -> NDArray[Any]:
+    """The spans that cover `rows` and nothing else.
+
+    Args:
+        rows: Gaussians, ascending, each of them in `slots`. [M]
+        slots: Gaussians that are a member of any edit, ascending. [U]
+
+    Returns:
+        [S] of `SPAN`, S ≤ M
+    """
+    broken = (np.diff(rows) != 1) | (rows[1:] % SPLATS_PER_ROW == 0)
+    begins = np.concatenate([np.arange(min(len(rows), 1)), 1 + np.flatnonzero(broken)])
+    firsts = rows[begins]
+    spans = np.zeros(len(begins), SPAN)
+    spans["row"], spans["column"] = np.divmod(firsts, SPLATS_PER_ROW)
+    spans["texels"] = np.diff(begins, append=len(rows))
+    spans["slot"] = np.searchsorted(slots, firsts)
+    return spans

@@ -19,8 +19,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 
-from .edit_packing import pack_edits, pack_stack
-from .edit_spans import spans_of
+from .edit_packing import pack_edits, pack_stack, spans_of
 from .layout import PLACES, SPLAT_TEXTURES, SPLATS_PER_ROW, TARGETS
 from .programs import load_program
 from .scene_textures import SplatTextures

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
-from .highlight_texture import HighlightTexture
 from .layout import ORDER, PROJECTED, SHOWN_SH
 from .programs import load_program
-from .scene_textures import SplatTextures
+from .scene_textures import HighlightTexture, SplatTextures
 
 Rgb = tuple[float, float, float]
 

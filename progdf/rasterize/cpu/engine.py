@@ -20,7 +20,7 @@ from progdf.rasterize.conventions import FRUSTUM_MARGIN, RasterInfo
 from progdf.rasterize.engines import ActivatedGaussians, RasterView
 
 from . import weights
-from .bin import TILE_H, TILE_W, TileLists, bin_splats, find_tiles
+from .bin import TILE_H, TILE_W, TileLists, bin_splats, depth_order, find_tiles
 from .blend import Picture, blend
 from .blend_backward import SUMS, blend_backward
 from .jit import compilation
@@ -28,7 +28,6 @@ from .parallel import run_chunks, threads
 from .project import Pinhole, Scene, Splats, project
 from .project_backward import BLOCK, CAMERA, project_backward
 from .project_backward import new_scratch as project_backward_scratch
-from .sort import depth_order
 from .spans import new_scratch
 
 Array = NDArray[Any]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from progdf.rasterize import set_threads
+from progdf.rasterize.cpu.bin import depth_order
 from progdf.rasterize.cpu.parallel import StoppedError, run_chunks, stopped_by
-from progdf.rasterize.cpu.sort import depth_order
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

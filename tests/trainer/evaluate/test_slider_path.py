@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.helpers.scenes import orbit_camera
 from trainer.evaluate.camera_path import FRAMES, camera_path, neighbor_similarity
-from trainer.evaluate.slider import SliderPath, slider_path
+from trainer.evaluate.measures import SliderPath, slider_path
 from trainer.fit.evaluate import Evaluator
 
 

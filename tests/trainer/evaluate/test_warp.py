@@ -14,7 +14,7 @@ from progdf.rasterize import render
 from progdf.rasterize.depth import Depth
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import concatenate, front_camera
-from trainer.evaluate.warp import SeenDepth, see_depth, warp_view
+from trainer.evaluate.consistency import SeenDepth, see_depth, warp_view
 
 
 def _picture(scene: Gaussians, camera: Camera) -> Tensor:

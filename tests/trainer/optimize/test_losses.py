@@ -11,7 +11,7 @@ import trainer.optimize.losses as losses
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Lpips
 from trainer.optimize.losses import GradientL1, LpipsLoss, perceptual_loss, warmup
-from trainer.views.clamp import clamp_towards
+from trainer.views.crops import clamp_towards
 
 
 def test_the_clamp_gives_the_plain_clamps_values() -> None:

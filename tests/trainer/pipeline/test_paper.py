@@ -16,7 +16,7 @@ from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import WHITE, quick_options, small, train
 from trainer.cli import train_options
-from trainer.fit.picture_loss import RenderedLoss
+from trainer.fit.network import RenderedLoss
 from trainer.optimize.losses import GradientL1, l1
 from trainer.optimize.objective import LossWeights
 from trainer.optimize.settings import pgs_settings

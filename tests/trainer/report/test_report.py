@@ -23,7 +23,7 @@ from trainer.optimize.losses import GradientL1
 from trainer.report.curves import error_curves
 from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
-from trainer.store.memory import PeakMemory
+from trainer.store.progress import PeakMemory
 from trainer.views.crops import moving_attributes
 
 
@@ -143,7 +143,7 @@ def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
 PEAKS = """
 import resource
 from pathlib import Path
-from trainer.store.memory import PeakMemory
+from trainer.store.progress import PeakMemory
 memory = PeakMemory()
 block = bytearray(128 << 20)
 memory.end("large")

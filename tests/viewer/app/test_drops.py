@@ -17,7 +17,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
 from viewer.files import timeline_file
-from viewer.files.images import save_picture
+from viewer.files.exports import save_picture
 from viewer.state.view_state import Keyframe, Timeline
 
 

@@ -21,7 +21,7 @@ from progdf.rasterize.pixel_cells import CELL, MOST_RECTANGLES, area, dirty_rect
 from progdf.region import Region
 from tests.helpers.stacks import Stack
 from viewer.camera.view_camera import first_camera, to_camera
-from viewer.gl.screen import read_rgb
+from viewer.gl.present import read_rgb
 from viewer.render import cpu_renderer as cpu_renderer
 from viewer.render.engine import ViewEngine
 from viewer.state.view_state import LayerState, ViewState

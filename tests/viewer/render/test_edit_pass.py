@@ -22,8 +22,8 @@ from progdf.gdf.file import Gdf
 from tests.helpers.edits import curved_field, curved_trajectory, edit_of, some_rows
 from tests.helpers.scenes import random_gaussians
 from viewer.gl import edit_pass as edit_pass_module
+from viewer.gl.edit_packing import spans_of
 from viewer.gl.edit_pass import EditPass, EditPassError
-from viewer.gl.edit_spans import spans_of
 from viewer.gl.layout import PLACES, SHOWN_SH, SPLATS_PER_ROW
 from viewer.gl.scene_textures import SplatTextures
 from viewer.render.edit_sample import EditSample, difference

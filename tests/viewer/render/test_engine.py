@@ -23,7 +23,7 @@ from tests.helpers.count import Count
 from tests.helpers.stacks import EARS, SCARF, Stack, view_of
 from viewer.camera.view_camera import to_camera
 from viewer.gl import edit_pass
-from viewer.gl.screen import read_rgb
+from viewer.gl.present import read_rgb
 from viewer.render import attribute_updates
 from viewer.render import engine as engine_module
 from viewer.render.engine import ViewEngine

@@ -10,7 +10,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from tests.helpers.ui_rig import bear
-from viewer.pictures.transparent import unmix
+from viewer.commands.render import unmix
 
 
 def test_color_and_coverage_are_found_from_black_and_white() -> None:
