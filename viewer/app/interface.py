@@ -64,6 +64,7 @@ def panels(
         work.search,
         work.searching,
         _snapshot_slider(work, pointer) if cards else SnapshotSlider(),
+        work.cards_fit,
     )
     result = panel.draw(work.view, shown, pointer.ui)
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)

@@ -31,12 +31,25 @@ _VIEWS = (
     ("Top", "Numpad 7", "look:top"),
     ("Bottom", "Ctrl+Numpad 7", "look:bottom"),
 )
+_LAYERS = (
+    ("Select all", "Ctrl+Alt+A", "select_layers"),
+    ("Search", "Ctrl+F", "search"),
+    ("Group", "Ctrl+G", "group"),
+    ("Ungroup", "Ctrl+Shift+G", "ungroup"),
+    ("Copy values", "Ctrl+C", "copy_values"),
+    ("Paste values", "Ctrl+V", "paste_values"),
+    ("Reset", "Ctrl+R", "reset"),
+    ("Reset all", "Ctrl+Shift+R", "reset_all"),
+)
 _FRAMES = (("Frame", "F", "frame"), ("Home", "Shift+F", "home"))
 _HELP = (("Shortcuts", "F1", "help"), ("About", "", "about"), ("Quit", "Ctrl+Q", "quit"))
 
 
-def button(recent: Sequence[Path], view: ViewState, ui: UiContext) -> list[str]:
-    """The button at the right of the present line, and its menu while it is open; what was chosen."""
+def button(recent: Sequence[Path], view: ViewState, compact: bool, ui: UiContext) -> list[str]:
+    """The button at the right of the present line, and its menu while it is open; what was chosen.
+
+    `compact`: layers are shown as rows of one line.
+    """
     if icon_button("menu", Icon.BARS, ui):
         imgui.open_popup(NAME)
     tip("Menu")
@@ -50,6 +63,7 @@ def button(recent: Sequence[Path], view: ViewState, ui: UiContext) -> list[str]:
             actions += _items(_MAKES)
             imgui.separator()
             actions += _view(view)
+            actions += _layers(view, compact)
             imgui.separator()
             actions += _items(_HELP)
     return actions
@@ -68,6 +82,16 @@ def _view(view: ViewState) -> list[str]:
         imgui.separator()
         shown = (("Ground grid", "Shift+G", "grid", view.grid), ("Axes", "", "axes", view.axes))
         actions += [action for name, keys, action, on in shown if imgui.menu_item(name, keys, on)[0]]
+        imgui.end_menu()
+    return actions
+
+
+def _layers(view: ViewState, compact: bool) -> list[str]:
+    actions: list[str] = []
+    if imgui.begin_menu("Layers", bool(view.layers)):
+        actions += _items(_LAYERS)
+        imgui.separator()
+        actions += ["cards"] * bool(imgui.menu_item("Compact rows", "Alt+G", compact)[0])
         imgui.end_menu()
     return actions
 

@@ -77,6 +77,7 @@ class PanelInput:
         recent: files opened before, the last one first
         selected, search, searching: as in `Cards`
         snapshot_slider: between two snapshots
+        cards_fit: as in the last frame's `PanelResult`
     """
 
     title: str
@@ -99,6 +100,7 @@ class PanelInput:
     search: str = ""
     searching: bool = False
     snapshot_slider: SnapshotSlider = SnapshotSlider()
+    cards_fit: bool = True
 
 
 @dataclass(frozen=True)
@@ -224,9 +226,9 @@ def _title(state: ViewState, shown: PanelInput, ui: UiContext) -> list[str]:
     imgui.text(elide(shown.title, room - side))
     imgui.pop_font()
     small(f"{group_digits(shown.count)} splats", PALETTE.dim, room - side)
-    below = imgui.get_cursor_pos()
+    below, compact = imgui.get_cursor_pos(), cards_shown(state, shown.cards_fit) == "compact"
     imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
-    actions = main_menu.button(shown.recent, state, ui)
+    actions = main_menu.button(shown.recent, state, compact, ui)
     imgui.set_cursor_pos(below)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     return actions

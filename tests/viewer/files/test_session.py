@@ -211,6 +211,16 @@ def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: P
     assert np.abs(np.asarray(Image.open(out)).astype(int) - expected).max() <= 1
 
 
+def test_render_sets_two_snapshots_of_a_session_beside_each_other(
+    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.png"
+    view = replace(full_view(), compare=Comparison("split", 0.5, against="snapshots"))
+    session.save(saved, replace(session.open_session(saved), view=view))
+    assert main(["render", str(saved), "--size", "64x48", "--engine", "cpu", "-o", str(out)]) == 0
+    assert "PSNR of snapshot 1 against original" in capsys.readouterr().out
+
+
 def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path: Path) -> None:
     path = spoilt(saved, "view", "layers", value=[])
     out, size = tmp_path / "a.png", ("--size", "32x24", "--engine", "cpu")
