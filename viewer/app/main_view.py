@@ -240,6 +240,8 @@ class MainView:
             self.request("keep_up")
         flies = self.work.view.camera.mode == "fly"
         self._taps, tapped = inputs.tapped_actions(self._taps, self._keys, self._clock, flies)
+        if asks:  # the letters are its own
+            self._taps, tapped = Taps(), []
         self._keys = self._taps.without(self._keys)
         for action in (*inputs.requested_actions(self._keys), *tapped):
             if self.at_start and action not in start_page.KEYS:

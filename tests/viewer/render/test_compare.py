@@ -20,6 +20,7 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import half_camera, to_camera
 from viewer.state import comparison as compare
 from viewer.state.view_state import Comparison, ViewState
+from viewer.state.workspace import Dialog
 
 
 @cache
@@ -223,6 +224,12 @@ def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand:
     hand.frame(keys=replace(down, pressed=(Press("D"),)))
     hand.frame()
     assert hand.main_view.work.view.compare.mode == "difference", "in fly mode it only flies"
+    hand.key("V")
+    hand.main_view.ask(Dialog("leave", "bear.session.json", "quit"))
+    hand.frame(3)
+    hand.key("D")
+    assert hand.main_view.work.dialog is None
+    assert hand.main_view.work.view.compare.mode == "difference", "it answered the question"
 
 
 def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:

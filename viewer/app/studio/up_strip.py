@@ -12,7 +12,9 @@ from viewer.ui.overlay import Area
 from viewer.ui.widgets import right_edge
 
 SIZE = (160, 120)
-"""Pixels of a picture, and its size at 1× where there is room."""
+"""Pixels of a picture."""
+_WIDE_PX = 128.0
+"""Of a picture at 1×, where there is room."""
 _GAP_PX, _PAD_PX, _TITLE_PX = 8.0, 10.0, 24.0
 
 
@@ -84,7 +86,7 @@ def _width(strip: UpStrip, area: Area, ui: UiContext) -> float:
     """Of a picture, window pixels."""
     count = len(strip.choices)
     room = area.width - (2 * _PAD_PX + (count + 1) * _GAP_PX) * ui.scale
-    return max(min(SIZE[0] * ui.scale, room / count), 24.0 * ui.scale)
+    return max(min(_WIDE_PX * ui.scale, room / count), 24.0 * ui.scale)
 
 
 def _picture(choice: UpChoice, wide: float, now: bool, ui: UiContext) -> bool:
