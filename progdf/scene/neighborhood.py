@@ -20,6 +20,7 @@ from .selection import Floats, Mask, alike_in_color
 _RING, _AROUND, _LINKS = 8, 24, 8  # neighbors: of a step, of a vote, of a connection
 _REACH = 3.0  # times how far neighbors commonly are; what is farther is none, also where none is nearer
 _TOUCH = 1.0
+_WORTH_THREADS = 2000  # Gaussians of which the neighbors are sought
 
 
 class Neighborhood:
@@ -109,7 +110,8 @@ class Neighborhood:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The pairs of connected ones in a tree of `rows`, of which `some` begin; all as places in `rows`."""
         k = min(_LINKS + 1, len(rows))
-        distances, near = tree.query(self._points[rows[some]], k, workers=threads())
+        workers = threads() if len(some) > _WORTH_THREADS else 1
+        distances, near = tree.query(self._points[rows[some]], k, workers=workers)
         distances, near = distances.reshape(len(some), k), near.reshape(len(some), k)
         sizes = self._sizes[rows]
         touch = distances <= _TOUCH * (sizes[some][:, None] + sizes[near])

@@ -6,6 +6,8 @@ A selection is a boolean mask over the scene. Shapes go by the centers of Gaussi
 
 from __future__ import annotations
 
+import threading
+from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,6 +20,7 @@ from progdf.camera import Camera
 from progdf.color.oklab import srgb_to_oklab
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
+from progdf.rasterize.cpu.parallel import StoppedError, stopped_by
 from progdf.sh import sh0_to_rgb
 
 Mask = NDArray[np.bool_]
@@ -178,6 +181,57 @@ def front_surface(
     surface = depth[cells[:, 1] - y0, cells[:, 0] - x0]
     size = np.exp(scene.log_scales.numpy()[part].max(axis=1))
     return np.asarray(shown & (depths <= surface * (1.0 + _BEHIND) + _OWN * size))
+
+
+class Surface:
+    """What a camera sees of a scene, for tools that ask more than once.
+
+    Each thing is worked out when it is first asked for, by whichever thread; the scene must not change.
+
+    Args:
+        scene: as it is on screen
+        camera: of the picture
+    """
+
+    def __init__(self, scene: Gaussians, camera: Camera) -> None:
+        self.scene, self.camera = scene, camera
+        self._lock, self._stop = threading.RLock(), threading.Event()
+        self._centers: Centers | None = None
+        self._front: Mask | None = None
+        self._colors: Floats | None = None
+
+    @property
+    def centers(self) -> Centers:
+        """See `project_centers`."""
+        with self._lock:
+            self._centers = self._centers or project_centers(self.scene, self.camera)
+            return self._centers
+
+    @property
+    def colors(self) -> Floats:
+        """See `base_colors`. [N,3]"""
+        with self._lock:
+            self._colors = base_colors(self.scene) if self._colors is None else self._colors
+            return self._colors
+
+    def front(self, rows: NDArray[np.int64]) -> Mask:
+        """See `front_surface`. [M]"""
+        with self._lock:
+            if self._front is not None:
+                return self._front[rows]
+            return front_surface(self.scene, self.camera, self.centers, rows)
+
+    def prepare(self, colors: bool = False) -> None:
+        """Work out the whole front, and the colors, ahead; until `drop`."""
+        with self._lock, stopped_by(self._stop), suppress(StoppedError):
+            if self._front is None:
+                self._front = front_surface(self.scene, self.camera, self.centers)
+            if colors and not self._stop.is_set():
+                _ = self.colors
+
+    def drop(self) -> None:
+        """Nobody will ask any more."""
+        self._stop.set()
 
 
 _OUTSIDE, _INSIDE, _EDGE = 0, 1, 2

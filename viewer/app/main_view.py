@@ -23,6 +23,7 @@ from viewer.gl.present import read_rgb
 from viewer.panel import panel
 from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size
+from viewer.render.surfaces import Surfaces
 from viewer.select import hand
 from viewer.state import comparison, layer_selection, playback, workspace
 from viewer.state.layers import shown_edits
@@ -76,6 +77,7 @@ class MainView:
         self.cover: Cover | None = None  # what lies over the picture
         self.preview_said = ("", False)  # of the picture of a new edit, and whether it failed
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
+        self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self.work = workspace.new_workspace(view)
@@ -102,6 +104,7 @@ class MainView:
         self.ui.make_current()
         imgui.backends.opengl3_shutdown()
         self.ui.close()
+        self.surfaces.drop()
         self.canvas.release()
 
     def set_engine(self, engine: ViewEngine, facts: SceneFacts, live: tuple[LayerState, ...] = ()) -> None:
@@ -111,6 +114,7 @@ class MainView:
             live: layers of what is being trained; the engine has their edits after those of the facts
         """
         self.canvas.release()
+        self.surfaces.drop()
         self.engine, self.facts, self.live = engine, facts, live
         self.canvas = Canvas(self.context, engine, (*facts.recordings, *(RecordingFile() for _ in live)))
         self.wake()
@@ -200,6 +204,8 @@ class MainView:
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, shown)
         asked = (self.work.overlap, self.work.pointed) if shown.panel else (None, None)
         self.canvas.draw(shown, screen, area, self._is_held(), self._clock, self.work.focus, *asked)
+        if self.canvas.pixels == 1 and not self._is_held():
+            self._pointer().look_ahead()
         self._draw_overlays()
         imgui.render()
         screen.use()
@@ -282,7 +288,7 @@ class MainView:
         if self._tool.drag is None:
             self._half = int(2 * imgui.get_io().mouse_pos.x >= area.width)
         return PointerContext(
-            self.engine, self.facts, self._shown_view(), area, self.ui, self._clock, self._half
+            self.engine, self.facts, self._shown_view(), area, self.ui, self._clock, self.surfaces, self._half
         )
 
     def _shown_view(self) -> ViewState:

@@ -129,12 +129,10 @@ def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> 
     reason = brush.obstacle(work.view, work.focus)
     if reason or work.focus is None:
         return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
-    layer, camera = work.view.layers[work.focus], pointer.camera(work.view.camera)
-    scene, held = pointer.engine.gaussians(work.view), work.view.brush
+    layer, held = work.view.layers[work.focus], work.view.brush
     mode = paint.mode_while(held.mode, inputs.modifier())
-    stroke = paint.begin_stroke(
-        layer.paint, pointer.engine.gdfs[layer.gdf], scene, camera, held.through, mode
-    )
+    gdf = pointer.engine.gdfs[layer.gdf]
+    stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, held.through, mode)
     return _paint(MouseTool(brush.DRAG, stroke), work, pointer)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -56,7 +57,7 @@ class Document:
             recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, scene, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
-            neighborhood=cache(lambda: Neighborhood(scene)),
+            neighborhood=_once(lambda: Neighborhood(scene)),
             home=lambda camera, aspect: replace(
                 first_camera(scene, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),
@@ -74,6 +75,17 @@ class Document:
         while free in taken:
             free, number = f"{name}-{number}", number + 1
         return free
+
+
+def _once(make: Callable[[], Neighborhood]) -> Callable[[], Neighborhood]:
+    """Made when it is first asked for, by whichever thread; another one that asks meanwhile waits."""
+    lock, kept = threading.Lock(), cache(make)
+
+    def ask() -> Neighborhood:
+        with lock:
+            return kept()
+
+    return ask
 
 
 def empty() -> Document:

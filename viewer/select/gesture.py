@@ -8,20 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from progdf.camera import Camera
-from progdf.gaussians import Gaussians
 from progdf.scene.neighborhood import Neighborhood, grow_along_surface
 from progdf.scene.selection import (
     Centers,
     Mask,
+    Surface,
     alike_in_color,
-    base_colors,
-    front_surface,
     inside_ball,
     inside_polygon,
     inside_rectangle,
     inside_stroke,
-    project_centers,
 )
 from viewer.camera.up_axis import Vec3
 from viewer.render.picking import Seen, seen_at, surface_point
@@ -74,23 +70,21 @@ class Gesture:
         return self.scale * float(np.hypot(*np.subtract(self.path[-1], self.path[0])))
 
 
-def begin(
-    tool: str, mode: str, before: bytes, at: Point, scene: Gaussians, camera: Camera, through: bool
-) -> Gesture | None:
+def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, through: bool) -> Gesture | None:
     """What begins where the mouse was pressed; None for a sphere on the background.
 
     Args:
-        scene: as it is on screen
-        camera: of the picture
+        surface: of the scene on screen
         through: also what lies behind the front surface
     """
     gesture = Gesture(tool, mode, before, (at,))
     if tool == "brush":
-        centers = project_centers(scene, camera)
-        front = np.isfinite(centers.points[:, 0]) if through else front_surface(scene, camera, centers)
-        return replace(gesture, brushed=Brushed(centers, front, np.zeros(len(scene), bool)))
+        front = np.isfinite(surface.centers.points[:, 0])
+        if not through:
+            front = surface.front(np.arange(len(front)))
+        return replace(gesture, brushed=Brushed(surface.centers, front, np.zeros(len(front), bool)))
     if tool == "sphere":
-        center = surface_point(scene, camera, *at)
+        camera, center = surface.camera, surface_point(surface.scene, surface.camera, *at)
         if center is None:
             return None
         depth = float(camera.viewmat[2, :3] @ torch.tensor(center, dtype=camera.viewmat.dtype))
@@ -114,44 +108,46 @@ def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
     return gesture if at == gesture.path[-1] else replace(gesture, path=(*gesture.path, at))
 
 
-def enclosed(gesture: Gesture, scene: Gaussians, camera: Camera, through: bool) -> Mask:
+def enclosed(gesture: Gesture, surface: Surface, through: bool) -> Mask:
     """What the gesture selects as it is. Arguments as of `begin`. [N]"""
     if gesture.brushed is not None:
         return gesture.brushed.touched
     if gesture.center is not None:
-        return inside_ball(scene, gesture.center, gesture.radius)
-    centers = project_centers(scene, camera)
+        return inside_ball(surface.scene, gesture.center, gesture.radius)
+    points = surface.centers.points
     if gesture.tool == "box":
-        mask = inside_rectangle(centers.points, gesture.path[0], gesture.path[-1])
+        mask = inside_rectangle(points, gesture.path[0], gesture.path[-1])
     else:
-        mask = inside_polygon(centers.points, gesture.path)
+        mask = inside_polygon(points, gesture.path)
     if not through:
         rows = np.flatnonzero(mask)
-        mask[rows] = front_surface(scene, camera, centers, rows)
+        mask[rows] = surface.front(rows)
     return mask
 
 
 def clicked(
     tool: str,
     at: Point,
-    scene: Gaussians,
-    camera: Camera,
+    surface: Surface,
     tolerance: float,
     through: bool,
     neighborhood: Callable[[], Neighborhood],
 ) -> Mask | None:
     """What a click of "flood" or "color" selects; None on the background. Arguments as of `begin`. [N]"""
-    seen = seen_at(scene, camera, *at)
+    seen = seen_at(surface.scene, surface.camera, *at)
     if seen is None:
         return None
-    colors = base_colors(scene)
+    colors = surface.colors
     color = np.average(colors[seen.rows], axis=0, weights=seen.shares)
     seeds = _seeds(seen)
     if tool == "flood":
         return grow_along_surface(neighborhood(), colors, seeds, color, tolerance)
     mask = alike_in_color(colors, color, tolerance)
     mask[seeds] = True
-    return mask if through else mask & front_surface(scene, camera, project_centers(scene, camera))
+    if not through:
+        rows = np.flatnonzero(mask)
+        mask[rows] = surface.front(rows)
+    return mask
 
 
 def _seeds(seen: Seen) -> np.ndarray:

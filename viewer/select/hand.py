@@ -36,10 +36,10 @@ def mode(wanted: str) -> str:
 def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> Held:
     """The left button went down over the picture."""
     view, tool = work.view, work.view.select
-    scene, camera, at = pointer.scene, pointer.camera(view.camera), pointer.cursor
+    at = pointer.cursor
     if tool.tool in ("flood", "color"):
         found = gestures.clicked(
-            tool.tool, at, scene, camera, tool.tolerance, tool.through, pointer.facts.neighborhood
+            tool.tool, at, pointer.surface, tool.tolerance, tool.through, pointer.facts.neighborhood
         )
         begun = Gesture(tool.tool, mode(tool.mode), view.selection.members, (at,))
         return begun, work if found is None else _apply(begun, work, found, pointer)
@@ -48,7 +48,7 @@ def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> 
             return finish(gesture, work, pointer)
         return replace(gesture, path=(*gesture.path, at)), work
     begun_at = gestures.begin(
-        tool.tool, mode(tool.mode), view.selection.members, at, scene, camera, tool.through
+        tool.tool, mode(tool.mode), view.selection.members, at, pointer.surface, tool.through
     )
     return (None, work) if begun_at is None else follow(begun_at, work, pointer)
 
@@ -105,8 +105,7 @@ def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:
 
 
 def _enclosed(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Mask:
-    camera = pointer.camera(work.view.camera)
-    return gestures.enclosed(gesture, pointer.scene, camera, work.view.select.through)
+    return gestures.enclosed(gesture, pointer.surface, work.view.select.through)
 
 
 def _apply(gesture: Gesture, work: Workspace, found: Mask, pointer: PointerContext) -> Workspace:

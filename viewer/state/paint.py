@@ -17,12 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.compose.layers import Gains, Layer
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.scene.selection import front_surface, project_centers
+from progdf.scene.selection import Surface
 
 from .view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush
 
@@ -110,29 +108,25 @@ def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
     return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region)))
 
 
-def begin_stroke(
-    paint: str, gdf: Gdf, scene: Gaussians, camera: Camera, through: bool, mode: str = "erase"
-) -> Stroke:
+def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: str = "erase") -> Stroke:
     """A stroke that has touched nothing yet.
 
     Args:
         paint: of the layer
         gdf: its edit
-        scene: as it is on screen
-        camera: of the picture
+        surface: of the scene on screen
         through: also what lies behind the front surface
         mode: of `BRUSH_MODES`
     """
     weights, count = decode(paint, len(gdf.region)), len(gdf.region)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()
     members = gdf.region.members.numpy()
-    centers = project_centers(scene, camera)
-    points, depths = centers.points[members], centers.depths[members]
+    points, depths = surface.centers.points[members], surface.centers.depths[members]
     with np.errstate(divide="ignore", invalid="ignore"):
-        places = np.column_stack([points, float(camera.K[0, 0]) * np.log(depths)])
+        places = np.column_stack([points, float(surface.camera.K[0, 0]) * np.log(depths)])
     reachable = np.isfinite(places).all(1)
     if not through:
-        reachable &= front_surface(scene, camera, centers, members)
+        reachable &= surface.front(members)
     places = np.where(reachable[:, None], places, np.nan).astype(np.float32)
     return Stroke(before, places, np.zeros(count, np.float32), mode)
 

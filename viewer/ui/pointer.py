@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,14 +11,19 @@ from imgui_bundle import imgui
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.scene.selection import Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
+from viewer.render.surfaces import MANY, Surfaces, beside
 from viewer.state.selection import NOBODY, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import SceneFacts
 
 from .context import UiContext
 from .overlay import Area
+
+_SURFACE = ("means", "quats", "log_scales", "logit_opacities", "sh0")
+"""What `Surface` and picking read of a scene."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,7 @@ class PointerContext:
         area: the part of the window that shows it
         ui: fonts and scale
         now: seconds on the main view's clock
+        surfaces: what was looked at ahead
         half: side by side, the one that the mouse is in, or was in when its drag began: 0 left, 1 right
     """
 
@@ -40,6 +47,7 @@ class PointerContext:
     area: Area
     ui: UiContext
     now: float
+    surfaces: Surfaces
     half: int = 0
 
     @property
@@ -82,3 +90,31 @@ class PointerContext:
             return scene
         drawn = torch.from_numpy(np.where(unpack(hidden, len(scene)), np.float32(-np.inf), np.float32(0.0)))
         return replace(scene, logit_opacities=scene.logit_opacities + drawn)
+
+    @property
+    def surface(self) -> Surface:
+        """What the picture shows, for tools; valid until another strength is drawn."""
+        return self.surfaces.at(self._surface_key) or Surface(self.scene, self.camera(self.shown.camera))
+
+    def look_ahead(self) -> None:
+        """Work out in another thread what the tool in the hand will ask of a picture at rest."""
+        tool = self.shown.select.tool
+        if self.facts.count < MANY or not (tool or self.shown.brush.active):
+            return
+        self.surfaces.look(self._surface_key, self._copy_surface, colors=tool in ("flood", "color"))
+        if tool == "flood":
+            beside(self.facts.neighborhood)
+
+    @property
+    def _surface_key(self) -> object:
+        camera, shown = self.camera(self.shown.camera), self.shown
+        place = camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height
+        return self.engine, shown.layers, shown.blend, shown.selection.hidden, place
+
+    def _copy_surface(self) -> Surface:
+        """Of a scene that stays as it is, whatever strengths are drawn."""
+        scene = self.scene
+        if self.shown.layers:
+            copies: dict[str, Any] = {name: getattr(scene, name).clone() for name in _SURFACE}
+            scene = replace(scene, **copies)
+        return Surface(scene, self.camera(self.shown.camera))

@@ -14,6 +14,7 @@ from imgui_bundle import imgui
 from progdf.camera import Camera
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
+from progdf.scene.selection import Surface
 from tests.helpers.hostile import NPY_HEADERS, npy
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
@@ -213,8 +214,9 @@ def test_shift_held_at_the_press_smooths_for_one_stroke(hand: Rig) -> None:
 
 def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Rig) -> None:
     gdf, scene = bear().gdfs[0], bear().scene
-    front = paint.begin_stroke(paint.FULL, gdf, scene, camera_of(hand), through=False)
-    through = paint.begin_stroke(paint.FULL, gdf, scene, camera_of(hand), through=True)
+    surface = Surface(scene, camera_of(hand))
+    front = paint.begin_stroke(paint.FULL, gdf, surface, through=False)
+    through = paint.begin_stroke(paint.FULL, gdf, surface, through=True)
     assert not np.isnan(through.places).any()
     hidden = np.isnan(front.places[:, 0])
     assert 0.2 < hidden.mean() < 0.8, "a scarf goes around the neck"
