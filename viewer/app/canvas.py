@@ -40,6 +40,7 @@ class Canvas:
         """How many pictures were drawn."""
         self._resolution = dynamic_resolution.first_known(len(engine.scene), engine.draws_with)
         self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
+        self._awaited: object = None  # what is being made while the last picture stays on screen
 
     def draw(
         self,
@@ -73,12 +74,20 @@ class Canvas:
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, held, turned, slid, now)
         self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap, pointed)
-        rests = mode != "off" and not (turned or slid)
-        waits = rests and dynamic_resolution.takes_long(before, self._resolution)
-        if waits and not self.comparer.prepare(view, size):
-            self._resolution = dynamic_resolution.keep_waiting(before, now)
+        wanted = aim, edits, self.comparer.engine.highlight
+        if mode != "off" and self.pictures_drawn and dynamic_resolution.takes_long(before, self._resolution):
+            moves = turned or (held and self._awaited not in (None, wanted))
+            if moves or not self.comparer.prepare(view, size):
+                stays = not moves and before.pixels == 1 and view.compare.mode == "off"
+                self._resolution = dynamic_resolution.wait(self._resolution, now, coarsely=not stays)
+                self._awaited = wanted
+                if stays:
+                    self.comparer.engine.show_last(view, screen, size)
+                    return
         new = self.comparer.needs_draw(view, size, self.pixels)
         timings = self.comparer.draw(view, screen, size, self.pixels)
+        if self.pixels == 1:
+            self._awaited = None
         if new:
             self.timings = timings
             self.pictures_drawn += 1

@@ -41,6 +41,9 @@ members of 125 000 Gaussians: 41 ms a step, 35 without)."""
 WORTH_DRAWING_APART = 0.8
 """Share of the picture beyond which all of it is drawn."""
 
+WORTH_WAITING = 0.25
+"""Share of the picture up to which nobody has to wait for another thread."""
+
 CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
 """Pixels that take as long as another call of the rasterizer, and as its look at one more Gaussian."""
 
@@ -192,13 +195,8 @@ class CpuRenderer:
             self._keep(_Kept(*found, camera, background))
             self._last, self._cells = None, None if pixels > 1 else no_cells(camera.width, camera.height)
             return 1.0
-        whole = camera.width * camera.height
-        crops = [(0, 0, camera.width, camera.height)]
-        kept = self._kept if self._kept is not None and self._kept.shows(camera, background) else None
-        if kept is not None and self._cells is not None:
-            worth = CALL_PIXELS + int(GAUSSIAN_PIXELS * len(self._drawn.means))
-            crops = dirty_rectangles(self._cells, (camera.width, camera.height), worth)
-        share = area(crops) / whole
+        kept, crops = self._last_of(camera, background)
+        share = area(crops) / (camera.width * camera.height)
         if kept is None or share > WORTH_DRAWING_APART:
             share = 1.0
             self._keep(_Kept(*_draw(self._drawn, camera, background), camera, background))
@@ -227,10 +225,22 @@ class CpuRenderer:
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         """See `Renderer.prepare`."""
+        kept, crops = self._last_of(camera, background)
+        if kept is not None and area(crops) <= WORTH_WAITING * camera.width * camera.height:
+            return True
         if self._begun is None or not self._begun.shows(camera, background):
             self._drop()
             self._begun = _Begun(self._drawn, camera, background)
         return self._begun.done()
+
+    def _last_of(self, camera: Camera, background: Vec3) -> tuple[_Kept | None, list[Crop]]:
+        """The last picture, if it is of this camera, and what of it has to be drawn anew."""
+        if self._kept is None or not self._kept.shows(camera, background):
+            return None, [(0, 0, camera.width, camera.height)]
+        if self._cells is None:
+            return self._kept, [(0, 0, camera.width, camera.height)]
+        worth = CALL_PIXELS + int(GAUSSIAN_PIXELS * len(self._drawn.means))
+        return self._kept, dirty_rectangles(self._cells, (camera.width, camera.height), worth)
 
     def _drop(self) -> None:
         if self._begun is not None:

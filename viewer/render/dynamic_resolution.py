@@ -21,6 +21,9 @@ POLL_S = 0.02
 MANY = 300_000
 """Gaussians of which the CPU's pictures are taken for slow before the first one is known."""
 
+JUMP_MS = 100.0
+"""What one may take that comes alone, after a click or a key, before the window goes on without it."""
+
 COARSE = 2
 """How many pixels of the window one pixel of a coarse picture covers, each way."""
 
@@ -48,14 +51,15 @@ def first_known(count: int, draws_with: str) -> DynamicResolution:
     return DynamicResolution(camera_ms=(math.inf, math.inf) if slow else ())
 
 
-def takes_long(known: DynamicResolution, full: DynamicResolution) -> bool:
-    """Whether the picture in full that comes after a coarse one should be made beside the window's work."""
-    return known.rest_at is not None and full.rest_at is None and _slow(known.camera_ms)
+def takes_long(before: DynamicResolution, known: DynamicResolution) -> bool:
+    """Whether the picture, which shall be in full now, should be made beside the window's work."""
+    least = SLOW_MS if before.pixels > 1 else JUMP_MS
+    return known.pixels == 1 and _slow(known.camera_ms, least)
 
 
-def keep_waiting(known: DynamicResolution, now: float) -> DynamicResolution:
-    """The picture in full is not done yet: go on with the coarse one."""
-    return replace(known, rest_at=now + POLL_S)
+def wait(known: DynamicResolution, now: float, coarsely: bool) -> DynamicResolution:
+    """The picture in full is not done yet: a coarse one takes its place, or the last one stays."""
+    return replace(known, pixels=COARSE if coarsely else 1, rest_at=now + POLL_S)
 
 
 def before_draw(
@@ -89,8 +93,8 @@ def after_draw(known: DynamicResolution, timings: FrameTimings, turned: bool) ->
     return known if turned else replace(known, slider_ms=(*known.slider_ms[-1:], timings.total_ms))
 
 
-def _slow(pictures_ms: tuple[float, ...]) -> bool:
-    return len(pictures_ms) == 2 and min(pictures_ms) > SLOW_MS
+def _slow(pictures_ms: tuple[float, ...], least: float = SLOW_MS) -> bool:
+    return len(pictures_ms) == 2 and min(pictures_ms) > least
 
 
 def next_frame_delay(known: DynamicResolution, now: float) -> float | None:

@@ -147,10 +147,18 @@ class ViewEngine:
         self.renderer.show(framebuffer, size, left, self._grid_lines(view, camera))
         return self.timings
 
+    def show_last(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> None:
+        """Show the last picture once more, whatever `view` asks for."""
+        self.renderer.show(framebuffer, size)
+        if view.grid and self.ctx is not None:
+            self._draw_grid(view, to_camera(view.camera, *size), framebuffer, size, 0)
+
     def prepare(self, view: ViewState, camera: Camera) -> bool:
         """Begin a picture of `view` without waiting for it; whether `draw` now shows it at once."""
-        if _edits(view) != self._edits or not self.needs_draw(view, (camera.width, camera.height), camera):
+        if not self.needs_draw(view, (camera.width, camera.height), camera):
             return True
+        self._compose(_edits(view))
+        self._apply_highlight(_with_hidden(self.highlight, view))
         return self.renderer.prepare(replace(camera, near=self.near), view.background)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:

@@ -24,18 +24,20 @@ class Surfaces:
         """That of a picture if it was looked at ahead, or is just being."""
         return self._surface if key == self._key else None
 
-    def look(self, key: object, make: Callable[[], Surface], colors: bool) -> None:
-        """Look at the surface of another picture, unless it is the last one's.
+    def look(self, key: object, make: Callable[[], Surface], colors: bool) -> bool:
+        """Look at the surface of another picture, unless it is the last one's; whether it is another.
 
         Args:
             key: what decides it
             make: gives it; it must stay as it is
             colors: whether colors will be asked for as well
         """
-        if (key, colors) != (self._key, self._colors):
-            self.drop()
-            self._key, self._colors, self._surface = key, colors, make()
-            beside(self._surface.prepare, colors)
+        if (key, colors) == (self._key, self._colors):
+            return False
+        self.drop()
+        self._key, self._colors, self._surface = key, colors, make()
+        beside(self._surface.prepare, colors)
+        return True
 
     def drop(self) -> None:
         """Forget it."""

@@ -101,8 +101,8 @@ class PointerContext:
         tool = self.shown.select.tool
         if self.facts.count < MANY or not (tool or self.shown.brush.active):
             return
-        self.surfaces.look(self._surface_key, self._copy_surface, colors=tool in ("flood", "color"))
-        if tool == "flood":
+        another = self.surfaces.look(self._surface_key, self._copy_surface, tool in ("flood", "color"))
+        if another and tool == "flood":
             beside(self.facts.neighborhood)
 
     @property

@@ -15,6 +15,7 @@ from progdf.gaussians import Gaussians
 from progdf.scene.neighborhood import Neighborhood, grow_along_surface
 from progdf.scene.selection import (
     MODES,
+    Surface,
     alike_in_color,
     base_colors,
     combine,
@@ -201,3 +202,16 @@ def test_a_flood_stops_at_another_color_and_at_a_gap() -> None:
     assert grow_along_surface(near, lab, np.array([seed]), lab[seed], 1.0).sum() == 400
     deep = near.nearest((0.0, -0.9, 3.0))
     assert np.flatnonzero(grow_along_surface(near, lab, np.array([deep]), lab[300], 0.1)).tolist() == [deep]
+
+
+def test_a_surface_that_was_looked_at_ahead_says_the_same_as_one_that_was_not() -> None:
+    scene, seen = random_gaussians(3000, seed=4), camera()
+    ahead, late = Surface(scene, seen), Surface(scene, seen)
+    ahead.prepare(colors=True)
+    rows = np.arange(0, 3000, 7)
+    assert (ahead.front(rows) == late.front(rows)).all()
+    assert (late.front(rows) == front_surface(scene, seen, project_centers(scene, seen), rows)).all()
+    given_up = Surface(scene, seen)
+    given_up.drop()
+    given_up.prepare()
+    assert (given_up.front(rows) == late.front(rows)).all(), "asked for all the same"

@@ -16,6 +16,7 @@ from viewer.camera.view_camera import to_camera
 from viewer.state import selection
 from viewer.state.selection import SelectionState, unpack
 from viewer.state.view_state import SelectTool
+from viewer.ui import pointer
 
 pytestmark = pytest.mark.gl
 WINDOW = (700, 640)
@@ -177,6 +178,20 @@ def test_only_the_front_surface_is_selected_unless_n_says_through(hand: Rig) -> 
     hand.key("N")
     hand.drag((100, 150), (300, 400))
     assert 0 < selected(hand).sum() < 0.8 * through
+
+
+def test_a_surface_looked_at_ahead_selects_the_same(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    hand.key("R")
+    hand.key("N")
+    found = []
+    for many in (10**9, 1):
+        monkeypatch.setattr(pointer, "MANY", many)
+        hand.frame()
+        hand.drag((100, 150), (300, 400))
+        found.append(selected(hand).copy())
+    assert hand.main_view.surfaces.at(None) is None, "it was looked at"
+    assert (found[0] == found[1]).all()
+    assert found[0].any()
 
 
 def test_a_click_beside_selects_nothing_and_with_shift_keeps_what_there_was(hand: Rig) -> None:

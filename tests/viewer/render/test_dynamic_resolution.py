@@ -154,6 +154,25 @@ def test_an_orbit_is_coarse_in_the_hand_and_sharp_where_the_hand_rests(hand: Rig
 
 
 @pytest.mark.gl
+def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
+    hand: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(2):  # pictures tell that it is slow
+        hold_and_orbit(hand)
+        hand.release()
+        wait(hand, REST_S)
+    monkeypatch.setattr(dynamic_resolution, "JUMP_MS", 0.0)
+    before = hand.picture()
+    hand.main_view.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
+    hand.frame()
+    assert (hand.picture() == before).all(), "the last picture stays"
+    while hand.main_view.next_frame_delay() == 0.0 or hand.main_view.canvas.next_frame_delay(0.0) is not None:
+        wait(hand, 0.02)
+    image = hand.main_view.engine.image(hand.main_view.work.view, (340, 540))
+    assert np.abs(hand.picture() - np.round(np.clip(image, 0.0, 1.0) * 255.0)).max() <= 1
+
+
+@pytest.mark.gl
 def test_a_slider_is_coarse_in_the_hand_too(hand: Rig) -> None:
     hand.move(*hand.slider(0, 0.5))
     hand.press()
