@@ -149,9 +149,7 @@ class ViewEngine:
 
     def show_last(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         """Show the last picture once more, whatever `view` asks for."""
-        self.renderer.show(framebuffer, size)
-        if view.grid and self.ctx is not None:
-            self._draw_grid(view, to_camera(view.camera, *size), framebuffer, size, 0)
+        self.renderer.show(framebuffer, size, 0, self._grid_lines(view, to_camera(view.camera, *size)))
 
     def prepare(self, view: ViewState, camera: Camera) -> bool:
         """Begin a picture of `view` without waiting for it; whether `draw` now shows it at once."""
