@@ -369,11 +369,12 @@ class MainView:
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
         title, view = self.facts.title, self._shown_view()
         if request == "copy_values":
-            imgui.set_clipboard_text(layer_selection.copy_values(self.work))
-            return f"Copied the values of {len(layer_selection.selected_layers(self.work))} layers"
+            text, what = layer_selection.copy_values(self.work)
+            imgui.set_clipboard_text(text)
+            return f"Copied strength and gains of {what}; Ctrl+V pastes them"
         if request == "paste_values":
-            self.work, count = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
-            return f"Pasted to {count} layers"
+            self.work, what = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
+            return f"Pasted strength and gains to {what}"
         if request == "timeline_file":
             return saved_files.timeline(self.pictures, title, view)
         if request == "window_picture":

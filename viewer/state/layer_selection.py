@@ -191,16 +191,23 @@ class CopiedValues:
     progdf_values: Annotated[int, Meta(ge=1, le=1)] = 1
 
 
-def copy_values(workspace: Workspace) -> str:
-    """Strengths and gains of the selected layers as a text, "" where none is selected."""
+def copy_values(workspace: Workspace) -> tuple[str, str]:
+    """Strengths and gains of the selected layers as a text, and of which.
+
+    Raises:
+        ProgdfError: none is selected.
+    """
     view = workspace.view
     chosen = tuple(view.layers[i] for i in selected_layers(workspace))
+    if not chosen:
+        raise ProgdfError("no layer is selected; click one first")
     values = tuple(LayerValues(layer.name, layer.strength, layer.gains) for layer in chosen)
-    return json.dumps(plain(CopiedValues(values, view.blend)), ensure_ascii=False) if values else ""
+    text = json.dumps(plain(CopiedValues(values, view.blend)), ensure_ascii=False)
+    return text, _name_layers([layer.name for layer in chosen])
 
 
-def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, int]:
-    """With what `copy_values` gave, and how many layers took it.
+def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, str]:
+    """With what `copy_values` gave, and which layers took it.
 
     One layer's values go to all selected layers; those of several go by name, with the blend rule. Locked
     layers stay.
@@ -225,10 +232,14 @@ def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, int]:
             return layer
         return replace(layer, strength=min(upper, values.strength), gains=values.gains)
 
-    count = sum(layer.name in taken and not layer.locked for layer in view.layers)
-    if not count:
+    took = [layer.name for layer in view.layers if layer.name in taken and not layer.locked]
+    if not took:
         raise ProgdfError("no layer takes these values: none has their names, or those that do are locked")
-    return replace(workspace, view=replace(view, layers=tuple(map(take, view.layers)))), count
+    return replace(workspace, view=replace(view, layers=tuple(map(take, view.layers)))), _name_layers(took)
+
+
+def _name_layers(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{len(names)} layers"
 
 
 def group(workspace: Workspace, name: str) -> Workspace:

@@ -109,14 +109,15 @@ def test_values_go_from_one_layer_to_all_selected_ones_and_from_several_by_name(
     work = workspace.new_workspace(
         replace(work.view, layers=(work.view.layers[0], gained, *work.view.layers[2:]))
     )
-    one = layer_selection.copy_values(press(work, "one", "b"))
-    pasted, count = layer_selection.paste_values(press(press(work, "one", "d"), "toggle", "f"), one)
-    assert count == 2
+    one, what = layer_selection.copy_values(press(work, "one", "b"))
+    assert what == "b"
+    pasted, what = layer_selection.paste_values(press(press(work, "one", "d"), "toggle", "f"), one)
+    assert what == "2 layers"
     assert [pasted.view.layers[i].gains for i in (3, 5)] == [gained.gains] * 2
     assert strengths(pasted) == [0.1, 0.2, 0.5, 0.2, 0.5, 0.2]
-    two = layer_selection.copy_values(press(press(act(work, "blend"), "one", "a"), "toggle", "b"))
-    other, count = layer_selection.paste_values(six(), two)
-    assert (count, strengths(other)[:3], other.view.blend) == (2, [0.1, 0.2, 0.5], "sum")
+    two, _ = layer_selection.copy_values(press(press(act(work, "blend"), "one", "a"), "toggle", "b"))
+    other, what = layer_selection.paste_values(six(), two)
+    assert (what, strengths(other)[:3], other.view.blend) == ("2 layers", [0.1, 0.2, 0.5], "sum")
     for text in (
         "",
         "hello",
@@ -127,6 +128,8 @@ def test_values_go_from_one_layer_to_all_selected_ones_and_from_several_by_name(
     ):
         with pytest.raises(ProgdfError, match="the clipboard holds no values"):
             layer_selection.paste_values(work, text)
+    with pytest.raises(ProgdfError, match="no layer is selected"):
+        layer_selection.copy_values(act(work, "unfocus"))
     with pytest.raises(ProgdfError, match="no layer takes these values"):
         layer_selection.paste_values(work, two.replace('"a"', '"x"').replace('"b"', '"y"'))
 
