@@ -21,7 +21,16 @@ from viewer.state import history, layer_selection, paint, playback, selection, s
 from viewer.state import layers as stack
 from viewer.state.history import History
 from viewer.state.view_state import ViewState, cards_shown, next_resolution_mode
-from viewer.state.workspace import SceneFacts, Workspace, focus_layer, loses_strengths, with_camera
+from viewer.state.workspace import (
+    REQUESTS,
+    SceneFacts,
+    Workspace,
+    change_focused,
+    focus_layer,
+    loses_strengths,
+    with_camera,
+    with_layers_of,
+)
 
 FEATHER = 0.1
 """How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
@@ -45,12 +54,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
         return (_frame if name == "frame" else _home)(workspace, facts, aspect)
-    if name in ("paint_clear", "paint_fill"):
-        return _fill_paint(workspace, facts, 1.0 if name == "paint_fill" else 0.0)
-    if name == "paint_feather":
-        return _feather(workspace, facts)
-    if name == "paint_invert":
-        return _invert_paint(workspace, facts)
+    if name in ("paint_clear", "paint_fill", "paint_invert", "paint_feather"):
+        return _repaint(workspace, name, facts)
     if name in selection.CHANGES:
         state = workspace.view.selection
         changed = selection.change(state, name, argument, facts.count, facts.neighborhood)
@@ -121,36 +126,23 @@ def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
     return replace(workspace, view=replace(view, brush=replace(view.brush, **changes)))
 
 
-def _fill_paint(workspace: Workspace, facts: SceneFacts, weight: float) -> Workspace:
-    """The focused layer painted evenly, unless it is locked."""
+def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
+    """The focused layer's paint, unless it is locked: even, swapped with what is not painted, or its edges
+    softened a little; again softens them more.
+    """
 
-    def fill(view: ViewState, index: int) -> ViewState:
-        count = facts.rows[view.layers[index].gdf].count
-        return stack.with_paint(view, index, paint.encode(np.full(count, weight, np.float32)))
-
-    return _change_focused(workspace, fill)
-
-
-def _invert_paint(workspace: Workspace, facts: SceneFacts) -> Workspace:
-    """What is painted of the focused layer, and what is not, swapped."""
-
-    def swap(view: ViewState, index: int) -> ViewState:
-        layer = view.layers[index]
-        return stack.with_paint(view, index, paint.invert(layer.paint, facts.rows[layer.gdf].count))
-
-    return _change_focused(workspace, swap)
-
-
-def _feather(workspace: Workspace, facts: SceneFacts) -> Workspace:
-    """The edges of the focused layer's paint softened a little; again softens them more."""
-
-    def soften(view: ViewState, index: int) -> ViewState:
+    def change(view: ViewState, index: int) -> ViewState:
         layer = view.layers[index]
         row = facts.rows[layer.gdf]
-        width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
-        return stack.with_paint(view, index, paint.feather(layer.paint, row.points, width))
+        if how == "paint_feather":
+            width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
+            return stack.with_paint(view, index, paint.feather(layer.paint, row.points, width))
+        if how == "paint_invert":
+            return stack.with_paint(view, index, paint.invert(layer.paint, row.count))
+        even = np.full(row.count, how == "paint_fill", np.float32)
+        return stack.with_paint(view, index, paint.encode(even))
 
-    return _change_focused(workspace, soften)
+    return change_focused(workspace, change)
 
 
 def _take_tool(workspace: Workspace, tool: str) -> Workspace:
@@ -216,27 +208,12 @@ def _blend(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, view=replace(workspace.view, blend=after))
 
 
-def _change_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
-    if workspace.focus is None:
-        return workspace
-    return replace(workspace, view=change(workspace.view, workspace.focus))
-
-
 def _back(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
     kept = past.present
     workspace = replace(workspace, past=past, snapshots=kept.snapshots, renaming=None)
-    return _with_layers_of(workspace, history.apply_edit(workspace.view, kept.edit))
-
-
-def _with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
-    """Another state; the focus stays on its layer, wherever that has gone."""
-    focus, before = workspace.focus, workspace.view.layers
-    if focus is not None and focus < len(before):
-        places = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
-        focus = focus if focus in places else next(iter(places), None)
-    return replace(workspace, view=view, focus=focus)
+    return with_layers_of(workspace, history.apply_edit(workspace.view, kept.edit))
 
 
 def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
@@ -259,7 +236,7 @@ def _restore(workspace: Workspace, index: str) -> Workspace:
     kept = snapshots.with_original(workspace.snapshots, workspace.view)
     if not 0 <= int(index) < len(kept):
         return workspace
-    return _with_layers_of(workspace, snapshots.restore(workspace.view, kept[int(index)]))
+    return with_layers_of(workspace, snapshots.restore(workspace.view, kept[int(index)]))
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
@@ -288,7 +265,7 @@ def _blend_snapshots(workspace: Workspace, share: str, facts: SceneFacts) -> Wor
         return workspace
     kept = snapshots.with_original(workspace.snapshots, workspace.view)
     view = snapshots.blend(workspace.view, kept, float(share), lambda gdf: facts.rows[gdf].count)
-    return _with_layers_of(workspace, view)
+    return with_layers_of(workspace, view)
 
 
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
@@ -304,27 +281,6 @@ def _new_edit(workspace: Workspace, _: str) -> Workspace:
 
 GLIDES = ("frame", "home", "look")
 """Actions that take the camera elsewhere, which the window shows as a short way."""
-REQUESTS = (
-    *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
-    *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
-    *("train", "stop_run", "resume_run", "discard_run", "run_log", "stop_and_quit"),
-    *(
-        "export",
-        "render_picture",
-        "render_film",
-        "deliver",
-        "stop_delivery",
-        "drop_and_quit",
-        "about",
-        "demo",
-    ),
-    *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
-    *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up"),
-)
-"""What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
-afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
-layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`;
-`save_region:NAME`, `rename_region:INDEX:NAME`."""
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
     "unfocus": _step_back,
@@ -335,7 +291,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "solo": lambda workspace, _: layer_selection.switch_selected(workspace, "solo"),
     "show_all": _show_all,
     "lock": lambda workspace, _: layer_selection.switch_selected(workspace, "locked"),
-    "fold": lambda workspace, _: _change_focused(workspace, stack.toggle_details),
+    "fold": lambda workspace, _: change_focused(workspace, stack.toggle_details),
     "rename": _rename,
     "remove": layer_selection.remove,
     "press_layer": layer_selection.press,

@@ -30,6 +30,19 @@ from .view_state import Comparison, ViewState
 MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
 UNSAVED = "• "
 """Before the scene's name where there are unsaved changes."""
+REQUESTS = (
+    *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
+    *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
+    *("train", "stop_run", "resume_run", "discard_run", "run_log", "stop_and_quit"),
+    *("export", "render_picture", "render_film", "deliver", "stop_delivery", "drop_and_quit"),
+    *("about", "demo"),
+    *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
+    *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up"),
+)
+"""What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
+afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
+layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`;
+`save_region:NAME`, `rename_region:INDEX:NAME`."""
 
 
 def _unknown() -> Neighborhood:
@@ -246,3 +259,19 @@ def focus_layer(workspace: Workspace, index: int) -> Workspace:
     """With another layer focused, and it alone selected; as it was where there is no such layer."""
     found = 0 <= index < len(workspace.view.layers)
     return replace(workspace, focus=index, selected=frozenset()) if found else workspace
+
+
+def change_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
+    """With the focused layer changed, if one is; `change` gets its index."""
+    if workspace.focus is None:
+        return workspace
+    return replace(workspace, view=change(workspace.view, workspace.focus))
+
+
+def with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
+    """Another state; the focus stays on its layer, wherever that has gone."""
+    focus, before = workspace.focus, workspace.view.layers
+    if focus is not None and focus < len(before):
+        places = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
+        focus = focus if focus in places else next(iter(places), None)
+    return replace(workspace, view=view, focus=focus)
