@@ -60,6 +60,6 @@ bench: setup
 # Everything the README and the documents show that a command made.
 pictures: setup window
 	$(BIN)/progdf demo --out demo --no-window
-	cp demo/hero.png demo/two-sliders.png assets/
+	cp demo/hero.png demo/one-picture.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
 	$(BIN)/python -m benchmarks --markdown docs/benchmarks.md

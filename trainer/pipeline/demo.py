@@ -26,7 +26,7 @@ from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.cameras import save_cameras
-from progdf.io.images import contact_sheet, to_picture, write_image
+from progdf.io.images import contact_sheet, read_picture, to_picture, write_image
 from progdf.io.picture_camera import camera_chunk
 from progdf.rasterize import render
 from trainer.option_checks import check_ranges
@@ -39,6 +39,7 @@ STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MOST_GAUSSIANS = 5_000_000
 """As many as large trained scenes have: what --size says at most."""
 _HERO_HEIGHT = 400
+_TURNS = (-4, 3, 6)  # cameras from the one of the picture, 11 degrees each
 _GRID = (0.0, 1 / 3, 2 / 3, 1.0)
 
 
@@ -194,7 +195,7 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
 
 
 def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
-    """Write what sliders do: each alone, two against each other, and in large.
+    """Write what sliders do: each alone, two against each other, in large, and of one picture.
 
     Args:
         folder: where scene.ply lies and the pictures go
@@ -203,12 +204,13 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
         view: which camera
 
     Returns:
-        sliders.png, two-sliders.png, hero.png
+        sliders.png, two-sliders.png, hero.png, and for an edit made of a changed picture one-picture.png: the
+        render, the picture, and the edit from three sides
     """
     gaussians = load_ply(folder / "scene.ply")
-    camera = scene.cameras[view]
 
-    def shot(height: int, strengths: Mapping[str, float]) -> Tensor:
+    def shot(height: int, strengths: Mapping[str, float], view: int = view) -> Tensor:
+        camera = scene.cameras[view]
         layers = [Layer(gdfs[name], strength) for name, strength in strengths.items()]
         sized = camera.resize(round(height * camera.width / camera.height), height)
         with torch.no_grad():
@@ -231,8 +233,14 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
         "Two sliders, every mixture",
     )
     hero = torch.cat([shot(_HERO_HEIGHT, {third: strength}) for strength in STRENGTHS], dim=1)
+    pictures = [("sliders", sliders), ("two-sliders", grid), ("hero", hero)]
+    for name in names:
+        if (folder / f"{name}.png").is_file():
+            given = shot(_HERO_HEIGHT, {}), read_picture(folder / f"{name}.png", (_HERO_HEIGHT, _HERO_HEIGHT))
+            sides = [shot(_HERO_HEIGHT, {name: 1.0}, view + turn) for turn in _TURNS]
+            pictures.append(("one-picture", torch.cat([*given, *sides], dim=1)))
     written = []
-    for name, image in (("sliders", sliders), ("two-sliders", grid), ("hero", hero)):
+    for name, image in pictures:
         written.append(folder / f"{name}.png")
         write_image(written[-1], image)
     return written
