@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from progdf.camera import Camera
@@ -24,11 +25,12 @@ from progdf.gaussians import Gaussians
 from progdf.io.images import read_picture
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
+from progdf.sh import sh0_to_rgb
 from trainer.editors.pictures import mend_background, transmittance
 from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plane
 
 from .few_masks import connected_pieces
-from .lift import lift_masks
+from .lift import HIDDEN, bare_weight, lift_masks
 
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
@@ -43,6 +45,8 @@ _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
 _LEAST = 0.5  # of a member's visible share lies where the pictures differ
 _RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thinner
 _INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
+_LITTLE = 1e-3  # of what the largest piece shows there: as good as nothing
+_ODD, _VOTED = 0.06, 0.005  # of color, apart from all that is shown; of score, above the least
 
 
 def changed_region(
@@ -74,7 +78,7 @@ def changed_region(
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
     found = lift_masks(scene, small, masks, "changed", "share", least)
-    region = _drop_strays(scene, found, small, masks)
+    region = _drop_strays(scene, found, small, masks, least)
     if not len(region):
         raise ProgdfError(
             "no Gaussian lies mostly where the pictures differ; change more, or name the region with --region"
@@ -84,7 +88,7 @@ def changed_region(
         strays = len(found) - len(region)
         say(
             f"changed: {share:.1%} of the pictures differ, which {format_count(len(region))} show"
-            + (f"; {format_count(strays)} along its rim left out" if strays else "")
+            + (f"; {format_count(strays)} beside it left out" if strays else "")
         )
     return region
 
@@ -131,18 +135,26 @@ def _moved(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
 
 
 def _drop_strays(
-    scene: Gaussians, region: Region, cameras: Sequence[Camera], masks: Sequence[Tensor]
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], masks: Sequence[Tensor], least: float
 ) -> Region:
-    """The region without connected pieces that show along the rim of what changed, and nowhere else."""
+    """The region without connected pieces that show along the rim of what changed, and nowhere else; and
+    without what does not show, and is neither on the surface nor of the color of anything that does."""
     if not len(region):
         return region
+    members = scene[region.members]
     sums = torch.zeros(len(region), 4, dtype=torch.float64)
     for camera, mask in zip(cameras, masks, strict=True):
         sums += alpha_weights(scene, camera, _within_rim(mask))[region.members]
-    piece = connected_pieces(scene[region.members])
+    piece = connected_pieces(members)
     inside, shown = (np.bincount(piece, sums[:, column].numpy()) for column in (0, 2))
-    kept = (inside > _INNER * shown) | (inside == inside.max())
-    kept = torch.from_numpy(kept[piece])
+    whole = (inside > _INNER * shown) & (inside > _LITTLE * inside.max()) | (inside == inside.max())
+    kept = torch.from_numpy(whole[piece])
+    hidden = sums[:, 2] < HIDDEN * bare_weight(members.opacities) * sums[:, 3].clamp_min(1.0)
+    if bool(hidden.any()) and bool((kept & ~hidden).any()):
+        colors = sh0_to_rgb(members.sh0).numpy()
+        apart = cKDTree(colors[kept & ~hidden]).query(colors[hidden])[0]
+        likely = region.score[region.members[hidden]] > least + _VOTED
+        kept[hidden] &= likely | torch.from_numpy(apart <= _ODD)
     score = region.score.clone()
     score[region.members[~kept]] = 0.0
     return Region(region.name, region.members[kept], score)
