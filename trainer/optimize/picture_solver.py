@@ -45,8 +45,9 @@ _RIDGE = 1e-5
 
 _WEAKEST_TIE = 5e-3  # of all of a member's: most of its neighbors are hardly alike
 
-_BRIGHTEST = 0.99
-"""Quantile of the members' own channels which no member becomes brighter than, if it is above 1."""
+_BRIGHTEST, _GLARE = 0.99, 1.0
+"""The brightest: this quantile of the members' own channels, or 1. How much brighter a member may become to
+outshine what is before it; the paint is fitted without that."""
 
 _PAINTS, _ROUNDS, _GAIN = 3, 12, 2e-3
 """How often the paint is fitted; rounds of descent each time, until one gains less than this share."""
@@ -90,7 +91,8 @@ class PictureSolver:
         prior = torch.zeros_like(change)
         for _ in range(_PAINTS):
             change = self._descend(change, bands, prior, targets)
-            paint = fit_paint(self.colors, change, self.shown)
+            low, high = self._limits(0.0)
+            paint = fit_paint(self.colors, change.clamp(low, high), self.shown)
             # where one function of color is the edit, what no picture shows follows it too
             prior = paint.full if paint.whole else torch.zeros_like(change)
             amounts = paint.trust * paint.amounts
@@ -112,7 +114,7 @@ class PictureSolver:
 
     def _descend(self, change: Tensor, bands: Tensor, prior: Tensor, targets: Sequence[Tensor]) -> Tensor:
         """Projected Newton steps (Bertsekas 1982) to the change of color that fits best. [M,3] float64"""
-        low, high = self._limits()
+        low, high = self._limits(_GLARE)
         change = change.clamp(low, high)
         error, apart, free = self._look(change, bands, prior, targets)
         for _ in range(_ROUNDS):
@@ -131,9 +133,9 @@ class PictureSolver:
                 break
         return change
 
-    def _limits(self) -> tuple[Tensor, Tensor]:
-        """How far the members' colors may change. [M,3] each"""
-        most = max(1.0, float(np.quantile(self.colors.numpy(), _BRIGHTEST)))
+    def _limits(self, glare: float) -> tuple[Tensor, Tensor]:
+        """How far the members' colors may change, `glare` beyond the brightest. [M,3] each"""
+        most = max(1.0, float(np.quantile(self.colors.numpy(), _BRIGHTEST))) + glare
         low, high = self.colors.clamp_max(0.0) - self.colors, self.colors.clamp_min(most) - self.colors
         shown = (self.shown > 0)[:, None]  # the others shine in no picture
         return torch.where(shown, low, -math.inf), torch.where(shown, high, math.inf)

@@ -46,7 +46,8 @@ _LEAST = 0.5  # of a member's visible share lies where the pictures differ
 _RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thinner
 _INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
 _LITTLE = 1e-3  # of what the largest piece shows there: as good as nothing
-_ODD, _VOTED = 0.06, 0.005  # of color, apart from all that is shown; of score, above the least
+_ODD, _VOTED = 0.06, 0.001  # of color, apart from nearly all that shows; of score, above the least
+_FEW = 0.01  # of what shows, on the rim perhaps
 
 
 def changed_region(
@@ -152,7 +153,9 @@ def _drop_strays(
     hidden = sums[:, 2] < HIDDEN * bare_weight(members.opacities) * sums[:, 3].clamp_min(1.0)
     if bool(hidden.any()) and bool((kept & ~hidden).any()):
         colors = sh0_to_rgb(members.sh0).numpy()
-        apart = cKDTree(colors[kept & ~hidden]).query(colors[hidden])[0]
+        shown_colors = colors[kept & ~hidden]
+        like = min(len(shown_colors), 1 + int(_FEW * len(shown_colors)))
+        apart = cKDTree(shown_colors).query(colors[hidden], [like])[0][:, 0]
         likely = region.score[region.members[hidden]] > least + _VOTED
         kept[hidden] &= likely | torch.from_numpy(apart <= _ODD)
     score = region.score.clone()
