@@ -49,7 +49,7 @@ def compare(hand: Rig) -> None:
 def difference(hand: Rig) -> None:
     """What differs, four times as bright, with the PSNR."""
     _at(hand, (1.0,) * len(hand.strengths))
-    hand.key("Shift+Y")
+    hand.key("D")
 
 
 def recorded(hand: Rig) -> None:
