@@ -32,6 +32,7 @@ BENCHES: dict[str, str] = {
     "viewer": "benchmarks.viewer.slider:tables",
     "select": "benchmarks.viewer.selection:tables",
     "frames": "benchmarks.viewer.frames:tables",
+    "moving": "benchmarks.viewer.moving:tables",
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.warps:tables",
     "pictures": "benchmarks.pictures:tables",
@@ -45,14 +46,14 @@ class BenchOptions:
     """Measure speed against error; each benchmark interleaves what it compares in one process.
 
     Args:
-        what: rasterize, field, edits, networks, viewer, select, frames, window, warps, pictures; none
-            named is all
+        what: rasterize, field, edits, networks, viewer, select, frames, moving, window, warps, pictures;
+            none named is all
         json: also write the tables to this JSON file
         markdown: also put the tables between their markers in this Markdown file
         runs: finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits
         plot: `field` also draws its errors into this PNG file
-        scenes: .ply files that viewer, select, frames and window take in place of the bears, warps beside
-            them, and pictures alone
+        scenes: .ply files that viewer, select, frames, moving and window take in place of the bears, warps
+            beside them, and pictures alone
         seconds: how long `window` drags its slider; 60 where not said
     """
 
@@ -78,7 +79,7 @@ def main(argv: Sequence[str]) -> int:
     trained = ("field", "edits", "networks")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
-    drawing = ("viewer", "select", "frames", "window", "warps", "pictures")
+    drawing = ("viewer", "select", "frames", "moving", "window", "warps", "pictures")
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks {drawing[0]}")
     if options.seconds is not None and options.what and "window" not in options.what:

@@ -12,6 +12,7 @@ import torch
 from benchmarks import __main__ as front
 from benchmarks.table import Table
 from benchmarks.viewer import frames as bench_frames
+from benchmarks.viewer import moving
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.mouse import Mouse
@@ -71,6 +72,18 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
     coarse = bench_frames.coarse_table(turnings, "a renderer")
     assert [row[-2:] for row in frames.rows] == [("2.50 (0.80)", "200"), ("1.50 (0.90)", "300")]
     assert all(len(row) == len(table.columns) for table in (frames, coarse) for row in table.rows)
+
+
+@pytest.mark.gl
+def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moving, "_SETTLE_S", 0.05)
+    ctx = headless_context()
+    result = moving.measure(ctx, bear(2000).gaussians, steps=2, size=(240, 200))
+    ctx.release()
+    assert len(result.turning) == 2
+    assert 20.0 < result.db < 60.0
+    assert abs(result.luminance) < 0.02
+    assert moving.table([result]).rows[0][0] == "2 000"
 
 
 def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:

@@ -27,10 +27,15 @@ class Canvas:
         context: the GL context of the engine
         engine: draws them; stays the caller's
         found: where the engine's edits were recorded, one for each
+        last: the canvas of the same scene under other edits; its picture stays until there is one of these
     """
 
     def __init__(
-        self, context: moderngl.Context, engine: ViewEngine, found: Sequence[RecordingFile] = ()
+        self,
+        context: moderngl.Context,
+        engine: ViewEngine,
+        found: Sequence[RecordingFile] = (),
+        last: Canvas | None = None,
     ) -> None:
         self.comparer = Comparer(engine, context, found)
         self._thumbnails = Thumbnails(context, engine)
@@ -41,6 +46,9 @@ class Canvas:
         self._resolution = dynamic_resolution.first_known(len(engine.scene), engine.draws_with)
         self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
         self._awaited: object = None  # what is being made while the last picture stays on screen
+        self._follows = last is not None and engine.follow(last.comparer.engine)
+        if last is not None and self._follows:
+            self._resolution, self._last = last._resolution, last._last
 
     def draw(
         self,
@@ -75,7 +83,8 @@ class Canvas:
         self._resolution = dynamic_resolution.before_draw(before, mode, held, turned, slid, now)
         self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap, pointed)
         wanted = aim, edits, self.comparer.engine.highlight
-        if mode != "off" and self.pictures_drawn and dynamic_resolution.takes_long(before, self._resolution):
+        shown = self.pictures_drawn or self._follows
+        if mode != "off" and shown and dynamic_resolution.takes_long(before, self._resolution):
             moves = turned or (held and self._awaited not in (None, wanted))
             if moves or not self.comparer.prepare(view, size):
                 stays = not moves and before.pixels == 1 and view.compare.mode == "off"

@@ -115,8 +115,9 @@ class MainView:
         """
         self.canvas.release()
         self.surfaces.drop()
+        found = (*facts.recordings, *(RecordingFile() for _ in live))
         self.engine, self.facts, self.live = engine, facts, live
-        self.canvas = Canvas(self.context, engine, (*facts.recordings, *(RecordingFile() for _ in live)))
+        self.canvas = Canvas(self.context, engine, found, self.canvas)
         self.wake()
 
     def change(self, view: ViewState) -> None:

@@ -29,6 +29,7 @@ from viewer.gl.scene_textures import row_runs
 
 from .ground_grid import CLEAR, Lines
 from .highlight import HIDDEN
+from .renderers import Renderer
 
 Image = NDArray[np.float32]
 
@@ -246,6 +247,13 @@ class CpuRenderer:
         if self._begun is not None:
             self._begun.drop()
             self._begun = None
+
+    def follow(self, last: Renderer) -> bool:
+        """See `Renderer.follow`."""
+        if isinstance(last, CpuRenderer) and last._kept is not None:
+            self._keep(last._kept)
+            self._lent = True  # two have it
+        return self._kept is not None
 
     def forget(self) -> None:
         """Draw the next picture as a whole, whatever the last one was."""

@@ -18,7 +18,7 @@ REST_S = 0.06
 POLL_S = 0.02
 """Between two looks whether it is done."""
 
-MANY = 300_000
+MANY = 150_000
 """Gaussians of which the CPU's pictures are taken for slow before the first one is known."""
 
 JUMP_MS = 100.0

@@ -147,6 +147,10 @@ class ViewEngine:
         self.renderer.show(framebuffer, size, left, self._grid_lines(view, camera))
         return self.timings
 
+    def follow(self, last: ViewEngine) -> bool:
+        """Take over another engine's picture, to be shown until there is one of this; whether it could."""
+        return last.scene is self.scene and self.renderer.follow(last.renderer)
+
     def show_last(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         """Show the last picture once more, whatever `view` asks for."""
         self.renderer.show(framebuffer, size, 0, self._grid_lines(view, to_camera(view.camera, *size)))

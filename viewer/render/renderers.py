@@ -62,6 +62,9 @@ class Renderer(Protocol):
         """Begin the picture, if making it may take long, without waiting for it; whether `draw` now has it at
         once. Any other call drops what was begun."""
 
+    def follow(self, last: Renderer) -> bool:
+        """Take over another's picture, to be shown until there is a new one; whether there was one."""
+
     def forget(self) -> None:
         """Draw the next picture as a whole, whatever the last one was."""
 
@@ -135,6 +138,9 @@ class GlRenderer:
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         return True
+
+    def follow(self, last: Renderer) -> bool:
+        return False
 
     def forget(self) -> None:
         pass  # as it does every time

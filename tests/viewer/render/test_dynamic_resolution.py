@@ -12,6 +12,7 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.inputs import Keys, Press
 from viewer.render import dynamic_resolution
 from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution
+from viewer.render.engine import ViewEngine
 from viewer.render.timings import FrameTimings
 
 SLOW = FrameTimings(draw_ms=SLOW_MS + 1.0, share=1.0)
@@ -166,6 +167,20 @@ def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
     hand.main_view.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
     hand.frame()
     assert (hand.picture() == before).all(), "the last picture stays"
+    settle_sharply(hand)
+    old, new = hand.picture(), hand.main_view.engine
+    other = ViewEngine(hand.main_view.context, new.scene, (), "cpu")
+    hand.main_view.set_engine(other, hand.main_view.facts)
+    hand.main_view.change(replace(hand.main_view.work.view, layers=()))
+    hand.frame()
+    assert (hand.picture() == old).all(), "also that of another engine, as while an edit is trained"
+    settle_sharply(hand)
+    hand.main_view.set_engine(new, hand.main_view.facts)
+    other.release()
+
+
+def settle_sharply(hand: Rig) -> None:
+    """Frames until the picture in full is there."""
     while hand.main_view.next_frame_delay() == 0.0 or hand.main_view.canvas.next_frame_delay(0.0) is not None:
         wait(hand, 0.02)
     image = hand.main_view.engine.image(hand.main_view.work.view, (340, 540))

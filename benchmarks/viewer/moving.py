@@ -1,0 +1,175 @@
+"""`python -m benchmarks moving`: what a hand feels that turns a scene, lets it rest, clicks and selects.
+
+Whole frames of a whole window, drawn by the CPU, from the mouse's event to finished pixels; beside them the
+error of the pictures in motion, which have fewer Gaussians and pixels.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.table import Table
+from progdf.gaussians import Gaussians
+from progdf.metrics.image import psnr
+from viewer.camera.view_camera import first_camera
+from viewer.render.dynamic_resolution import COARSE
+from viewer.render.engine import ViewEngine
+from viewer.render.headless import headless_context
+from viewer.render.threads import one_thread
+from viewer.state.view_state import ViewState
+
+from .mouse import Mouse
+from .scenes import copies, scenes_of
+
+SIZE, STEPS, TURN_PX, WARM_UP = (980, 800), 60, 10.0, 3
+MILLION, JUDGED = 1_000_000, 6
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_POLL_S, _SETTLE_S, _LONGEST_S = 0.005, 3.0, 20.0
+
+
+@dataclass(frozen=True)
+class Moving:
+    """One scene in the hand; times in ms.
+
+    Args:
+        count: Gaussians
+        turning: frames while the picture turns
+        sharp: from the last of these to the picture in full, the hand at rest on the button
+        meanwhile: the longest frame until then
+        click, lasso: the longest frame of a click on the picture; of letting go of a lasso
+        full: the picture in full
+        db: PSNR of the pictures in motion to those in full, the worst
+        luminance: difference of their means, the largest, of the full one's
+    """
+
+    count: int
+    turning: tuple[float, ...]
+    sharp: float
+    meanwhile: float
+    click: float
+    lasso: float
+    full: float
+    db: float
+    luminance: float
+
+
+def tables(scenes: Sequence[Path] = ()) -> list[Table]:
+    """Measure, for docs/benchmarks.md.
+
+    Args:
+        scenes: .ply files that take the place of the bears; the largest is laid over itself up to a million
+
+    Raises:
+        ProgdfError: there is no OpenGL here, or a file is broken.
+    """
+    opened = scenes_of(scenes)
+    if len(opened[-1]) < MILLION:
+        opened.append(copies(opened[-1], round(MILLION / len(opened[-1]))))
+    ctx = headless_context()
+    try:
+        return [table([measure(ctx, scene) for scene in opened])]
+    finally:
+        ctx.release()
+
+
+@one_thread()
+def measure(
+    ctx: moderngl.Context, scene: Gaussians, steps: int = STEPS, size: tuple[int, int] = SIZE
+) -> Moving:
+    """A hand at a window that shows `scene`, always with pictures in motion."""
+    engine = ViewEngine(ctx, scene, (), "cpu")
+    view = ViewState(first_camera(scene), dynamic_resolution="on")
+    with Mouse(ctx, engine, scene, (), view, size) as mouse:
+        mouse.grip_picture()
+        turning, db, luminance = [], math.inf, 0.0
+        for step in range(-WARM_UP, steps):
+            turning.append(mouse.turn(TURN_PX))
+            if step >= 0 and step % max(steps // JUDGED, 1) == 0:
+                error, apart = _compare(mouse, scene)
+                db, luminance = min(db, error), max(luminance, apart, key=abs)
+        began = time.perf_counter()
+        meanwhile = _rest(mouse, until_sharp=True)
+        sharp, full = 1e3 * (time.perf_counter() - began), mouse.main_view.canvas.timings.total_ms
+        mouse.release()
+        mouse.frame(seconds=1.0)
+        click = max(mouse.press(), mouse.release(), mouse.frame(), _rest(mouse))
+        held = mouse.main_view.work.view
+        mouse.main_view.change(replace(held, select=replace(held.select, tool="lasso")))
+        _rest(mouse)
+        middle, reach = (size[0] / 2, size[1] / 2), 0.25 * min(size)
+        mouse.move(middle[0], middle[1] - reach)
+        mouse.press()
+        for turn in np.linspace(0.0, 2.0 * np.pi, 40):
+            mouse.move(middle[0] + reach * np.sin(turn), middle[1] - reach * np.cos(turn))
+        lasso = max(mouse.release(), _rest(mouse))
+    engine.release()
+    return Moving(len(scene), tuple(turning[WARM_UP:]), sharp, meanwhile, click, lasso, full, db, luminance)
+
+
+def table(results: Sequence[Moving]) -> Table:
+    """A row a scene."""
+    rows = []
+    for result in results:
+        middle, late = np.percentile(result.turning, (50, 95))
+        rows.append(
+            (
+                f"{result.count:,}".replace(",", " "),
+                f"{result.full:.0f}",
+                f"**{middle:.0f}** / {late:.0f}",
+                f"{result.sharp:.0f} ({result.meanwhile:.0f})",
+                f"{result.click:.0f}",
+                f"{result.lasso:.0f}",
+                f"{result.db:.1f}",
+                f"{100 * result.luminance:+.2f} %",
+            )
+        )
+    return Table(
+        "moving",
+        f"A scene in the hand without a graphics card, {SIZE[0]}×{SIZE[1]}, ms",
+        (
+            "Gaussians",
+            "picture in full",
+            "frame while turning p50 / p95",
+            "sharp after (longest frame)",
+            "click",
+            "lasso let go",
+            "PSNR while turning, dB",
+            "luminance while turning",
+        ),
+        tuple(rows),
+        "Whole frames, from the mouse's event to finished pixels of picture and panel; each step of "
+        f"{STEPS} turns three degrees. The errors are the worst of {JUDGED} pictures, on white.",
+    )
+
+
+def _compare(mouse: Mouse, scene: Gaussians) -> tuple[float, float]:
+    """PSNR of the last picture to the one in full, and the relative difference of their luminance."""
+    view, (width, height) = mouse.main_view.work.view, mouse.size
+    drawn = mouse.engine.renderer.pixels().clip(0.0, 1.0)
+    moving = drawn.repeat(COARSE, 0).repeat(COARSE, 1)[:height, :width]
+    full: NDArray[np.float32] = ViewEngine(None, scene).image(view, mouse.size).clip(0.0, 1.0)
+    error = psnr(torch.from_numpy(moving), torch.from_numpy(full))
+    return error, float((moving @ _LUMINANCE).mean() / (full @ _LUMINANCE).mean()) - 1.0
+
+
+def _rest(mouse: Mouse, until_sharp: bool = False) -> float:
+    """Frames while the hand rests, as the window draws them; the longest one, ms."""
+    began = last = time.perf_counter()
+    longest = 0.0
+    while time.perf_counter() - began < (_LONGEST_S if until_sharp else _SETTLE_S):
+        if until_sharp and mouse.main_view.canvas.pixels == 1:
+            break
+        now = time.perf_counter()
+        longest = max(longest, mouse.frame(seconds=now - last))
+        last = now
+        time.sleep(min(max(mouse.main_view.next_frame_delay() or 0.0, _POLL_S), 4 * _POLL_S))
+    return longest
