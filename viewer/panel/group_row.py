@@ -54,6 +54,8 @@ def draw(state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions
     imgui.get_window_draw_list().add_text(corner, color, f"{strength:.2f}")
     imgui.end_group()
     imgui.pop_id()
+    if strength == group.strength:
+        return state
     return stack.change_group(state, group.name, lambda old: replace(old, strength=strength))
 
 

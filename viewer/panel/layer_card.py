@@ -94,15 +94,16 @@ class CardResult:
     named: bool = False
 
 
-def draw_card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> CardResult:
+def draw_card(state: ViewState, index: int, active: bool, cards: Cards, ui: UiContext) -> CardResult:
     """One card: eye, swatch, name and value; the slider; count and toggles; unfolded, curve and gains.
 
     Where cards are compact, a row with the eye, the swatch, the name, a short slider and the value.
+    `active`: the layer takes part in the picture.
     """
     scale, p = ui.scale, PALETTE
     layer, focused = state.layers[index], cards.focus == index
     selected = focused or layer.gdf in cards.selected
-    row, active = cards.rows[layer.gdf], stack.is_visible(state, layer)
+    row = cards.rows[layer.gdf]
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
@@ -138,9 +139,9 @@ def draw_card(state: ViewState, index: int, cards: Cards, ui: UiContext) -> Card
     touched = imgui.is_item_active()
     imgui.end_disabled()
     _number(number_at, strength, active, cards)
-    card = replace(
-        card, state=stack.change_layer(card.state, index, lambda old: replace(old, strength=strength))
-    )
+    if strength != layer.strength:  # a new state takes its time, and most cards rest
+        moved = stack.change_layer(card.state, index, lambda old: replace(old, strength=strength))
+        card = replace(card, state=moved)
     if not cards.compact:
         card = _foot(card, index, row, ui)
     if layer.gdf in card.state.unfolded:
@@ -276,7 +277,7 @@ def _name(card: CardResult, index: int, room: float, cards: Cards, active: bool,
     imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     color = PALETTE.text if active else PALETTE.dim
-    card = replace(card, named=imgui.is_item_active())
+    card = replace(card, named=True) if imgui.is_item_active() else card
     marks = f"{Icon.LOCKED} " * (layer.locked and cards.compact) + "S " * (layer.solo and cards.compact)
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):

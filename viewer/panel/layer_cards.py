@@ -122,6 +122,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
     dropped = False
     spans: list[tuple[float, float]] = []
     listed: list[int] = []
+    visible = {layer.name for layer in stack.visible_layers(state)}
     group = ""
     for i in found:
         layer = state.layers[i]
@@ -134,7 +135,7 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
         inset = INSET_PX * ui.scale * bool(group)
         top, left = imgui.get_cursor_screen_pos().y, imgui.get_cursor_pos_x()
         imgui.set_cursor_pos_x(left + inset)
-        card = draw_card(state, i, cards, ui)
+        card = draw_card(state, i, layer.name in visible, cards, ui)
         state = card.state
         spans.append((top, imgui.get_item_rect_max().y))
         _tighten(cards, ui)
