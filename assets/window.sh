@@ -15,6 +15,8 @@ cd "$folder"
 window=$!
 xdotool search --sync --onlyvisible --name scene.ply >/dev/null
 sleep 20 # the first picture on a machine compiles the rasterizer
+xdotool key shift+g # without the ground grid
+sleep 1
 xdotool key shift+F2
 sleep 3
 xdotool key ctrl+q
