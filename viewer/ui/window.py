@@ -83,6 +83,7 @@ class Window:
         glfw.swap_interval(1)
         self._pressed: list[Press] = []
         self._down: dict[int, str] = {}  # names of the keys that are down
+        self._chorded: set[int] = set()  # those of them that went down with Ctrl, and do not fly without it
         self._windowed: tuple[int, int, int, int] | None = None
         self._clicks = DoubleClicks()
         self._heard_until = time.perf_counter()  # when it last stopped listening, to draw
@@ -191,7 +192,8 @@ class Window:
 
     def take_keys(self) -> Keys:
         """What the keyboard did since the last call."""
-        fly = frozenset(n for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS)
+        down = {n: key for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS}
+        fly = frozenset(n for n, key in down.items() if key not in self._chorded)
         keys = Keys(tuple(self._pressed), frozenset(self._down.values()), fly)
         self._pressed.clear()
         return keys
@@ -199,7 +201,10 @@ class Window:
     def _note_key(self, key: int, scancode: int, action: int, mods: int) -> None:
         if action == glfw.RELEASE:
             self._down.pop(key, None)
+            self._chorded.discard(key)
             return
+        if mods & glfw.MOD_CONTROL and action == glfw.PRESS:
+            self._chorded.add(key)
         name = key_name(key, scancode)
         self._down[key] = name
         # imgui adds its own event after this one

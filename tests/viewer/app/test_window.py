@@ -194,6 +194,9 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
     desktop.drag((400, 400), (480, 380))
     desktop.until("the turn", lambda: changed(first, desktop.shot()) > 1000)
     orbited = desktop.rest()
+    desktop.xdotool("keydown", "ctrl", "keydown", "a", "keyup", "ctrl")  # as hands let go of a chord
+    assert changed(orbited, desktop.rest()) == 0, "what is left of Ctrl+A does not fly"
+    desktop.xdotool("keyup", "a")
     desktop.xdotool("keydown", "w")
     desktop.until("the flight", lambda: changed(orbited, desktop.shot("F2")) > 1000)
     desktop.xdotool("keyup", "w")
