@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
 from trainer.evaluate.options import EvaluateOptions
-from trainer.regions.options import RegionOptions, ViewsOptions, join_negative_values
+from trainer.regions.options import RegionOptions, ViewsOptions
 
 from .options import FitOptions, TrainOptions
 from .presets import apply_preset
@@ -50,7 +50,7 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
 
 def region(argv: Sequence[str]) -> int:
     """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
-    options = parse_options(RegionOptions, join_negative_values(argv), "progdf region")
+    options = parse_options(RegionOptions, argv, "progdf region")
     from trainer.regions.command import show
 
     print(show(options))

@@ -16,7 +16,7 @@ from progdf.formats.load_report import file_size, format_count, group_digits
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gdf.header import GdfHead, read_head
 from progdf.io import session as session_file
-from progdf.io.atomic import check_regular, open_error
+from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json, decode_json
 from progdf.scene.stats import survey
@@ -59,12 +59,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         ProgdfError: it cannot be read, or is nothing we know.
     """
     path = scene_file(path)
-    check_regular(path)
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError as error:
-        raise open_error(path, error) from None
+    start = read_file(path, 64)
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "gdf"
     if scene_format(path) is not None:

@@ -30,7 +30,7 @@ def parse_options(
         ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
     """
     said = io.StringIO()
-    argv = _join_axes(argv)
+    argv = _join_negative_values(argv)
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
@@ -42,12 +42,12 @@ def parse_options(
         raise ProgdfError(f"{_short_message(said.getvalue())}; see {command} --help") from None
 
 
-def _join_axes(argv: Sequence[str]) -> list[str]:
-    """`--up -y` as `--up=-y`: what begins with a minus would be taken for an option."""
+def _join_negative_values(argv: Sequence[str]) -> list[str]:
+    """`--up -y` as `--up=-y`, and so with --orbit: what begins with a minus would be taken for an option."""
     found: list[str] = []
     for argument in argv:
-        if found and found[-1] == "--up":
-            found[-1] = f"--up={argument}"
+        if found and found[-1] in ("--up", "--orbit"):
+            found[-1] += f"={argument}"
         else:
             found.append(argument)
     return found

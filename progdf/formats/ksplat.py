@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import open_error
+from progdf.io.atomic import read_file
 from progdf.sh import C0
 
 _HEADER, _SECTION = 4096, 1024
@@ -59,10 +58,7 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     Raises:
         ProgdfError: it is no .ksplat, or truncated or damaged.
     """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise open_error(path, error) from None
+    content = read_file(path)
     if len(content) < _HEADER or not is_ksplat(content):
         raise ProgdfError(f"{path} is not a .ksplat scene; export it again")
     level = _number(content, 20, "<u2")

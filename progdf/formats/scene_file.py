@@ -24,7 +24,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import check_regular, open_error
+from progdf.io.atomic import read_file
 from progdf.terminal import escape_text
 
 from . import gaussforge_child
@@ -55,12 +55,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         ProgdfError: it cannot be read.
     """
     path = scene_file(path)
-    check_regular(path)
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError as error:
-        raise open_error(path, error) from None
+    start = read_file(path, 64)
     suffix = path.suffix.lower().lstrip(".")
     if start[:3] == b"ply":
         return "ply"

@@ -28,7 +28,7 @@ from progdf.errors import ProgdfError
 from progdf.field.bake import rows_hash
 from progdf.field.baked import BakedField
 from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
-from progdf.io.atomic import atomic_write, open_error
+from progdf.io.atomic import atomic_write, read_file
 from progdf.io.tensors import table_of, write_tensors
 from progdf.region import Region
 
@@ -221,10 +221,7 @@ def load_gdf(
 
 def _read(head: GdfHead) -> Gdf:
     """The whole edit, every byte checked; a network stays as it is and moves nothing."""
-    try:
-        content = head.path.read_bytes()
-    except OSError as error:
-        raise open_error(head.path, error) from error
+    content = read_file(head.path)
     try:
         tensors: dict[str, Tensor] = safetensors.torch.load(content)
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError, OverflowError):

@@ -159,6 +159,20 @@ def check_regular(path: str | os.PathLike[str]) -> None:
         raise ProgdfError(f"{path} is a pipe or a device; give a file")
 
 
+def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
+    """What a file holds, or its first `most` bytes.
+
+    Raises:
+        ProgdfError: it is not there, no file, or cannot be read.
+    """
+    check_regular(path)
+    try:
+        with open(path, "rb") as file:
+            return file.read(most)
+    except OSError as error:
+        raise open_error(path, error) from error
+
+
 def open_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
     """The one line for a file that cannot be opened."""
     if isinstance(error, FileNotFoundError):

@@ -16,7 +16,7 @@ from typing import Any
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 
-from .atomic import atomic_write, check_regular, open_error
+from .atomic import atomic_write, read_file
 from .camera_formats import inria_camera, nerfstudio_camera, own_camera
 from .colmap import find_model, load_model
 from .json_values import decode_json
@@ -96,17 +96,14 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     name = os.fspath(path)
     if Path(path).name in _MODEL_FILES and (model := find_model(Path(path).parent)):
         return load_model(model)
-    check_regular(path)
+    found = read_file(path)
+    if found.startswith(_PNG):
+        camera = camera_in_picture(path)
+        if camera is None:
+            raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
+        return [camera]
     try:
-        found = Path(path).read_bytes()
-        if found.startswith(_PNG):
-            camera = camera_in_picture(path)
-            if camera is None:
-                raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
-            return [camera]
         content = decode_json(found)
-    except OSError as error:
-        raise open_error(path, error) from None
     except ValueError as error:
         raise ProgdfError(
             f"{name} is not JSON ({error}); give a cameras.json, a transforms.json or a file of saved cameras"
@@ -157,11 +154,9 @@ def _from_content(name: str, content: Any, path: Path) -> list[Camera]:
 
 def kind_of_cameras(path: str | os.PathLike[str]) -> str:
     """ "own" for a file that `save_cameras` wrote, "other" for anything else."""
-    check_regular(path)
+    found = read_file(path)
     try:
-        content = json.loads(Path(path).read_bytes())
-    except OSError as error:
-        raise open_error(path, error) from None
+        content = json.loads(found)
     except (ValueError, RecursionError):
         return "other"
     return "own" if isinstance(content, dict) and content.get("format") == _FORMAT else "other"

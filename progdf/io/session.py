@@ -27,7 +27,7 @@ import msgspec
 
 from progdf.errors import ProgdfError
 
-from .atomic import atomic_write, check_regular, open_error
+from .atomic import atomic_write, check_regular, open_error, read_file
 from .json_values import convert_json, decode_json, plain
 
 VERSION = 1
@@ -120,12 +120,7 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
         ProgdfError: it cannot be read, is no session, of a newer version, or holds what no session holds.
     """
     name = Path(path).name
-    check_regular(path)
-    try:
-        with Path(path).open("rb") as file:
-            content = file.read(_LARGEST + 1)
-    except OSError as error:
-        raise open_error(path, error) from None
+    content = read_file(path, _LARGEST + 1)
     if len(content) > _LARGEST:
         raise ProgdfError(
             f"{name} is larger than {_LARGEST >> 20} MB, too large for a session; give one saved with Ctrl+S"

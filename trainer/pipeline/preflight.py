@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from progdf.io.atomic import check_regular, open_error
+from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.scene.region_spec import check_region
 from trainer.editors import check_editor, check_new_editor
@@ -34,11 +34,7 @@ def check_command(plan: Plan, out: Path, resume: bool) -> None:
     check_editor(plan.editor.editor)
     folder = check_folder(out, plan.edit)
     if not plan.scene.is_dir():  # some formats are folders
-        check_regular(plan.scene)
-        try:
-            plan.scene.open("rb").close()
-        except OSError as error:
-            raise open_error(plan.scene, error) from None
+        read_file(plan.scene, 0)
     if plan.views.cameras is not None and not resume:
         load_cameras(plan.views.cameras)
     if plan.views.pictures:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -61,14 +60,3 @@ class ViewsOptions:
     """Longer side of the views in pixels."""
     up: UpChoice = "auto"
     """The axis of the scene that is up."""
-
-
-def join_negative_values(argv: Sequence[str]) -> list[str]:
-    """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option."""
-    found: list[str] = []
-    for argument in argv:
-        if found and found[-1] == "--orbit":
-            found[-1] = f"--orbit={argument}"
-        else:
-            found.append(argument)
-    return found

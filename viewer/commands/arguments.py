@@ -169,15 +169,10 @@ def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
 
 
 def join_arguments(argv: Sequence[str]) -> list[str]:
-    """`--orbit -30,15` as `--orbit=-30,15`: what begins with a minus would be taken for an option.
-
-    `--split` and `--difference` without a number get theirs.
-    """
+    """`--split` and `--difference` without a number get theirs."""
     found: list[str] = []
     for argument in argv:
-        if found and found[-1] == "--orbit":
-            found[-1] = f"--orbit={argument}"
-        elif found and found[-1] in _BARE and is_number(argument):
+        if found and found[-1] in _BARE and is_number(argument):
             found[-1] = f"{found[-1]}={argument}"
         else:
             found.append(argument)

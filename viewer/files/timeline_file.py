@@ -24,7 +24,7 @@ import msgspec
 
 from progdf.cli.info import TIMELINE_MARK as MARK
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, check_regular, open_error
+from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import convert_json, decode_json, plain
 from viewer.camera.view_camera import ViewCamera
 from viewer.state.view_state import Easing, Fps, Frame, Keyframe, LayerState, Length, Strength, Timeline
@@ -83,12 +83,7 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
         ProgdfError: the file is missing, no timeline, damaged, of a newer version, or names an edit that is
             not open.
     """
-    check_regular(path)
-    try:
-        with path.open("rb") as opened:
-            text = opened.read(_LARGEST + 1)
-    except OSError as error:
-        raise open_error(path, error) from None
+    text = read_file(path, _LARGEST + 1)
     try:
         value = decode_json(text) if len(text) <= _LARGEST else None
     except ValueError:

@@ -14,7 +14,7 @@ from PIL import Image
 import progdf
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.lens import Lens
 from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
 from tests.helpers.full_disk import files_up_to
@@ -154,3 +154,8 @@ def test_a_save_that_fails_leaves_the_old_cameras_and_nothing_else(tmp_path: Pat
         save_cameras(path, some_cameras()[:2])
     assert path.read_bytes() == old
     assert [entry.name for entry in tmp_path.iterdir()] == ["cameras.json"]
+
+
+def test_what_cannot_be_read_is_no_kind_of_cameras(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="does not exist"):
+        kind_of_cameras(tmp_path / "cameras.json")
