@@ -52,18 +52,22 @@ def measure(scene: Gaussians) -> dict[str, float]:
     colors, near = shapes.base_colors(scene), Neighborhood(scene)
     seed = int(np.flatnonzero(ball)[0])
 
-    def lasso(through: bool) -> bytes:
+    ahead = shapes.Surface(scene, camera)
+    ahead.prepare()
+
+    def lasso(through: bool, surface: shapes.Surface | None = None) -> bytes:
         """From the mouse's release to the state: seen, enclosed, in front, packed."""
-        seen = shapes.project_centers(scene, camera)
-        mask = shapes.inside_polygon(seen.points, outline)
+        surface = surface or shapes.Surface(scene, camera)
+        mask = shapes.inside_polygon(surface.centers.points, outline)
         if not through:
             rows = np.flatnonzero(mask)
-            mask[rows] = shapes.front_surface(scene, camera, seen, rows)
+            mask[rows] = surface.front(rows)
         return selection.pack(mask)
 
     works: dict[str, Callable[[], object]] = {
         "lasso, through": lambda: lasso(True),
-        "lasso, front surface": lambda: lasso(False),
+        "lasso, front surface, at once": lambda: lasso(False),
+        "lasso, front surface, looked at ahead": lambda: lasso(False, ahead),
         "a step of the brush": lambda: shapes.inside_stroke(centers.points, outline[:2], 40.0),
         "colors": lambda: shapes.base_colors(scene),
         "flood": lambda: grow_along_surface(near, colors, np.array([seed]), colors[seed], 0.08),

@@ -40,8 +40,8 @@ class Simplification:
     cell: int = 8
     slices: int = 224
     least_light: float = 0.05
-    most_times: float = 8.0
-    dense: float = 6.0
+    most_times: float = 6.0
+    dense: float = 8.0
 
 
 SIMPLIFY = Simplification()
