@@ -4,7 +4,8 @@
     0.5/A.png, 0.5/B.png, …     beside them: further strengths, a subfolder each
 
 The run's views are these pictures' own (see `trainer.setup.training_setup`). What shows through the scene,
-its background, may be of any one color: it is found, and taken for the run's.
+its background, may be of any one color: it is found, and taken for the run's; a shift by a pixel or two is
+undone.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from progdf.camera import Camera
@@ -32,6 +35,10 @@ MOST_PICTURES = 32
 """More are a folder of views: what a handful needs would take long."""
 
 _CLEAR, _LEAST_CLEAR = 0.98, 0.002  # transmittance of a pixel of the background; share of those that tell
+_SHIFT = 2  # pixels by which a program may have moved the picture
+_STILL = 0.4  # quantile of the difference that tells how well a shift fits: much of a picture is unchanged
+_EDGE = 0.02  # of color, from pixel to pixel: the rest fits anywhere
+_BETTER = 0.8  # of the misfit as it is: noise alone makes one shift a little better than another
 _SKEWED = 0.02  # by which a picture may differ in its proportions from its camera
 
 
@@ -57,7 +64,7 @@ class PicturesEditor:
             return view.image
         name, camera = view.camera.name, view.camera
         picture = read_picture(self.files[name][strength], size=(camera.width, camera.height))
-        return mend_background(picture, self.clear[name])
+        return lay_over(view.image, mend_background(picture, self.clear[name]))
 
 
 def pictures(
@@ -154,3 +161,32 @@ def mend_background(picture: Tensor, clear: Tensor) -> Tensor:
         return picture
     own = picture[empty].median(dim=0).values
     return (picture + clear[..., None] * (torch.tensor(BACKGROUND) - own)).clamp(0.0, 1.0)
+
+
+def lay_over(original: Tensor, picture: Tensor) -> Tensor:
+    """The picture moved back by the pixels, up to two, that a program has moved it by. [H,W,3] each"""
+    a, b = (ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, picture))
+    steps = [np.abs(move_image(a, shift) - a).max(axis=2) for shift in ((0, 1), (1, 0))]
+    edges = np.max(steps, axis=0) > _EDGE
+    if not edges.any():
+        return picture
+    rows = range(-_SHIFT, _SHIFT + 1)
+    shifts = sorted(((y, x) for y in rows for x in rows), key=lambda shift: abs(shift[0]) + abs(shift[1]))
+
+    def misfit(shift: tuple[int, int]) -> float:
+        return float(np.quantile(np.abs(move_image(b, shift) - a).max(axis=2)[edges], _STILL))
+
+    errors = [misfit(shift) for shift in shifts]
+    best = int(np.argmin(errors))
+    if errors[best] >= _BETTER * errors[0]:
+        return picture
+    return torch.from_numpy(move_image(picture.numpy(), shifts[best]))
+
+
+def move_image(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
+    """The image moved by rows and columns, its rim repeated. [H,W,3]"""
+    height, width = image.shape[:2]
+    rows = (np.arange(height) - shift[0]).clip(0, height - 1)
+    columns = (np.arange(width) - shift[1]).clip(0, width - 1)
+    moved: np.ndarray = image[rows][:, columns]
+    return moved

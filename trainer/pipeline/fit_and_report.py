@@ -36,7 +36,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 _RANK_VIEWS = 4
-_REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views")
+_REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures")
 
 _LPIPS_OVER = (
     "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
@@ -175,6 +175,7 @@ def finish_run(
             **log.memory.by_stage,
         },
         "plan": told,
+        "pictures": dict(record.pictures),
     }
     # the .gdf has the options beside it, is small, and the same training writes the same file
     own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}

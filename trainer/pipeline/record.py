@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class RunRecord:
         agreement: whether the edited views agree, where that was measured
         followed: members that took their colors from others
         up: the axis that is up, and why
+        pictures: changed pictures that it was trained on, and their hashes
 
     Raises:
         ValueError: the losses do not fit each other, or the name is none.
@@ -48,6 +49,7 @@ class RunRecord:
     agreement: Mapping[str, Any] | None
     followed: int
     up: Mapping[str, Any] | None
+    pictures: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         columns = [self.losses.get(name, []) for name in ("step", "left")]

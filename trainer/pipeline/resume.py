@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
+from trainer.editors.pictures import strengths_of
 from trainer.options import MOST_THREADS, TrainOptions
 from trainer.plan import Plan
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
@@ -66,7 +67,10 @@ def decide_resume(
     """
     saved = _saved_identity(folder)
     if resume and saved is None and folder.report.is_file():
-        _check_plan(folder, _finished_plan(folder), plan, "leave out --resume to train again")
+        was, pictures = _finished(folder)
+        again = "leave out --resume to train again"
+        _check_plan(folder, was, plan, again)
+        _check_pictures(folder, pictures, picture_digests(plan), again)
         return ResumeDecision("nothing", threads)
     remove_leftovers(folder)
     now = _identity(plan, threads)
@@ -79,6 +83,8 @@ def decide_resume(
                     f"the {what} has changed since {folder.root} was started; restore it and continue "
                     "with --resume, or train again in another folder"
                 )
+        remedy = "restore it and continue with --resume, or train again in another folder"
+        _check_pictures(folder, saved.pictures, now.pictures, remedy)
         notes = []
         if saved.torch != now.torch:
             notes.append(f"torch was {saved.torch} and is {now.torch}: the last bits may differ")
@@ -104,7 +110,7 @@ def find_run(out: Path, plan: Plan) -> Literal["nothing", "stopped", "finished"]
     if saved is None and not folder.report.is_file():
         return "nothing"
     try:
-        _check_plan(folder, saved.plan if saved else _finished_plan(folder), plan, "")
+        _check_plan(folder, saved.plan if saved else _finished(folder)[0], plan, "")
     except ProgdfError:
         return "nothing"
     return "stopped" if saved else "finished"
@@ -148,13 +154,25 @@ class _Identity(msgspec.Struct):
     cameras: str | None
     threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
     torch: str
+    pictures: dict[str, str] = {}
 
 
 def _identity(plan: Plan, threads: int) -> _Identity:
     cameras = plan.views.cameras
     return _Identity(
-        plan, _digest(plan.scene), _digest(cameras) if cameras else None, threads, str(torch.__version__)
+        plan,
+        _digest(plan.scene),
+        _digest(cameras) if cameras else None,
+        threads,
+        str(torch.__version__),
+        picture_digests(plan),
     )
+
+
+def picture_digests(plan: Plan) -> dict[str, str]:
+    """The changed pictures that a plan names, those of further strengths among them, and their hashes."""
+    paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
+    return {str(path.resolve()): _digest(path) for path in paths}
 
 
 def _saved_identity(folder: RunFolder) -> _Identity | None:
@@ -198,9 +216,17 @@ def _check_plan(folder: RunFolder, was: Plan, now: Plan, remedy: str) -> None:
         raise ProgdfError(f"{folder.root} was started with {difference}; {remedy}")
 
 
-def _finished_plan(folder: RunFolder) -> Plan:
+def _check_pictures(folder: RunFolder, was: Mapping[str, str], now: Mapping[str, str], remedy: str) -> None:
+    for path in dict.fromkeys((*was, *now)):
+        if was.get(path) != now.get(path):
+            raise ProgdfError(f"{path} has changed since {folder.root} was started; {remedy}")
+
+
+def _finished(folder: RunFolder) -> tuple[Plan, dict[str, str]]:
+    """A finished run's plan, and the hashes of its changed pictures."""
     try:
-        return convert_json(decode_json(folder.report.read_bytes())["plan"], Plan)
+        report = decode_json(folder.report.read_bytes())
+        return convert_json(report["plan"], Plan), convert_json(report.get("pictures", {}), dict[str, str])
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave out --resume to train again") from error
 

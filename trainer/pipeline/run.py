@@ -61,7 +61,7 @@ from .kind_trial import Approach, choose_approach
 from .preflight import check_command, region_settings
 from .record import RunRecord
 from .reedit import reedit
-from .resume import check_exists, decide_resume, explain_stop, load_region
+from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
 from .training import JointNetwork, optimize_members, retime_trajectory
 
 __all__ = ["RunResult", "train"]
@@ -226,6 +226,7 @@ def _record(
 ) -> None:
     """Optimize, and write the trajectory and the finished edit's views."""
     kind, scene, region = optimization.kind, setup.scene, setup.region
+    pictures = picture_digests(plan)
     objective = optimization.objective(perceptual.name)
     log.say(f"loss: {objective}")
     if plan.optimization.group_steps and kind != "geometry":
@@ -283,6 +284,7 @@ def _record(
         agreement.figures() if agreement is not None else None,
         len(unseen_members.places) if unseen_members is not None else 0,
         setup.up.to_json() if setup.up is not None else None,
+        pictures,
     )
     extra = {"members": region.members, "score": region.score}
     save_trajectory(folder.trajectory, trajectory, extra, plain(record))

@@ -26,7 +26,7 @@ from progdf.io.images import read_picture
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
-from trainer.editors.pictures import mend_background, transmittance
+from trainer.editors.pictures import lay_over, mend_background, move_image, transmittance
 from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plane
 
 from .few_masks import connected_pieces
@@ -35,9 +35,6 @@ from .lift import HIDDEN, bare_weight, lift_masks
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
 
-_SHIFT = 2  # pixels by which a program may have moved the picture
-_STILL = 0.4  # quantile of the difference that tells how well a shift fits: much of a picture is unchanged
-_EDGE = 0.02  # of color, from pixel to pixel: the rest fits anywhere
 _NEAR = 1  # pixels around a place in which the render may have its color
 _CHANGED = 0.05  # of color: more differs than noise, JPEG and another renderer bring
 _SPECK, _GAP = 2, 5  # pixels: what is narrower is none; what is wider than a gap is not closed
@@ -96,23 +93,11 @@ def changed_region(
 
 def find_change(original: Tensor, picture: Tensor) -> Tensor:
     """Where a picture differs from the render, cleaned of noise. [H,W,3], [H,W,3] -> [H,W] bool"""
-    a, b = (ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, picture))
-    shifts = [(y, x) for y in range(-_SHIFT, _SHIFT + 1) for x in range(-_SHIFT, _SHIFT + 1)]
-    shifts.sort(key=lambda shift: abs(shift[0]) + abs(shift[1]))  # of equal ones the least
-
-    edges = np.max([np.abs(_moved(a, shift) - a).max(axis=2) for shift in ((0, 1), (1, 0))], axis=0) > _EDGE
-    if not edges.any():
-        edges[:] = True
-
-    def misfit(shift: tuple[int, int]) -> float:
-        return float(np.quantile(np.abs(_moved(b, shift) - a).max(axis=2)[edges], _STILL))
-
-    errors = [misfit(shift) for shift in shifts]
-    best = int(np.argmin(errors))
-    # noise alone makes one a little better than another
-    b = _moved(b, shifts[best if errors[best] < 0.8 * errors[0] else 0])
+    a, b = (
+        ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, lay_over(original, picture))
+    )
     around = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]
-    apart = np.min([np.abs(_moved(a, shift) - b).max(axis=2) for shift in around], axis=0)
+    apart = np.min([np.abs(move_image(a, shift) - b).max(axis=2) for shift in around], axis=0)
     changed = ndimage.binary_opening(apart > _CHANGED, np.ones((_SPECK, _SPECK)))
     changed = ndimage.binary_closing(changed, np.ones((_GAP, _GAP)), border_value=0) | changed
     holes = ndimage.binary_fill_holes(changed) & ~changed
@@ -124,15 +109,6 @@ def find_change(original: Tensor, picture: Tensor) -> Tensor:
         changed |= small[pieces]
     # what is compared with its surroundings ends a pixel early
     return torch.from_numpy(ndimage.binary_dilation(changed, np.ones((3, 3))))
-
-
-def _moved(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
-    """The image moved by rows and columns, its rim repeated. [H,W,3]"""
-    height, width = image.shape[:2]
-    rows = (np.arange(height) - shift[0]).clip(0, height - 1)
-    columns = (np.arange(width) - shift[1]).clip(0, width - 1)
-    moved: np.ndarray = image[rows][:, columns]
-    return moved
 
 
 def _drop_strays(

@@ -129,3 +129,15 @@ def test_what_is_no_list_of_pictures_is_one_line(tmp_path: Path) -> None:
 def test_a_comma_in_a_name_is_none_between_two(tmp_path: Path) -> None:
     Image.new("RGB", (4, 4)).save(tmp_path / "a,b.png")
     assert picture_paths(f"{tmp_path}/a,b.png") == (tmp_path / "a,b.png",)
+
+
+def test_a_shift_by_two_pixels_is_undone_before_training(tmp_path: Path) -> None:
+    scene = ball()
+    camera = looking(scene)[0]
+    image = render_view(scene, camera, WHITE).clamp(0, 1)
+    painted = image.clone()
+    painted[20:26, 28:34] = torch.tensor([0.1, 0.2, 0.9])
+    path = save(tmp_path / "A.png", painted.roll((-2, 1), (0, 1)), camera)
+    (view,) = views_of(scene, path)
+    edited = make_editor(f"pictures:{path}", scene, whole_scene(scene), [view]).edit(view, 1.0)
+    assert float((edited - painted)[4:-4, 4:-4].abs().max()) < 0.01

@@ -14,7 +14,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from progdf.io.images import to_picture
-from progdf.io.picture_camera import camera_chunk
+from progdf.io.picture_camera import camera_chunk, find_picture_camera
 from progdf.metrics.image import decibels
 from progdf.region import Region
 from progdf.scene.region_spec import parse_region
@@ -89,6 +89,22 @@ def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
 def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate_folder(EvaluateOptions(done.folder.root))
     assert "no two held-out views see enough of the same" in capsys.readouterr().out
+
+
+def test_a_finished_run_of_another_picture_is_not_taken_for_this_one_s(
+    folder: Path, done: RunResult, picture: Path
+) -> None:
+    options = replace(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
+    assert train(replace(options, resume=True), quiet=True).gdf == done.gdf
+    was = picture.read_bytes()
+    try:
+        to_picture(torch.ones(96, 96, 3)).save(picture, pnginfo=camera_chunk(find_picture_camera(picture)))
+        with pytest.raises(
+            ProgdfError, match=r"A\.png has changed since .* leave out --resume to train again"
+        ):
+            train(replace(options, resume=True), quiet=True)
+    finally:
+        picture.write_bytes(was)
 
 
 def test_a_picture_without_camera_is_refused_before_the_scene_is_read(folder: Path) -> None:
