@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import moderngl
 
+from progdf.io.picture_camera import camera_chunk
+from viewer.camera.view_camera import to_camera
+from viewer.files import exports
 from viewer.panel.snapshot_cards import SnapshotCard
+from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
 from viewer.pictures.thumbnails import Thumbnails
 from viewer.render import dynamic_resolution, highlight
 from viewer.render.engine import ViewEngine
 from viewer.render.renderers import Image
 from viewer.render.timings import FrameTimings
+from viewer.state.layers import shown_edits
 from viewer.state.recordings import RecordingFile
+from viewer.state.selection import NOBODY
 from viewer.state.snapshots import SliderSnapshot, with_original
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import Pointed
+from viewer.state.workspace import Pointed, original
 from viewer.ui.context import PALETTE
 
 
@@ -114,6 +122,29 @@ class Canvas:
     def image(self, view: ViewState, size: tuple[int, int]) -> Image:
         """The picture as an array, in full; see `Comparer.image`. [H,W,3]"""
         return self.comparer.image(view, size)
+
+    def save(
+        self, folder: Path, title: str, view: ViewState, size: tuple[int, int], to_change: bool = False
+    ) -> str:
+        """Write the picture of a view, with the camera from which it was taken; a line that tells where.
+
+        Args:
+            folder: where; the file's name begins with `title`
+            to_change: all of the scene without its edits, for a program that changes pictures
+
+        Raises:
+            ProgdfError: see `exports.picture`.
+        """
+        if to_change:
+            view = original(view)
+            view = replace(view, selection=replace(view.selection, hidden=NOBODY))
+        image = self.image(view, size)
+        pixels = draw_labels(image, view.compare, self.comparer.labels(view))
+        if view.compare.mode != "off":  # which is no view that could be edited and trained on
+            return exports.picture(folder, title, pixels)
+        camera = to_camera(view.camera, image.shape[1], image.shape[0])
+        said = exports.picture(folder, title, pixels, camera_chunk(camera, shown_edits(view)))
+        return f"{said}; change it in any program, and drop it here" if to_change else said
 
     def cards(
         self, kept: tuple[SliderSnapshot, ...], view: ViewState

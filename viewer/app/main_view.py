@@ -14,21 +14,16 @@ import moderngl
 from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
-from progdf.io.picture_camera import camera_chunk
 from viewer.camera import inputs
 from viewer.camera.inputs import NO_KEYS, Keys, Taps
-from viewer.camera.view_camera import to_camera
 from viewer.files import exports as saved_files
 from viewer.gl.present import read_rgb
 from viewer.panel import panel
-from viewer.pictures.compare_labels import draw_labels
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.surfaces import Surfaces
 from viewer.select import hand
 from viewer.state import comparison, layer_selection, playback, workspace
-from viewer.state.layers import shown_edits
 from viewer.state.recordings import RecordingFile
-from viewer.state.selection import NOBODY
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
@@ -380,13 +375,6 @@ class MainView:
             return saved_files.timeline(self.pictures, title, view)
         if request == "window_picture":
             return saved_files.picture(self.pictures, title, read_rgb(screen, size))
-        if request == "take_view":
-            view = workspace.original(self.work.view)
-            view = replace(view, selection=replace(view.selection, hidden=NOBODY))
-        image = self.canvas.image(view, self._pointer().size)
-        pixels = draw_labels(image, view.compare, self.canvas.comparer.labels(view))
-        if view.compare.mode != "off":  # which is no view that could be edited and trained on
-            return saved_files.picture(self.pictures, title, pixels)
-        camera = to_camera(view.camera, image.shape[1], image.shape[0])
-        said = saved_files.picture(self.pictures, title, pixels, camera_chunk(camera, shown_edits(view)))
-        return f"{said}; change it in any program, and drop it here" if request == "take_view" else said
+        taken = request == "take_view"
+        seen = self.work.view if taken else view
+        return self.canvas.save(self.pictures, title, seen, self._pointer().size, taken)
