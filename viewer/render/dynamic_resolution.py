@@ -37,12 +37,14 @@ class DynamicResolution:
         rest_at: when to draw in full, seconds on the main view's clock; None while the picture is in full
         camera_ms: what the last two whole pictures in full took; one alone may have waited for something
         slider_ms: the same of the last two steps of a slider, within this grip
+        coarse_ms: what the last coarse picture took; a slider's step in full that takes no longer stays so
     """
 
     pixels: int = 1
     rest_at: float | None = None
     camera_ms: tuple[float, ...] = ()
     slider_ms: tuple[float, ...] = ()
+    coarse_ms: float = 0.0
 
 
 def first_known(count: int, draws_with: str) -> DynamicResolution:
@@ -79,7 +81,8 @@ def before_draw(
     if mode == "off":
         return full
     if turned or slid:
-        pays = mode == "on" or known.pixels > 1 or _slow(known.camera_ms if turned else known.slider_ms)
+        slow = _slow(known.camera_ms) if turned else _slow(known.slider_ms, max(SLOW_MS, known.coarse_ms))
+        pays = mode == "on" or known.pixels > 1 or slow
         return replace(known, pixels=COARSE, rest_at=now + REST_S) if held and pays else full
     return full if known.rest_at is None or now >= known.rest_at else known
 
@@ -87,7 +90,7 @@ def before_draw(
 def after_draw(known: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
     """After a picture was drawn: what it took. A coarse one tells nothing of a full one."""
     if known.pixels > 1:
-        return known
+        return replace(known, coarse_ms=timings.total_ms)
     if timings.share == 1.0:
         known = replace(known, camera_ms=(*known.camera_ms[-1:], timings.total_ms))
     return known if turned else replace(known, slider_ms=(*known.slider_ms[-1:], timings.total_ms))

@@ -80,6 +80,16 @@ def test_a_slider_whose_first_steps_were_slow_goes_on_coarse() -> None:
     )
 
 
+def test_a_slider_whose_steps_are_no_slower_than_coarse_ones_stays_sharp() -> None:
+    known = twice(DynamicResolution(coarse_ms=SLOW_MS + 2.0), SLOW, turned=False)
+    for coarse_ms, pixels in ((SLOW_MS + 2.0, 1), (SLOW_MS, COARSE)):
+        known = replace(known, coarse_ms=coarse_ms)
+        assert (
+            dynamic_resolution.before_draw(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels
+            == pixels
+        )
+
+
 def test_one_click_is_drawn_sharp_at_once() -> None:
     known = twice(DynamicResolution(), SLOW, turned=True)
     assert (
