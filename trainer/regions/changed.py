@@ -31,6 +31,7 @@ from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plan
 
 from .few_masks import connected_pieces
 from .lift import HIDDEN, bare_weight, lift_masks
+from .surface import surface_vote
 
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
@@ -42,6 +43,7 @@ _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
 _LEAST = 0.5  # of a member's visible share lies where the pictures differ
 _RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thinner
 _INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
+_AT_RIM = 0.3  # of a member's visible share lies along the rim: its surface decides
 _LITTLE = 1e-3  # of what the largest piece shows there: as good as nothing
 _ODD, _VOTED = 0.06, 0.001  # of color, apart from nearly all that shows; of score, above the least
 _FEW = 0.01  # of what shows, on the rim perhaps
@@ -76,6 +78,7 @@ def changed_region(
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
     found = lift_masks(scene, small, masks, "changed", "share", least)
+    found = _vote_on_rim(scene, found, small, masks, least)
     region = _drop_strays(scene, found, small, masks, least)
     if not len(region):
         raise ProgdfError(
@@ -137,6 +140,31 @@ def _drop_strays(
     score = region.score.clone()
     score[region.members[~kept]] = 0.0
     return Region(region.name, region.members[kept], score)
+
+
+def _vote_on_rim(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], masks: Sequence[Tensor], least: float
+) -> Region:
+    """The region, with what shows along the rim of a change, or not at all, as its own surface is inside it.
+
+    A mask is a pixel or two too wide, and a Gaussian that something changed all but hides shows there alone:
+    it would hand its membership on to all that is hidden of its surface.
+    """
+    sums, rims = torch.zeros(len(scene), 4, dtype=torch.float64), torch.zeros(len(scene), dtype=torch.float64)
+    for camera, mask in zip(cameras, masks, strict=True):
+        sums += alpha_weights(scene, camera, mask)
+        rims += alpha_weights(scene, camera, mask & ~_within_rim(mask))[:, 0]
+    member = torch.zeros(len(scene), dtype=torch.bool).index_fill(0, region.members, True)
+    hidden = sums[:, 2] < HIDDEN * bare_weight(scene.opacities) * sums[:, 3].clamp_min(1.0)
+    doubtful = hidden | member & (rims > _AT_RIM * sums[:, 2])
+    if not bool((member & ~doubtful).any()):
+        return region
+    rows = doubtful.nonzero()[:, 0]
+    vote = surface_vote(scene, member, rows)
+    member[rows] = vote > 0
+    score = region.score.clone()
+    score[rows] = torch.where(vote > 0, least + (1 - least) * vote, torch.zeros(()))
+    return Region(region.name, member.nonzero()[:, 0], score)
 
 
 def _within_rim(mask: Tensor) -> Tensor:
