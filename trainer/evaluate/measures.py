@@ -74,8 +74,9 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: Texts) -> Eva
     paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}
     consistency = view_consistency(opened, perceptual)
     lpips = "LPIPS" if perceptual.name.startswith("lpips") else perceptual.name
+    views = "to the edited views" if opened.setup.held_out else "to the run's own pictures, trained on,"
     rows = (
-        *_edited_rows(curves, lpips),
+        *_edited_rows(curves, lpips, views),
         *_path_rows(paths, lpips),
         *_consistency_rows(consistency, lpips),
         Row("outside", "outside the region, mean change, of 255", _scaled(outside_change(opened), 255)),
@@ -85,7 +86,7 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: Texts) -> Eva
     return Evaluation(rows, curves, paths, consistency, perceptual.name)
 
 
-def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str) -> list[Row]:
+def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> list[Row]:
     def ends(values: Mapping[str, tuple[float, ...]]) -> dict[str, float | None]:
         return {name: found[-1] for name, found in values.items()}
 
@@ -99,7 +100,7 @@ def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str) -> list[Row]:
     )
     inner = len(next(iter(curves.values())).s) - 1
     rows = [
-        Row(f"{name}_end", f"to the edited views at 1, {text}", ends(values), digits)
+        Row(f"{name}_end", f"{views} at 1, {text}", ends(values), digits)
         for name, text, values, digits in measures
     ]
     if not inner:

@@ -88,7 +88,9 @@ def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
 
 def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate_folder(EvaluateOptions(done.folder.root))
-    assert "no two held-out views see enough of the same" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "no two held-out views see enough of the same" in said
+    assert "to the run's own pictures, trained on, at 1, PSNR" in said
 
 
 def test_a_finished_run_of_another_picture_is_not_taken_for_this_one_s(
