@@ -150,8 +150,9 @@ memory.end("large")
 del block
 memory.end("small")
 (line,) = [l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("VmHWM:")]
-assert memory.peak() == round(int(line.split()[1]) / 1024) >= 128, (memory.peak(), line)
-assert memory.by_stage == {"large": memory.peak(), "small": memory.peak()}, memory.by_stage
+# the kernel counts pages in batches, so that two looks may differ a little
+peaks = [memory.peak(), int(line.split()[1]) / 1024, memory.by_stage["large"], memory.by_stage["small"]]
+assert min(peaks) >= 128 and max(peaks) - min(peaks) <= 2, peaks
 """
 
 
