@@ -22,6 +22,9 @@ def _run(folder: Path) -> list[CaseResult]:
     return run_suite(folder, GradientL1(), 1, cases=_FEW, sizes=_SIZES, effort=_EFFORT)
 
 
+pytestmark = pytest.mark.slow  # trains its edits
+
+
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[CaseResult]]:
     folder = tmp_path_factory.mktemp("suite")
