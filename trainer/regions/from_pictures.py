@@ -145,8 +145,8 @@ def _changed_pictures(rest: str, settings: RegionSettings) -> tuple[Sequence[Pat
     for path in paths:
         if edits := edits_in_picture(path):
             raise ProgdfError(
-                f"{path} was taken with edits on ({edits}), and what they change would count; take "
-                "the view without them, or name the region with --region"
+                f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
+                "without them, or name the region with --region"
             )
     given = [] if settings.cameras is None else load_cameras(settings.cameras)
     return paths, picture_cameras(paths, given)
