@@ -185,8 +185,11 @@ def _swept_layers(options: RenderOptions, found: OpenStack) -> list[str]:
 
 
 def _check_visible(name: str, view: ViewState, option: str) -> str:
-    """`name`, when there is such an edit and no other that is alone hides it."""
+    """`name`, when there is such an edit, and neither another that is alone nor its group at 0 hides it."""
     arguments.known_edit(name, view.layers, option)
+    group = next(layer.group for layer in view.layers if layer.name == name)
+    if any(known.name == group and not known.strength for known in view.groups):
+        raise ProgdfError(f"{option} {name}: its group {group} is at 0, so nothing would change; raise that")
     alone = [layer.name for layer in view.layers if layer.solo]
     if alone and name not in alone:
         raise ProgdfError(f"{option} {name}: {alone[0]} is shown alone and hides it; show {name} alone too")

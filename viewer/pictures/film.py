@@ -35,14 +35,14 @@ def to_pixels(image: NDArray[np.float32]) -> Pixels:
 
 
 def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
-    """`view` with the named layers at these strengths."""
-    layers = (
-        replace(layer, strength=strengths.get(layer.name, layer.strength), enabled=True)
-        if layer.name in strengths
-        else layer
-        for layer in view.layers
+    """`view` with the named layers at these strengths, and shown, in groups that are shown."""
+    moved = tuple(
+        replace(l, strength=strengths[l.name], enabled=True) if l.name in strengths else l
+        for l in view.layers
     )
-    return replace(view, layers=tuple(layers))
+    shown = {layer.group for layer in moved if layer.name in strengths}
+    groups = tuple(replace(group, enabled=group.enabled or group.name in shown) for group in view.groups)
+    return replace(view, layers=moved, groups=groups)
 
 
 def sweep(view: ViewState, name: str, steps: int = SWEEP_STEPS) -> Iterator[ViewState]:

@@ -144,6 +144,24 @@ def test_a_sweep_moves_a_renamed_layer_of_a_session_and_leaves_its_comparison_al
     assert sheets[0].shape == sheets[1].shape
 
 
+def test_a_sweep_shows_a_layer_whose_group_is_hidden_and_refuses_one_whose_group_is_at_zero(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ears, scarf = full_view().layers
+    view = replace(full_view(), layers=(replace(ears, solo=False), scarf), compare=Comparison())
+    given = ("render", "work.session.json", "--sheet", "ears", *SMALL, "-o", "sheet.png")
+    sheets = []
+    for enabled in (True, False):
+        saved(here, replace(view, groups=(replace(view.groups[0], enabled=enabled),)))
+        assert run(*given) == 0
+        sheets.append(Path("sheet.png").read_bytes())
+    assert sheets[0] == sheets[1]
+    saved(here, replace(view, groups=(replace(view.groups[0], strength=0.0),)))
+    capsys.readouterr()
+    assert run(*given) == 2
+    assert "its group warm is at 0, so nothing would change" in capsys.readouterr().err
+
+
 def test_a_session_in_a_comparison_is_rendered_in_it(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, replace(full_view(), compare=Comparison("difference", amplify=2.0)))
     assert run("render", "work.session.json", *SMALL, "-o", "a.png") == 0
