@@ -79,7 +79,7 @@ class MainView:
         self.frames = 0  # all that were drawn
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
         self._tool = MouseTool()
-        self._revealed = self.work.focus  # the layer that the panel was last scrolled to
+        self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
         self._taps = Taps()
         self._half = 0  # of two pictures side by side, the one that the mouse is in
@@ -258,14 +258,15 @@ class MainView:
             flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
-            reveal = self.work.focus != self._revealed
+            several = len(layer_selection.selected_layers(self.work)) > 1
+            reveal = self._revealed != (self.work.focus, several)
             cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
             if missing:
                 self.wake()
             self.work = interface.panels(
                 self.work, self._pointer(), cards, reveal, self.preview_said, self.recent
             )
-            self._revealed = self.work.focus
+            self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for
             self._tool, self.work = mouse.handle_mouse(self._tool, self.work, self._pointer())
 

@@ -11,14 +11,19 @@ from viewer.panel.layer_card import COMPACT_PX, SLIDER_PX, SLIM_PX
 from viewer.state import layers as stack
 from viewer.state.view_state import LayerGroup, ViewState
 from viewer.ui.context import PALETTE, Icon, UiContext, u32
-from viewer.ui.widgets import elide, icon_button, menu, right_edge, tip, typed_name
+from viewer.ui.widgets import elide, grip, icon_button, menu, right_edge, tip, typed_name
 
 _MENU = "menu of a group"
 _ITEMS = (("Rename…", ""), ("Select layers", ""), ("Ungroup", "Ctrl+Shift+G"))
 
 
-def draw(state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions: list[str]) -> ViewState:
-    """The row of a group of `count` layers; the changed state. What was asked for goes into `actions`."""
+def draw(
+    state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions: list[str]
+) -> tuple[ViewState, str]:
+    """The row of a group of `count` layers; the changed state, and what the hand does with it, see `grip`.
+
+    What was asked for goes into `actions`.
+    """
     scale, folded = ui.scale, group.name in state.collapsed
     imgui.push_id(f"group {group.name}")
     imgui.begin_group()
@@ -34,7 +39,9 @@ def draw(state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions
     number = f"{group.strength:.2f}"
     wide = imgui.calc_text_size(number).x
     slider_at = right - wide - (SLIDER_PX + 6.0) * scale
-    name = _name(state, group, count, slider_at - 6.0 * scale - imgui.get_cursor_pos_x(), ui, actions)
+    corner, gesture = _name(
+        state, group, count, slider_at - 6.0 * scale - imgui.get_cursor_pos_x(), ui, actions
+    )
     imgui.same_line(slider_at)
     imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
     strength = strength_slider.draw(
@@ -49,14 +56,14 @@ def draw(state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions
         default=LayerGroup.strength,
         help_="What the strengths of its layers are multiplied by. Double-click: reset to 1",
     )
-    corner = imgui.ImVec2(imgui.get_item_rect_max().x + 6.0 * scale, name.y)
+    number_at = imgui.ImVec2(imgui.get_item_rect_max().x + 6.0 * scale, corner.y)
     color = u32(PALETTE.text if group.enabled else PALETTE.dim)
-    imgui.get_window_draw_list().add_text(corner, color, f"{strength:.2f}")
+    imgui.get_window_draw_list().add_text(number_at, color, f"{strength:.2f}")
     imgui.end_group()
     imgui.pop_id()
     if strength == group.strength:
-        return state
-    return stack.change_group(state, group.name, lambda old: replace(old, strength=strength))
+        return state, gesture
+    return stack.change_group(state, group.name, lambda old: replace(old, strength=strength)), gesture
 
 
 def _fold(folded: bool, ui: UiContext) -> bool:
@@ -74,8 +81,11 @@ def _fold(folded: bool, ui: UiContext) -> bool:
 
 def _name(
     state: ViewState, group: LayerGroup, count: int, room: float, ui: UiContext, actions: list[str]
-) -> imgui.ImVec2:
-    """The name and its menu; the corner of its text. A click selects the layers, a second one renames."""
+) -> tuple[imgui.ImVec2, str]:
+    """The name and its menu; the corner of its text, and what the hand does with it.
+
+    A click selects the layers, a second one renames, a drag moves them.
+    """
     storage, naming = imgui.get_state_storage(), imgui.get_id("naming")
     x, y = imgui.get_cursor_screen_pos()
     corner = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
@@ -83,11 +93,13 @@ def _name(
         name = typed_name(group.name, room)
         storage.set_bool(naming, name is None)
         actions += [f"rename_group:{state.groups.index(group)}:{name}"] if name else []
-        return corner
-    if imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height())):
+        return corner, ""
+    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    gesture = grip(ui)
+    if gesture == "clicked":
         actions.append(f"select_layers:{group.name}")
     hovered = imgui.is_item_hovered()
-    tip(f"{group.name}, {count} layers\nClick to select them, double-click to rename, right-click: ungroup")
+    tip(f"{group.name}, {count} layers\nClick to select them, drag to reorder, double-click to rename")
     if hovered and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
         storage.set_bool(naming, True)
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
@@ -102,4 +114,4 @@ def _name(
         storage.set_bool(naming, True)
     elif chosen:
         actions.append(f"{'ungroup' if chosen == ['Ungroup'] else 'select_layers'}:{group.name}")
-    return corner
+    return corner, gesture

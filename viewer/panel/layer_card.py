@@ -15,9 +15,9 @@ from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.context import PALETTE, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import (
     elide,
+    grip,
     group_digits,
     icon_button,
-    is_released,
     menu,
     right_edge,
     small,
@@ -26,7 +26,7 @@ from viewer.ui.widgets import (
     typed_name,
 )
 
-TOGGLE_PX, GRIP_PX = 24.0, 4.0
+TOGGLE_PX = 24.0
 CARD_PX = 97.0  # a whole card with what is between two, at 1×
 COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, its slider's width and height
 _MENU = "menu of a layer"
@@ -56,7 +56,7 @@ class Cards:
     Args:
         rows: one per .gdf, indexed by `LayerState.gdf`
         focus: the focused layer, an index into `ViewState.layers`, or None
-        reveal: scroll to it
+        reveal: scroll to it, and to what is cut of the selected ones
         active_slider: which of `stack.SLIDERS` of it the arrow keys move
         renaming: the layer whose name is being typed, or None
         selected: `LayerState.gdf` of the layers that are selected with the focused one
@@ -78,9 +78,10 @@ class Cards:
 
 @dataclass(frozen=True)
 class CardResult:
-    """What one card made of the state: the layer touched, being renamed, dragged or dropped, asked about.
+    """What one card made of the state: the layer touched, being renamed, asked about.
 
-    `press`: of `layer_selection.PRESSES`, "" where no button went down on it.
+    `drag`: what the hand does with its name, see `grip`; `press`: of `layer_selection.PRESSES`, "" where no
+    button went down on it.
     """
 
     state: ViewState
@@ -154,11 +155,16 @@ def draw_card(state: ViewState, index: int, active: bool, cards: Cards, ui: UiCo
             imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
     over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
     press = _press(card) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
+    several, alone = len(cards.selected) if selected else 0, imgui.get_id("alone")
+    if press:  # one of several may be dragged with the others: a click makes it the only one as it ends
+        imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
+        press = "keep" if press == "one" and several > 1 else press
+    if card.drag == "clicked" and imgui.get_state_storage().get_bool(alone):
+        press = "one"
     held = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button calls its drag off
     if over and not held and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
         press = "keep"
         imgui.open_popup(_MENU)
-    several = len(cards.selected) if selected else 0
     card = replace(card, action=_menu(card.state, index, several, ui))
     if selected:
         _focus_bar(clip, p.accent if focused else p.accent_dark, scale)
@@ -275,6 +281,7 @@ def _name(card: CardResult, index: int, room: float, cards: Cards, active: bool,
         return replace(card, renaming=text is None, state=stack.rename_layer(card.state, index, text or ""))
     x, y = imgui.get_cursor_screen_pos()
     imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    gesture = grip(ui)
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     color = PALETTE.text if active else PALETTE.dim
     card = replace(card, named=True) if imgui.is_item_active() else card
@@ -286,13 +293,7 @@ def _name(card: CardResult, index: int, room: float, cards: Cards, active: bool,
     double = imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) and _press(card) == "one"
     if imgui.is_item_hovered() and double:
         return replace(card, renaming=True, touched=True)
-    threshold = GRIP_PX * ui.scale
-    if imgui.is_item_active() and imgui.is_mouse_dragging(imgui.MouseButton_.left.value, threshold):
-        return replace(card, drag="dragged")
-    moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, threshold)
-    if is_released() and (moved.x or moved.y):
-        return replace(card, drag="dropped")
-    return card
+    return replace(card, drag=gesture)
 
 
 def _foot(card: CardResult, index: int, row: LayerRow, ui: UiContext) -> CardResult:

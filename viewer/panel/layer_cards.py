@@ -5,8 +5,9 @@ Cards are dragged into their order. What takes a layer away or adds one is an ac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 from imgui_bundle import imgui
 
@@ -26,12 +27,31 @@ from viewer.ui.widgets import (
 )
 
 HEADING_PX = 34.0  # at 1×: above the cards
+_DRAGS = ("dragged", "dropped")
 INSET_PX = 10.0  # of a group's layers, at 1×
 BLEND_HELP = {
     "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
     "over": "An edit covers those below it, where and as far as it changes something.",
 }
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A card in the list, or the row over a group.
+
+    Args:
+        top, bottom: window pixels
+        layers: places of what is dragged with it, in `ViewState.layers`
+        group: its own, or that of its layer
+        heads: it is the row over a group
+    """
+
+    top: float
+    bottom: float
+    layers: tuple[int, ...]
+    group: str
+    heads: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,16 +138,18 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
     search = layer_bar.search(state, cards, ui, actions) if state.layers else ""
     texts = [f"{row.region} {row.instruction}" for row in cards.rows]
     found = filter_layers(state, texts, search)[::-1]  # as seen: the top layer, which is the last one, first
-    dragged: int | None = None  # a place among the listed ones
-    dropped = False
-    spans: list[tuple[float, float]] = []
-    listed: list[int] = []
+    dragged, gesture = -1, ""  # one of the rows, and what the hand does with it
+    rows: list[_Row] = []
     visible = {layer.name for layer in stack.visible_layers(state)}
     group = ""
     for i in found:
         layer = state.layers[i]
         if layer.group and layer.group != group:
-            state = _group(state, layer.group, ui, actions)
+            top = imgui.get_cursor_screen_pos().y
+            state, drag = _group(state, layer.group, ui, actions)
+            dragged, gesture = (len(rows), drag) if drag in _DRAGS else (dragged, gesture)
+            layers = tuple(at for at, other in enumerate(state.layers) if other.group == layer.group)
+            rows.append(_Row(top, imgui.get_item_rect_max().y, layers, layer.group, heads=True))
             _tighten(cards, ui)
         group = layer.group
         if group in state.collapsed and not search:
@@ -137,10 +159,12 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
         imgui.set_cursor_pos_x(left + inset)
         card = draw_card(state, i, layer.name in visible, cards, ui)
         state = card.state
-        spans.append((top, imgui.get_item_rect_max().y))
+        dragged, gesture = (len(rows), card.drag) if card.drag in _DRAGS else (dragged, gesture)
+        rows.append(_Row(top, imgui.get_item_rect_max().y, (i,), group))
         _tighten(cards, ui)
-        if cards.reveal and cards.focus == i:
-            imgui.set_scroll_here_y(0.5)
+        cut = layer.gdf in cards.selected and imgui.is_item_visible()
+        if cards.reveal and (cards.focus == i or cut):
+            imgui.internal.scroll_to_item(imgui.internal.ScrollFlags_.keep_visible_edge_y.value)
         focus = i if card.touched and card.press in ("", "one", "keep") else focus
         if card.press and (cards.selected or card.press in ("toggle", "range")):
             actions.append(f"press_layer:{card.press}:{i}:{','.join(str(i) for i in found)}")
@@ -148,23 +172,15 @@ def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) 
         overlap = i if card.overlap else overlap
         pointed = ("layer", i) if card.pointed else pointed
         actions += [card.action] if card.action else []
-        if card.drag:
-            dragged, dropped = len(listed), card.drag == "dropped"
-        listed.append(i)
     if state.layers and not found:
         small("No layer has these words", PALETTE.dim)
-    if dragged is not None:
-        to = _place(dragged, spans, imgui.get_mouse_pos().y)
-        if dropped and to != dragged:
-            focus = listed[to]
-            state = stack.move_layer(state, listed[dragged], focus)
-        elif not dropped:
-            _show_place(dragged, to, spans, ui)
+    if gesture:
+        state, focus = _drag(state, focus, cards, rows, dragged, gesture, ui)
     return CardsResult(state, focus, renaming, overlap, pointed, tuple(actions), search)
 
 
-def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> ViewState:
-    """The row of a group; one that only its layers know is as any other, from the first change on."""
+def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tuple[ViewState, str]:
+    """The row of a group, see `group_row.draw`; one that only its layers know becomes as any other."""
     group = next((group for group in state.groups if group.name == name), LayerGroup(name))
     if group not in state.groups:
         state = replace(state, groups=(*state.groups, group))
@@ -177,23 +193,71 @@ def _tighten(cards: Cards, ui: UiContext) -> None:
         imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * ui.scale)
 
 
-def _place(dragged: int, spans: Sequence[tuple[float, float]], y: float) -> int:
-    """The row where the dragged card would lie: past each card over whose middle the hand is."""
-    return sum(y > (top + bottom) / 2 for i, (top, bottom) in enumerate(spans) if i != dragged)
+def _drag(
+    state: ViewState,
+    focus: int | None,
+    cards: Cards,
+    rows: Sequence[_Row],
+    dragged: int,
+    gesture: str,
+    ui: UiContext,
+) -> tuple[ViewState, int | None]:
+    """The state and the focused layer after a drag of a row: all selected layers go with one of them."""
+    layers = rows[dragged].layers
+    chosen = tuple(i for i, l in enumerate(state.layers) if i == cards.focus or l.gdf in cards.selected)
+    if not rows[dragged].heads and layers[0] in chosen:
+        layers = chosen
+    y, place, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)
+    moved = stack.move_layers(state, layers, place, group)
+    if gesture == "dragged":
+        _show_place(y if moved.layers != state.layers else None, bool(group), layers, rows, ui)
+        return state, focus
+    if focus is not None:
+        name = state.layers[focus].name
+        focus = next(i for i, layer in enumerate(moved.layers) if layer.name == name)
+    return moved, focus
 
 
-def _show_place(dragged: int, to: int, spans: Sequence[tuple[float, float]], ui: UiContext) -> None:
-    """A veil over the dragged card and a line where it would lie; near an edge the list scrolls."""
+def _nearest_gap(
+    state: ViewState, rows: Sequence[_Row], layers: Sequence[int], whole: bool, mouse: float
+) -> tuple[float, int, str]:
+    """Where what is dragged would lie: the line's height, how many layers there are below, the group joined.
+
+    Args:
+        layers: that are dragged
+        whole: as a group, which lies in no other
+        mouse: the hand's height
+    """
+    own = {state.layers[i].group for i in layers}
+    gap, gaps = imgui.get_style().item_spacing.y / 2, [(rows[0].top, max(rows[0].layers) + 1, "")]
+    for over, row in pairwise(rows):
+        inside = bool(row.group) and over.group == row.group
+        if inside and whole and {row.group} != own:
+            continue
+        group = row.group if inside else over.group if not over.heads and {over.group} == own else ""
+        gaps.append((row.top, max(row.layers) + 1, "" if whole else group))
+    last = rows[-1]
+    stays = not (whole or last.heads) and {last.group} == own
+    gaps.append((last.bottom + 2 * gap, min(last.layers), last.group if stays else ""))
+    y, place, group = min(gaps, key=lambda found: abs(found[0] - gap - mouse))
+    return y - gap, place, group
+
+
+def _show_place(
+    y: float | None, joins: bool, layers: Collection[int], rows: Sequence[_Row], ui: UiContext
+) -> None:
+    """A veil over what is dragged and a line where it would lie; near an edge the list scrolls."""
     imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ns)
     canvas, left = imgui.get_window_draw_list(), imgui.get_window_pos().x
-    right, gap = left + imgui.get_window_width(), imgui.get_style().item_spacing.y / 2
-    top, bottom = spans[dragged]
-    veil = imgui.ImVec2(left, top), imgui.ImVec2(right, bottom)
-    canvas.add_rect_filled(*veil, u32((*PALETTE.panel[:3], 0.6)), 6.0 * ui.scale)
-    if to != dragged:
-        y = spans[to][1] + gap if to > dragged else spans[to][0] - gap
-        ends = imgui.ImVec2(left, y - ui.scale), imgui.ImVec2(right, y + ui.scale)
+    right = left + imgui.get_window_width()
+    for row in rows:
+        if {*row.layers} <= {*layers}:
+            veil = imgui.ImVec2(left, row.top), imgui.ImVec2(right, row.bottom)
+            canvas.add_rect_filled(*veil, u32((*PALETTE.panel[:3], 0.6)), 6.0 * ui.scale)
+    if y is not None:
+        start = left + INSET_PX * ui.scale * joins
         canvas.push_clip_rect_full_screen()
+        ends = imgui.ImVec2(start, y - ui.scale), imgui.ImVec2(right, y + ui.scale)
         canvas.add_rect_filled(*ends, u32(PALETTE.accent), ui.scale)
         canvas.pop_clip_rect()
     mouse, margin, step = imgui.get_mouse_pos().y, 24.0 * ui.scale, 6.0 * ui.scale

@@ -8,10 +8,9 @@ from imgui_bundle import imgui
 
 from viewer.panel import strength_slider
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import elide, icon_button, is_released, menu, right_edge, section, tip, typed_name
+from viewer.ui.widgets import elide, grip, icon_button, menu, right_edge, section, tip, typed_name
 
 COLUMNS = 3
-GRIP_PX = 4.0
 _MENU = "menu of a snapshot"
 _ITEMS = (
     ("Rename…", ""),
@@ -135,15 +134,11 @@ def _card(
     imgui.push_id(index)
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
-    tall, dragged = 0.75 * wide, ""
-    clicked = imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall))
-    moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, GRIP_PX * ui.scale)
-    far = bool(index and (moved.x or moved.y))
-    if far and imgui.is_item_active():
-        dragged = f"dragged:{index}"
-    elif far and is_released():
-        dragged = f"dropped:{index}"
-    elif clicked:
+    tall = 0.75 * wide
+    imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall))
+    gesture = grip(ui)
+    dragged = f"{gesture}:{index}" if index and gesture in ("dragged", "dropped") else ""
+    if gesture == "clicked":
         actions.append(f"restore:{index}")
     hovered = imgui.is_item_hovered()
     tip(

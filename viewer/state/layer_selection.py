@@ -140,24 +140,8 @@ def reset(workspace: Workspace, everything: bool) -> Workspace:
 
 def move(workspace: Workspace, by: int) -> Workspace:
     """The selected layers up (−1) or down in the panel's list; the focus goes with them."""
-    chosen, view, focus = selected_layers(workspace), workspace.view, workspace.focus
-    if focus is None:
-        return workspace
-    if len(chosen) == 1:
-        to = max(0, min(focus - by, len(view.layers) - 1))
-        return replace(workspace, view=stack.move_layer(view, focus, to), focus=to)
-    names = {view.layers[i].name for i in chosen}
-    layers = list(view.layers)
-    for i in reversed(chosen) if by < 0 else chosen:
-        to = i - by
-        if 0 <= to < len(layers) and layers[to].name not in names:
-            layers[i], layers[to] = layers[to], layers[i]
-    loose = {layer.group for layer in layers if layer.name not in names} - {""}  # groups that stay behind
-    moved = tuple(
-        replace(layer, group="") if layer.name in names and layer.group in loose else layer
-        for layer in layers
-    )
-    return _with_focus(workspace, stack.tidy_groups(replace(view, layers=moved)))
+    chosen = selected_layers(workspace)
+    return _with_focus(workspace, stack.step_layers(workspace.view, chosen, -by)) if chosen else workspace
 
 
 def remove(workspace: Workspace, index: str) -> Workspace:

@@ -89,16 +89,42 @@ def nudge(view: ViewState, index: int, slider: str, by: float) -> ViewState:
     return change_layer(view, index, step)
 
 
-def move_layer(view: ViewState, index: int, to: int) -> ViewState:
-    """The layer at `index` taken out and put in at `to`; the ends of the stack stop it.
+def move_layers(view: ViewState, indices: Collection[int], at: int, group: str = "") -> ViewState:
+    """These layers taken out and put in over what of the others is among the `at` lowest.
 
-    Between two layers of a group it joins them, away from those of its own it leaves them.
+    Args:
+        group: which they join; "" for none, but a group all of whose layers move stays one
     """
-    if not 0 <= index < len(view.layers):
+    rest = [layer for i, layer in enumerate(view.layers) if i not in indices]
+    left = {layer.group for layer in rest}
+    moved = [
+        replace(l, group=group or (l.group if l.group not in left else ""))
+        for i, l in enumerate(view.layers)
+        if i in indices
+    ]
+    below = sum(i not in indices for i in range(at))
+    return tidy_groups(replace(view, layers=(*rest[:below], *moved, *rest[below:])))
+
+
+def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState:
+    """These layers over the next one above (1) or under the next below (−1); the ends of the stack stop them.
+
+    Between two layers of a group they join them, away from those of their own they leave them; groups go over
+    groups.
+    """
+    past = max(indices) + 1 if by > 0 else min(indices) - 1
+    if not 0 <= past < len(view.layers):
         return view
-    layers, to = list(view.layers), max(0, min(to, len(view.layers) - 1))
-    layers.insert(to, layers.pop(index))
-    return _join_neighbors(replace(view, layers=tuple(layers)), to)
+    rest = {i: layer.group for i, layer in enumerate(view.layers) if i not in indices}
+    own = {view.layers[i].group for i in indices}
+    if "" not in own and not own & {*rest.values()}:
+        while past + by in rest and rest[past + by] == rest[past] != "":
+            past += by
+    at = past + 1 if by > 0 else past
+    below = next((rest[i] for i in range(at - 1, -1, -1) if i in rest), "")
+    above = next((rest[i] for i in range(at, len(view.layers)) if i in rest), "")
+    joined = below if below == above or {below} == own else above if {above} == own else ""
+    return move_layers(view, indices, at, joined)
 
 
 def rename_layer(view: ViewState, index: int, text: str) -> ViewState:
@@ -261,14 +287,3 @@ def tidy_groups(view: ViewState) -> ViewState:
         groups=tuple(group for group in view.groups if group.name in names),
         collapsed=tuple(name for name in view.collapsed if name in names),
     )
-
-
-def _join_neighbors(view: ViewState, index: int) -> ViewState:
-    """The layer at `index` in the group that lies around it, or beside it where that is its own."""
-    below = view.layers[index - 1].group if index else ""
-    above = view.layers[index + 1].group if index + 1 < len(view.layers) else ""
-    own = view.layers[index].group
-    group = below if below == above else own if own in (below, above) else ""
-    others = {layer.group for i, layer in enumerate(view.layers) if i != index}
-    group = own if own and own not in others and below != above else group  # a group of one moves with it
-    return tidy_groups(change_layer(view, index, lambda layer: replace(layer, group=group)))

@@ -9,6 +9,8 @@ from imgui_bundle import imgui
 
 from .context import PALETTE, SMALL_PX, Rgba, UiContext, u32
 
+_GRIP_PX = 4.0  # what moves no further is a click, at 1×
+
 
 def section(name: str, ui: UiContext) -> None:
     """The heading of a part of the panel."""
@@ -92,6 +94,18 @@ def menu(name: str, ui: UiContext) -> Iterator[bool]:
 def is_released() -> bool:
     """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
     return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
+
+
+def grip(ui: UiContext) -> str:
+    """What the hand does with the last item, a button: "clicked", or "dragged" and at the end "dropped".
+
+    "" for nothing, and where a drag was called off.
+    """
+    moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, _GRIP_PX * ui.scale)
+    far = bool(moved.x or moved.y)
+    if far and imgui.is_item_active():
+        return "dragged"
+    return "" if not is_released() else "dropped" if far else "clicked"
 
 
 def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:

@@ -46,6 +46,10 @@ def selected(hand: Rig) -> list[str]:
     return [work.view.layers[i].name for i in layer_selection.selected_layers(work)]
 
 
+def order(hand: Rig) -> list[str]:
+    return [layer.name for layer in hand.main_view.work.view.layers]
+
+
 def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -82,8 +86,23 @@ def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
         hand.click(TRACK + 0.7 * SPAN, row(3))
         assert len(selected(hand)) == 2, "a slider moves alone and leaves the selection"
         assert hand.strengths[3] == pytest.approx(0.7, abs=0.01)
+        entries, names = len(hand.main_view.work.past.past), order(hand)
+        hand.drag((NAME, row(3)), (NAME, row(18) + 0.6 * STEP))
+        assert order(hand)[-4:] == [EDITS[0], EDITS[3], EDITS[18], EDITS[19]], "all that are selected"
+        assert selected(hand) == [EDITS[0], EDITS[3]]
+        assert len(hand.main_view.work.past.past) == entries + 1
+        hand.key("Ctrl+Z")
+        assert order(hand) == names
+        hand.pause(0.5)  # no double click
+        hand.click(NAME, row(3))
+        assert selected(hand) == [EDITS[3]], "a click, unlike a drag, leaves the others"
         hand.click(NAME, row(5))
         assert selected(hand) == [EDITS[5]]
+        hand.key("Ctrl+G")
+        hand.click(NAME, row(0) + STEP)
+        click_with(hand, imgui.Key.mod_ctrl, NAME, row(1) + STEP)
+        hand.click(TRACK + 0.9 * SPAN, MASTER[1] - 64.0)
+        assert hand.strengths[0] == pytest.approx(0.9, abs=0.01), "the bar hides no row that is selected"
 
 
 def test_values_are_copied_as_text_and_the_search_finds_names_and_regions() -> None:
@@ -136,6 +155,14 @@ def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
         assert selected(hand) == [EDITS[8]], "the next row is the one below the group"
         hand.click(NAME, TOP)
         assert selected(hand) == list(EDITS[9:12])
+        entries = len(hand.main_view.work.past.past)
+        hand.pause(0.5)  # no double click
+        hand.drag((NAME, TOP), (NAME, TOP + 2 * STEP + 10.0))
+        assert order(hand)[7:] == [*EDITS[9:12], *EDITS[7:9]]
+        assert {layer.group for layer in hand.main_view.work.view.layers[7:10]} == {"Group"}
+        assert len(hand.main_view.work.past.past) == entries + 1
+        hand.key("Ctrl+Z")
+        assert order(hand) == list(EDITS[:12])
         hand.frame(30)
         hand.double_click(NAME, TOP)
         type_text(hand, "tank", imgui.Key.enter)

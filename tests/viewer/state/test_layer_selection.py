@@ -162,18 +162,17 @@ def test_a_group_gathers_its_layers_switches_and_dims_them_and_dissolves() -> No
 
 def test_a_layer_that_moves_joins_the_group_around_it_and_leaves_its_own_behind() -> None:
     work = act(press(press(six(), "one", "c"), "toggle", "d"), "group")
-    view = layers.move_layer(work.view, 0, 2)
-    assert [(l.name, l.group) for l in view.layers][:4] == [
-        ("b", ""),
-        ("c", "Group"),
-        ("a", "Group"),
-        ("d", "Group"),
-    ]
-    view = layers.move_layer(work.view, 3, 5)
-    assert [(l.name, l.group) for l in view.layers][2:] == [("c", "Group"), ("e", ""), ("f", ""), ("d", "")]
+    joined = act(press(work, "one", "b"), "move:-1")
+    assert (order(joined), groups(joined)) == ("acbdef", ["", "Group", "Group", "Group", "", ""])
+    left = act(press(work, "one", "d"), "move:-1")
+    assert (order(left), groups(left)) == ("abcedf", ["", "", "Group", "", "", ""])
     up = act(act(work, "select_layers:Group"), "move:-1")
     assert (order(up), groups(up)) == ("abecdf", ["", "", "", "Group", "Group", ""])
     assert order(act(up, "move:-1", "move:-1")) == "abefcd", "the end stops all of them"
+    two = act(press(press(work, "one", "e"), "toggle", "f"), "group")
+    down = act(two, "move:1")
+    assert (order(down), groups(down)[2:]) == ("abefcd", ["Group 2"] * 2 + ["Group"] * 2), "over all of it"
+    assert groups(act(press(two, "one", "d"), "move:1", "move:1")) == ["", "", "", "Group", *["Group 2"] * 2]
 
 
 def test_compact_rows_come_by_themselves_and_a_switch_turns_them_round() -> None:

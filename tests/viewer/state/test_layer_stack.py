@@ -96,10 +96,12 @@ def test_what_is_alone_shows_though_its_eye_is_closed_and_nothing_else_does() ->
     assert stack.visible_layers(stack.show_all(view)) == THREE.layers
 
 
-def test_a_layer_moves_within_the_stack_and_stops_at_its_ends() -> None:
-    for to, order in ((-5, "bac"), (0, "bac"), (1, "abc"), (2, "acb"), (9, "acb")):
-        assert "".join(layer.name for layer in stack.move_layer(THREE, 1, to).layers) == order
-    assert stack.move_layer(THREE, 3, 0) == THREE
+def test_layers_move_within_the_stack_and_stop_at_its_ends() -> None:
+    for at, order in ((0, "bac"), (1, "abc"), (2, "abc"), (3, "acb")):
+        assert "".join(layer.name for layer in stack.move_layers(THREE, (1,), at).layers) == order
+    for at, order in ((0, "acb"), (1, "acb"), (2, "bac"), (3, "bac")):
+        assert "".join(layer.name for layer in stack.move_layers(THREE, (0, 2), at).layers) == order
+    assert stack.step_layers(THREE, (1, 2), 1) == stack.step_layers(THREE, (0,), -1) == THREE
 
 
 def test_names_stay_apart_on_one_line_and_never_empty() -> None:
