@@ -53,6 +53,7 @@ class Canvas:
         """How many pictures were drawn."""
         self._resolution = dynamic_resolution.first_known(len(engine.scene), engine.draws_with)
         self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
+        self._sliding = False  # the mouse holds what moves the edits
         self._awaited: object = None  # what is being made while the last picture stays on screen
         self._follows = last is not None and engine.follow(last.comparer.engine)
         if last is not None and self._follows:
@@ -85,11 +86,13 @@ class Canvas:
         screen.clear(*PALETTE.panel)
         aim, edits = (view.camera, size), (view.layers, view.blend, view.background)
         turned, slid = aim != self._last[0], edits != self._last[1]
-        self._last = aim, edits
+        self._last, self._sliding = (aim, edits), held and (self._sliding or slid)
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, held, turned, slid, now)
-        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, overlap, pointed)
+        self.comparer.engine.highlight = highlight.requested_highlight(
+            view, focus, overlap, pointed, self._sliding
+        )
         wanted = aim, edits, self.comparer.engine.highlight
         shown = self.pictures_drawn or self._follows
         if mode != "off" and shown and dynamic_resolution.takes_long(before, self._resolution):

@@ -30,8 +30,9 @@ SHARED = 0xFF3FA0
 """The color of what is in several layers."""
 
 SELECTED: Color = (1.0, 0.72, 0.05)
-TINT, HIDDEN = 140, 255
-"""Shares of 255 that a tint takes; and the one that means that a Gaussian is not drawn at all."""
+TINT, TRACE, HIDDEN = 140, 45, 255
+"""Shares of 255 that a tint takes, and that of a selection while no tool selects; and the one that means that
+a Gaussian is not drawn at all."""
 
 Bytes = NDArray[np.uint8]
 
@@ -45,7 +46,7 @@ class Highlight:
         paint: its weights, as `paint.encode` writes them
         others: edits of which to show, in place of weights, the members that they share with this one
         thin: only a tint over what has less than all of the edit
-        tinted: packed masks and their colors, later ones over earlier ones
+        tinted: packed masks, their colors and shares of 255, later ones over earlier ones
         region: an edit whose members are tinted as one, or None
         hidden: packed mask of what is not drawn
     """
@@ -54,23 +55,29 @@ class Highlight:
     paint: str = paint.FULL
     others: tuple[int, ...] = ()
     thin: bool = False
-    tinted: tuple[tuple[bytes, Color], ...] = ()
+    tinted: tuple[tuple[bytes, Color, int], ...] = ()
     region: int | None = None
     hidden: bytes = NOBODY
 
 
 def requested_highlight(
-    view: ViewState, focus: int | None, overlap: int | None = None, pointed: Pointed | None = None
+    view: ViewState,
+    focus: int | None,
+    overlap: int | None = None,
+    pointed: Pointed | None = None,
+    sliding: bool = False,
 ) -> Highlight | None:
-    """What `view` shows: what the panel is asked about, weights while the brush is out, or the selection
-    while a tool selects, with the regions that are shown.
+    """What `view` shows: what the panel is asked about, weights while the brush is out, or the selection,
+    with the regions that are shown.
 
-    Not in a comparison, and no weights of a hidden layer. What is hidden is the engine's to know.
+    Not in a comparison, and no weights of a hidden layer. A selection is a trace while no tool selects, and
+    none where the panel is hidden or the edits move. What is hidden is the engine's to know.
 
     Args:
         focus: the focused layer, an index into `view.layers`, or None
         overlap: the layer of which to show what it shares with the others, or None
         pointed: what else the mouse rests on in the panel
+        sliding: edits are being moved, and are what one looks at
     """
     if view.compare.mode != "off":
         return None
@@ -86,12 +93,13 @@ def requested_highlight(
             return None
         return Highlight(layer.gdf, layer.paint, thin=not view.brush.weights)
     tinted = [
-        (region.members, region.color)
+        (region.members, region.color, TINT)
         for i, region in enumerate(state.regions)
         if region.visible or (kind, index) == ("region", i)
     ]
-    if state.count and (view.select.tool or kind == "selection"):
-        tinted.append((state.members, SELECTED))
+    asked = bool(view.select.tool) or kind == "selection"
+    if state.count and (asked or (view.panel and not sliding)):
+        tinted.append((state.members, SELECTED, TINT if asked else TRACE))
     return Highlight(tinted=tuple(tinted)) if tinted else None
 
 
@@ -120,10 +128,10 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
         ProgdfError: see `paint.decode` and `unpack`.
     """
     colors = np.zeros((total, 4), np.uint8)
-    for packed, color in highlight.tinted:
-        colors[unpack(packed, total)] = _tint(color)
+    for packed, color, share in highlight.tinted:
+        colors[unpack(packed, total)] = _tint(color, share)
     if highlight.region is not None:
-        colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED)
+        colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED, TINT)
     if highlight.gdf is not None:
         members = gdfs[highlight.gdf].region.members.numpy()
         if highlight.others:
@@ -142,5 +150,5 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
     return colors
 
 
-def _tint(color: Color) -> Bytes:
-    return np.array([*(round(255 * channel) for channel in color), TINT], np.uint8)
+def _tint(color: Color, share: int) -> Bytes:
+    return np.array([*(round(255 * channel) for channel in color), share], np.uint8)

@@ -72,6 +72,26 @@ def test_a_lasso_selects_what_it_encloses(hand: Rig) -> None:
     assert not selected(hand).any()
 
 
+def test_a_selection_leaves_a_trace_in_the_picture_but_not_over_a_slider_that_moves(hand: Rig) -> None:
+    plain = hand.picture()
+    hand.key("L")
+    drag_along(hand, LASSO)
+    tinted = hand.picture()
+    hand.key("L")
+    hand.move(5.0, 5.0)
+    trace = hand.picture()
+    far, near = (np.abs(image.astype(int) - plain).mean() for image in (tinted, trace))
+    assert 0 < near < far / 2
+    hand.move(*hand.slider(0, 0.0))
+    hand.press()
+    hand.move(*hand.slider(0, 0.6))
+    assert hand.main_view.engine.highlight is None
+    hand.release()
+    assert hand.main_view.engine.highlight is not None
+    hand.key("F12")
+    assert hand.main_view.engine.highlight is None, "without the panel one sees the scene alone"
+
+
 @pytest.mark.parametrize("how", ["Enter", "double click", "first corner"])
 def test_a_polygon_is_clicked_and_closed(hand: Rig, how: str) -> None:
     hand.key("P")

@@ -155,15 +155,20 @@ def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_the_selection_is_tinted_while_a_tool_selects(ctx: moderngl.Context, draw: str) -> None:
+def test_the_selection_is_tinted_while_a_tool_selects_and_a_trace_without_one(
+    ctx: moderngl.Context, draw: str
+) -> None:
     members = bear().gdfs[SCARF].region.members
     mask = np.zeros(len(bear().scene), bool)
     mask[members] = True
     chosen = selection.select(SelectionState(), mask)
     still = replace(view(0.6), selection=chosen)
-    assert highlight.requested_highlight(still, 0) is None
+    trace = Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TRACE),))
+    assert highlight.requested_highlight(still, 0) == trace
+    assert highlight.requested_highlight(still, 0, sliding=True) is None
+    assert highlight.requested_highlight(replace(still, panel=False), 0) is None
     tinted = highlight.requested_highlight(replace(still, select=SelectTool("lasso")), 0)
-    assert tinted == Highlight(tinted=((chosen.members, highlight.SELECTED),))
+    assert tinted == Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TINT),))
     assert highlight.requested_highlight(still, 0, None, ("selection", 0)) == tinted
     assert highlight.requested_highlight(still, 0, None, ("layer", SCARF)) == Highlight(region=SCARF)
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
