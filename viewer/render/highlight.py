@@ -128,8 +128,11 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
         ProgdfError: see `paint.decode` and `unpack`.
     """
     colors = np.zeros((total, 4), np.uint8)
+    hidden = unpack(highlight.hidden, total)
     for packed, color, share in highlight.tinted:
-        colors[unpack(packed, total)] = _tint(color, share)
+        mask = unpack(packed, total)
+        if share != TRACE or not hidden.any() or not (mask | hidden).all():  # isolated, it is all one sees
+            colors[mask] = _tint(color, share)
     if highlight.region is not None:
         colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED, TINT)
     if highlight.gdf is not None:
@@ -145,8 +148,7 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
             colors[members, :3] = ramp_colors(weights)
             shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)
             colors[members, 3] = np.round(255.0 * shares)
-    if highlight.hidden != NOBODY:
-        colors[unpack(highlight.hidden, total), 3] = HIDDEN
+    colors[hidden, 3] = HIDDEN
     return colors
 
 
