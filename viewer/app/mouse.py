@@ -12,7 +12,7 @@ from viewer.camera.view_camera import ViewCamera
 from viewer.panel import brush
 from viewer.render.picking import layer_at, seen_at, surface_point
 from viewer.select import hand
-from viewer.select.gesture import Gesture
+from viewer.select.gesture import Click, Gesture
 from viewer.state import layers as stack
 from viewer.state import paint, workspace
 from viewer.state.paint import Stroke
@@ -36,6 +36,7 @@ class MouseTool:
             `axis_gizmo.DRAG`; None while it holds nothing
         stroke: of the brush, from its first drag on
         gesture: of the tool that selects; of a polygon also between its clicks
+        click: the last of a tool that selects by one, while it follows the tool's tolerance
         divider: where that of a split stood when it was gripped, share of the picture's width
         axis: the end of an axis that was pressed, of `named_views.AXES`, or another part of the axes
     """
@@ -43,6 +44,7 @@ class MouseTool:
     drag: str | None = None
     stroke: Stroke | None = None
     gesture: Gesture | None = None
+    click: Click | None = None
     divider: float = 0.5
     axis: str = ""
 
@@ -51,6 +53,8 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     """What the mouse did in this frame, as imgui's io has it."""
     io = imgui.get_io()
     tool, work = _drag(tool, work, pointer)
+    click, work = hand.adjust(tool.click, work, pointer)
+    tool = replace(tool, click=click)
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
     if tool.drag == hand.DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
@@ -71,6 +75,9 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
         return replace(tool, drag=axis_gizmo.DRAG, axis=axis), work
     if work.view.brush.active and plain and imgui.is_mouse_clicked(0):
         return _begin_stroke(tool, work, pointer)
+    if work.view.select.tool in ("flood", "color") and plain and imgui.is_mouse_clicked(0):
+        click, work = hand.click(work, pointer)
+        return MouseTool(hand.DRAG, click=click), work
     if work.view.select.tool and plain and imgui.is_mouse_clicked(0):
         gesture, work = hand.press(tool.gesture, work, pointer)
         return replace(tool, drag=hand.DRAG, gesture=gesture), work

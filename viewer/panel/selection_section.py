@@ -117,7 +117,7 @@ def _options(held: SelectTool, ui: UiContext) -> SelectTool:
         label("Tolerance", column)
         ends = (0.01, 1.0)
         tolerance = value_slider("##tolerance", held.tolerance, ends, "%.2f", SelectTool.tolerance, ui)
-        tip("How unlike the clicked color a color may be ([ and ])")
+        tip("How unlike the clicked color a color may be ([ and ]). The last click follows it")
         held = replace(held, tolerance=tolerance)
     return held
 

@@ -70,6 +70,31 @@ class Gesture:
         return self.scale * float(np.hypot(*np.subtract(self.path[-1], self.path[0])))
 
 
+@dataclass(frozen=True)
+class Click:
+    """A click of "flood" or "color", which follows its tolerance until something else is selected.
+
+    Args:
+        tool: of the two
+        mode: of `SELECT_MODES`
+        before: what was selected when it came, packed
+        at: pixels of the picture
+        surface: of the scene on screen then
+        options: tolerance and depth by which it last selected
+        after: what was selected by that, packed
+        recorded: what undo knows of it, packed
+    """
+
+    tool: str
+    mode: str
+    before: bytes
+    at: Point
+    surface: Surface
+    options: tuple[float, bool]
+    after: bytes
+    recorded: bytes
+
+
 def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, through: bool) -> Gesture | None:
     """What begins where the mouse was pressed; None for a sphere on the background.
 

@@ -8,13 +8,13 @@ from imgui_bundle import imgui
 
 from progdf.scene.selection import Mask, combine
 from viewer.camera.inputs import Keys
-from viewer.state import selection
+from viewer.state import history, selection
 from viewer.state.selection import unpack
 from viewer.state.workspace import Workspace
 from viewer.ui.pointer import PointerContext
 
 from . import gesture as gestures
-from .gesture import Gesture
+from .gesture import Click, Gesture
 
 DRAG = "select"
 """What a left drag does while a tool selects, beside those of `controls.DRAGS`."""
@@ -37,12 +37,6 @@ def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> 
     """The left button went down over the picture."""
     view, tool = work.view, work.view.select
     at = pointer.cursor
-    if tool.tool in ("flood", "color"):
-        found = gestures.clicked(
-            tool.tool, at, pointer.surface, tool.tolerance, tool.through, pointer.facts.neighborhood
-        )
-        begun = Gesture(tool.tool, mode(tool.mode), view.selection.members, (at,))
-        return begun, work if found is None else _apply(begun, work, found, pointer)
     if gesture is not None and gesture.tool == "polygon" == tool.tool:
         if imgui.is_mouse_double_clicked(0) or _is_near(gesture, pointer):
             return finish(gesture, work, pointer)
@@ -53,9 +47,45 @@ def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> 
     return (None, work) if begun_at is None else follow(begun_at, work, pointer)
 
 
+def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
+    """The left button went down over the picture, with a tool that needs no more than that."""
+    tool, before = work.view.select, work.view.selection.members
+    made = Click(
+        tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
+    )
+    made, work = _click(made, work, pointer)
+    return replace(made, recorded=made.after), work
+
+
+def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tuple[Click | None, Workspace]:
+    """The last click again where its tolerance or depth is another, as one change for undo.
+
+    None where something else was selected since, or the tool is another.
+    """
+    tool = work.view.select
+    if click is None or (tool.tool, work.view.selection.members) != (click.tool, click.after):
+        return None, work
+    past = work.past
+    if past.past and past.present.edit.selection.members == click.after != click.recorded:
+        if past.past[-1].edit.selection.members == click.recorded != click.before:
+            work = replace(work, past=history.merge(past))
+        click = replace(click, recorded=click.after)
+    same = click.options == (tool.tolerance, tool.through)
+    return (click, work) if same else _click(click, work, pointer)
+
+
+def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
+    """What a click selects by the tool as it is now."""
+    options = work.view.select.tolerance, work.view.select.through
+    found = gestures.clicked(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
+    if found is not None:
+        work = _apply(click, work, found, pointer)
+    return replace(click, options=options, after=work.view.selection.members), work
+
+
 def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     """The mouse is elsewhere with the button down; brush and sphere select at once."""
-    if gesture.tool in ("polygon", "flood", "color"):
+    if gesture.tool == "polygon":
         return gesture, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
     gesture = gestures.extend(gesture, pointer.cursor, work.view.select.radius * density)
@@ -108,7 +138,7 @@ def _enclosed(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Mas
     return gestures.enclosed(gesture, pointer.surface, work.view.select.through)
 
 
-def _apply(gesture: Gesture, work: Workspace, found: Mask, pointer: PointerContext) -> Workspace:
+def _apply(gesture: Gesture | Click, work: Workspace, found: Mask, pointer: PointerContext) -> Workspace:
     before = unpack(gesture.before, pointer.facts.count)
     return _with(work, selection.select(work.view.selection, combine(before, found, gesture.mode)))
 

@@ -74,6 +74,11 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
     return History(step, (*history.past, history.present)[-LONGEST:])
 
 
+def merge(history: History) -> History:
+    """What the last entry brings back is taken out: the last two changes are one."""
+    return replace(history, past=history.past[:-1])
+
+
 def follow_playhead(history: History, before: ViewState, after: ViewState) -> History:
     """The playhead has moved strengths: no entry, as nobody edited them; gestures under way stay such."""
     if after.layers == before.layers:

@@ -166,9 +166,31 @@ def test_a_click_selects_what_is_connected_and_alike_and_another_tool_all_that_i
     hand.click(*MIDDLE)
     assert (selected(hand) | ~flooded).all()
     assert selected(hand).sum() >= flooded.sum()
-    hand.key("]")
-    hand.key("]")
+
+
+@pytest.mark.parametrize("tool", ["J", "I"])
+def test_a_click_follows_its_tolerance_in_its_mode_as_one_undo_step(hand: Rig, tool: str) -> None:
+    hand.key("Ctrl+A")
+    everything = selected(hand).copy()
+    hand.key(tool)
+    hand.modifier(imgui.Key.mod_ctrl)
+    hand.click(*MIDDLE)
+    hand.modifier(imgui.Key.mod_ctrl, False)
+    taken = [(~selected(hand)).sum()]
+    hand.drag(MIDDLE, (MIDDLE[0] + 60, MIDDLE[1]), 2)  # turned, it is still what was clicked
+    for _ in range(3):
+        hand.key("]")
+        hand.frame(2)
+        taken.append((~selected(hand)).sum())
+    assert 0 < taken[0] < taken[-1]
+    assert taken == sorted(taken)
     assert hand.main_view.work.view.select.tolerance > SelectTool.tolerance
+    assert undos(hand) == 2
+    hand.key("Ctrl+Z")
+    assert (selected(hand) == everything).all()
+    hand.key("[")
+    assert (selected(hand) == everything).all(), "it is taken back, and follows no more"
+    assert undos(hand) == 1
 
 
 def test_shift_adds_ctrl_subtracts_and_both_intersect(hand: Rig) -> None:
