@@ -27,20 +27,20 @@ ANTIALIAS_FLOOR = 0.005
 
 @dataclass(frozen=True)
 class Simplification:
-    """How `simplify` weighs: found on four real scenes of a million (docs/experiments.md, The viewer).
+    """How `simplify` weighs: found on six real scenes of a million (docs/experiments.md, The viewer).
 
     Args:
         cell: side of a cell of the grid in which optical depth is added up, pixels
         slices: of its depth from the near plane on, sixteen to a factor of two
         least_light: share of a hidden one's importance that is left, as cells know nothing of gaps
-        most_times: as many stand behind one that is kept, at most
-        dense: optical depth of a slice beyond which what is left out is not made up for
+        most_times: as much of its area one takes that stands for others, at most
+        dense: optical depth of a slice beyond which there is no need of more area
     """
 
     cell: int = 8
     slices: int = 224
     least_light: float = 0.05
-    most_times: float = 6.0
+    most_times: float = 4.0
     dense: float = 8.0
 
 

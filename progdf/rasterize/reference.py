@@ -240,9 +240,8 @@ def simplify(
         drawn &= torch.maximum(-place, place - side).clamp_min(0.0) ** 2 <= reach2
     rows = drawn.nonzero()[:, 0]
     px, py, z, opacities = px[rows], py[rows], z[rows], opacities[rows]
-    axes = scales[rows].abs()
-    face = axes.prod(1) / axes.min(1).values.clamp_min(1e-300)
-    weights = opacities * (face * fx * fy / z**2 + dilation)
+    squares = scales[rows].square().sort(1).values[:, 1:] * (fx * fy / z**2)[:, None]
+    weights = opacities * (squares + (0.0 if gaussians.antialiased else dilation)).prod(1).sqrt()
     shape = (-(-camera.height // rules.cell), -(-camera.width // rules.cell), rules.slices)
     bits = (z / camera.near).float().view(torch.int32) - torch.tensor(1.0).view(torch.int32)
     cells = (
@@ -263,22 +262,27 @@ def simplify(
             fewer = float((weights / threshold).clamp_max(1.0).sum()) < budget
             low, high = (low, threshold) if fewer else (threshold, high)
     kept = weights >= threshold * (rows.double() * GOLDEN % 1.0)
-    rows, weights, z, dense = rows[kept], weights[kept], z[kept], density[cells][kept]
+    rows, weights, z, dense, opacities = (
+        values[kept] for values in (rows, weights, z, density[cells], opacities)
+    )
+    stands_for = threshold / weights
+    denser = torch.minimum(stands_for, ALPHA_MAX / opacities).clamp_min(1.0)
     enough = (rules.dense / dense.clamp_min(1e-6)).clamp_max(1.0)
-    times = (enough * threshold / weights).clamp(1.0, rules.most_times)
+    larger = (enough * stands_for / denser).clamp(1.0, rules.most_times)
     a, _, c, det0 = _covariances(points[rows], normalize_quats(quats[rows]), scales[rows], view)
     fine = det0 + dilation * (a + c) + dilation**2
-    wider = (times * dilation - DILATION).clamp_min(0.0)
-    coarse = times**2 * det0 + (wider + DILATION) * times * (a + c) + (wider + DILATION) ** 2
-    opacity = opacities[kept] * times * (fine / coarse).sqrt()
+    more = (larger * dilation - DILATION) * z**2 / (fx * fy)
+    sizes = (larger[:, None] * scales[rows] ** 2 + more[:, None]).clamp_min(0.0).sqrt()
+    a, _, c, det = _covariances(points[rows], normalize_quats(quats[rows]), sizes, view)
+    coarse = det + DILATION * (a + c) + DILATION**2
+    opacity = opacities * denser * larger * (fine / coarse).sqrt()
     if gaussians.antialiased:
         opacity = opacity * (det0 / fine).clamp_min(ANTIALIAS_FLOOR).sqrt()
-    larger = (times[:, None] * scales[rows] ** 2 + (wider * z**2 / (fx * fy))[:, None]).sqrt()
     rgb = colors[rows]
     if view.sh_degree is not None:
         direction = torch.nn.functional.normalize(means[rows] + rotation.T @ translation, dim=1, eps=1e-300)
         rgb = shade(view.sh_degree, direction, rgb)
-    found = ActivatedGaussians(means[rows], quats[rows], larger, opacity, rgb)
+    found = ActivatedGaussians(means[rows], quats[rows], sizes, opacity, rgb)
     return found.each(Tensor.float), rows
 
 

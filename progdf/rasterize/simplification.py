@@ -2,14 +2,14 @@
 
 After Cook, Halstead, Planck, Ryu: Stochastic simplification of aggregate detail (2007), for one view:
 
-- a Gaussian matters by its opacity, the area that the camera sees of it, and what reaches it of the light
-  (the optical depth before it, added up in a grid of cells and slices of depth);
+- a Gaussian weighs its opacity times the area that the fine picture shows of it, and matters by that and by
+  what reaches it of the light (the optical depth before it, added up in a grid of cells and slices of depth);
 - beyond the budget one of importance w is kept with probability p = min(1, w / t); which ones, a number
   decides that stays with each, so that nothing flickers while the camera moves;
-- one that is kept takes 1/p of its area, but no more than covers where the scene is dense: there the others
-  hide what is missing, and larger ones would blur its outline;
-- a coarse picture is as bright as the fine one: the dilation, wider there, takes off the opacity what it adds
-  to the area.
+- one that is kept stands for those of its weight that are not: by more opacity, and only where it has no more
+  to give by a larger area, since that blurs outlines; where the scene is dense by no more area than covers:
+  there the others hide what is missing;
+- the dilation, wider in a coarse picture, is taken off the size, and what is left of it off the opacity.
 
 `reference.simplify` is the plain version.
 """
@@ -17,7 +17,7 @@ After Cook, Halstead, Planck, Ryu: Stochastic simplification of aggregate detail
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,11 +25,13 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 
-from .conventions import ANTIALIAS_FLOOR, DILATION, GOLDEN, SIMPLIFY
+from .conventions import ALPHA_MAX, ANTIALIAS_FLOOR, DILATION, GOLDEN, SIMPLIFY
 from .cpu.engine import make_pinhole, share_gaussians
 from .cpu.jit import Number, compilation, kernel
 from .cpu.parallel import run_chunks, threads
-from .cpu.project import Pinhole, Scene, camera_center, footprint, largest_extents, shade_splat
+from .cpu.project import Pinhole, Scene, camera_center, cross, footprint, largest_extents, shade_splat, vec
+from .cpu.project import times as by_components
+from .cpu.shading import dot
 from .cpu.simd import prefetch
 from .engines import ActivatedGaussians, RasterView
 
@@ -43,6 +45,28 @@ _BINS = (int(np.float32(_MOST).view(np.uint32)) >> _SHIFT) + 2
 _EDGES = np.maximum((np.arange(_BINS, dtype=np.uint32) << _SHIFT).view(np.float32), 1e-30).astype(np.float64)
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
 _FULL_TURN = 2.0 * math.pi  # ∫ exp(−r²/2)
+
+
+class Chosen(NamedTuple):
+    """Which Gaussians of N are drawn, and how.
+
+    Args:
+        rows: they. [M] integers
+        weights: what each matters. [N] float32
+        places: in the flat grid, where there is a weight. [N] int32
+        enough: share of its slice's optical depth that covers. float32
+        threshold: of a weight; a lighter one stands for several
+        dilation: of the fine picture, in pixels of the coarse one
+        most_times: as much of its area one takes at most
+    """
+
+    rows: Array
+    weights: Array
+    places: Array
+    enough: Array
+    threshold: float
+    dilation: float
+    most_times: float
 
 
 def simplify(
@@ -65,20 +89,18 @@ def simplify(
     with compilation("simplification", 5):
         weights, places = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
         density = _weigh_all(scene, view, dilation, weights, places)
-        threshold = 0.0
+        threshold, enough = 0.0, np.minimum(rules.dense / np.maximum(density, 1e-6), 1.0)
         if np.count_nonzero(weights) > budget:
-            before = optical_depths(density)
-            threshold = _hide_all(weights, places, before, rules.least_light, budget)
-        rows = _choose_all(weights, threshold)
+            light = np.maximum(np.exp(-optical_depths(density)), rules.least_light)
+            threshold = _hide_all(weights, places, light.ravel(), budget)
+            rows = _choose_all(weights, threshold)
+        else:
+            rows = np.flatnonzero(weights).astype(np.int32)
+        chosen = Chosen(rows, weights, places, enough.ravel(), threshold, dilation, rules.most_times)
         out = Scene(*(np.empty((len(rows), width), np.float32) for width in (3, 4, 3, 1, 3)))
-
-        def take(begin: int, end: int) -> None:
-            _take(
-                begin, end, rows, weights, places, threshold, density.ravel(), dilation, rules.most_times,
-                rules.dense, scene, view, out, np.empty(16),
-            )  # fmt: skip
-
-        share_gaussians(take, len(rows))
+        share_gaussians(
+            lambda begin, end: _take(begin, end, chosen, scene, view, out, np.empty(16)), len(rows)
+        )
     turned, sizes, covers, shown = map(torch.from_numpy, out[1:])
     return ActivatedGaussians(torch.from_numpy(out.means), turned, sizes, covers[:, 0], shown)
 
@@ -131,12 +153,12 @@ def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, pla
     return first.reshape(shape)
 
 
-def _hide_all(weights: Array, places: Array, before: Array, least: float, budget: int) -> float:
+def _hide_all(weights: Array, places: Array, light: Array, budget: int) -> float:
     """Take from the weights what others hide; the threshold of the budget."""
 
     def hide(begin: int, end: int) -> tuple[Array, Array]:
         counts, sums = np.zeros(_BINS, np.int64), np.zeros(_BINS)
-        _hide(begin, end, weights, places, before.ravel(), least, counts, sums)
+        _hide(begin, end, weights, places, light, counts, sums)
         return counts, sums
 
     counts, sums = zip(*share_gaussians(hide, len(weights)), strict=True)
@@ -176,7 +198,10 @@ def _weigh(
         if not (usable and out_x * out_x <= wide2 and out_y * out_y <= high2):
             continue
         a, b, c = abs(scene.scales[i, 0]), abs(scene.scales[i, 1]), abs(scene.scales[i, 2])
-        area = max(a * b, max(a * c, b * c)) * focal / (z * z) + dilation
+        longest, middle = max(a, max(b, c)), max(min(a, b), min(max(a, b), c))
+        longest2, middle2 = longest * longest * focal / (z * z), middle * middle * focal / (z * z)
+        more = 0.0 if camera.antialiased else dilation
+        area = math.sqrt((longest2 + more) * (middle2 + more))
         weights[i] = min(scene.opacities[i] * area, _MOST)
         column = int(min(max(px, 0.0), x1 - 1.0)) // size
         row = int(min(max(py, 0.0), y1 - 1.0)) // size
@@ -186,16 +211,15 @@ def _weigh(
         density[places[i]] += weights[i] * share
 
 
-@kernel(contract=True, cache=True)
+@kernel(cache=True)
 def _hide(
-    begin: int, end: int, weights: Array, places: Array, before: Array, least: float, counts: Array,
-    sums: Array,
-) -> None:  # fmt: skip
-    """Take from the weights of Gaussians begin … end − 1 what does not reach them of the light, but for the
-    share `least`; count them and add them up by bins of their bits."""
+    begin: int, end: int, weights: Array, places: Array, light: Array, counts: Array, sums: Array
+) -> None:
+    """Take from the weights of Gaussians begin … end − 1 what does not reach their places of the light; count
+    them and add them up by bins of their bits."""
     for i in range(begin, end):
         if weights[i] > 0.0:
-            weights[i] *= max(math.exp(-before[places[i]]), least)
+            weights[i] *= light[places[i]]
             place = np.float32(weights[i]).view(np.int32) >> _SHIFT
             counts[place] += 1
             sums[place] += weights[i]
@@ -215,33 +239,37 @@ def _choose(begin: int, end: int, weights: Array, threshold: float, rows: Array)
 
 @kernel(contract=True, cache=True)
 def _take(
-    begin: int, end: int, rows: Array, weights: Array, places: Array, threshold: float, density: Array,
-    dilation: float, most: float, dense: float, scene: Scene, camera: Pinhole, out: Scene, basis: Array,
-) -> None:  # fmt: skip
+    begin: int, end: int, chosen: Chosen, scene: Scene, camera: Pinhole, out: Scene, basis: Array
+) -> None:
     """Take the chosen Gaussians of places begin … end − 1 as they are drawn."""
-    eye = camera_center(camera)
+    eye, dilation = camera_center(camera), chosen.dilation
     for at in range(begin, end):
-        i, ahead = rows[at], rows[min(at + _AHEAD, end - 1)]
+        i, ahead = chosen.rows[at], chosen.rows[min(at + _AHEAD, end - 1)]
         prefetch(scene.means, ahead)
         prefetch(scene.quats, ahead)
         prefetch(scene.scales, ahead)
         prefetch(scene.colors, ahead)
         seen = footprint(camera, scene, i)
-        enough = min(dense / max(density[places[i]], 1e-6), 1.0)
-        times = min(max(enough * threshold / weights[i], 1.0), most)
+        opacity, stands_for = np.float64(scene.opacities[i]), chosen.threshold / chosen.weights[i]
+        denser = max(min(stands_for, ALPHA_MAX / opacity), 1.0)
+        larger = min(max(chosen.enough[chosen.places[i]] * stands_for / denser, 1.0), chosen.most_times)
+        # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
+        more = (larger * dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
+        a, b, c = vec(scene.scales, i)
+        size = (
+            math.sqrt(max(larger * a * a + more, 0.0)), math.sqrt(max(larger * b * b + more, 0.0)),
+            math.sqrt(max(larger * c * c + more, 0.0)),
+        )  # fmt: skip
+        p0, p1 = by_components(seen.turned0, size), by_components(seen.turned1, size)
+        normal = cross(p0, p1)
         fine = seen.det0 + dilation * (seen.a + seen.c) + dilation * dilation
-        wider = max(times * dilation - DILATION, 0.0)  # what the coarse picture's dilation lacks
-        total = wider + DILATION
-        coarse = times * times * seen.det0 + total * times * (seen.a + seen.c) + total * total
-        opacity = np.float64(scene.opacities[i])
+        coarse = dot(normal, normal) + DILATION * (dot(p0, p0) + dot(p1, p1)) + DILATION * DILATION
         if camera.antialiased:
             opacity *= math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / fine))
-        out.opacities[at, 0] = opacity * times * math.sqrt(fine / coarse)
-        extra = wider / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
+        out.opacities[at, 0] = opacity * denser * larger * math.sqrt(fine / coarse)
         for k in range(3):
-            scale = np.float64(scene.scales[i, k])
             out.means[at, k] = scene.means[i, k]
-            out.scales[at, k] = math.sqrt(times * scale * scale + extra)
+        out.scales[at, 0], out.scales[at, 1], out.scales[at, 2] = size
         for k in range(4):
             out.quats[at, k] = scene.quats[i, k]
         red, green, blue = shade_splat(scene, i, camera.degree, eye, basis)
