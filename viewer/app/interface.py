@@ -127,7 +127,7 @@ def over_picture(
     closed, free = False, imgui.get_io().display_size
     bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)
-    if strip is not None:
+    if strip is not None and work.dialog is None:
         work = replace(work, requests=(*work.requests, *up_strip.draw(strip, above, ui)))
         above = replace(above, height=above.height - up_strip.height(strip, area, ui))
     if work.message is not None:

@@ -40,7 +40,7 @@ from .studio import cover, start_page
 from .studio.cover import Cover
 from .studio.up_strip import UpStrip
 
-FLIGHT_S, BLINK_S = 1 / 60, 0.3  # between frames: while flying; while a text field is open
+FLIGHT_S = 1 / 60  # between frames while flying
 
 
 class MainView:
@@ -133,8 +133,6 @@ class MainView:
         waits = [FLIGHT_S] if inputs.is_flying(self._keys) or self._taps.since else []
         if self.work.glide is not None:
             waits.append(0.0)
-        if imgui.get_io().want_text_input:
-            waits.append(BLINK_S)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
         sharpens = self.canvas.next_frame_delay(self._clock)

@@ -102,6 +102,7 @@ class UiContext:
         io = imgui.get_io()
         io.set_ini_filename("")  # no imgui.ini left in the user's folder
         io.set_log_filename("")
+        io.config_input_text_cursor_blink = False  # or an open text field has the window drawn all the time
         self.fonts = _load_fonts(io.fonts)
         self.scale = 0.0
         self.set_scale(scale)

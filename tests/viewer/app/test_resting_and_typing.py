@@ -98,6 +98,8 @@ def test_keys_wait_while_a_text_field_opens(hand: Rig) -> None:
     hand.settle()
     assert hand.main_view.work.renaming is not None
     assert not hand.main_view.work.view.brush.active, "the letter belongs to the name"
+    hand.rest()
+    assert hand.main_view.next_frame_delay() is None, "an open field alone draws nothing"
 
 
 def test_escape_closes_the_list_of_keys_first(hand: Rig) -> None:
