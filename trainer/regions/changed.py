@@ -29,9 +29,9 @@ from progdf.sh import sh0_to_rgb
 from trainer.editors.pictures import lay_over, mend_background, move_image, transmittance
 from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plane
 
-from .few_masks import connected_pieces
-from .lift import HIDDEN, bare_weight, lift_masks
-from .surface import surface_vote
+from .few_masks import FEW, connected_pieces
+from .lift import HIDDEN, Evidence, bare_weight, gather, lift_evidence
+from .surface import SurfaceVote
 
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
@@ -77,9 +77,14 @@ def changed_region(
     if not any(bool(mask.any()) for mask in masks):
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
-    found = lift_masks(scene, small, masks, "changed", "share", least)
-    found = _vote_on_rim(scene, found, small, masks, least)
-    region = _drop_strays(scene, found, small, masks, least)
+    evidence, surface_vote = gather(scene, small, masks), SurfaceVote(scene)
+    inner = torch.zeros(len(scene), dtype=torch.float64)  # of a member's contribution, what lies off the rims
+    for camera, mask in zip(small, masks, strict=True):
+        inner += alpha_weights(scene, camera, _within_rim(mask))[:, 0]
+    few = 2 <= len(masks) <= FEW
+    found = lift_evidence(scene, evidence, surface_vote, "changed", "share", least, few)
+    found = _vote_on_rim(found, evidence, inner, surface_vote, least)
+    region = _drop_strays(scene, found, evidence, inner, least)
     if not len(region):
         raise ProgdfError(
             "no Gaussian lies mostly where the pictures differ; change more, or name the region with --region"
@@ -114,22 +119,17 @@ def find_change(original: Tensor, picture: Tensor) -> Tensor:
     return torch.from_numpy(ndimage.binary_dilation(changed, np.ones((3, 3))))
 
 
-def _drop_strays(
-    scene: Gaussians, region: Region, cameras: Sequence[Camera], masks: Sequence[Tensor], least: float
-) -> Region:
+def _drop_strays(scene: Gaussians, region: Region, evidence: Evidence, inner: Tensor, least: float) -> Region:
     """The region without connected pieces that show along the rim of what changed, and nowhere else; and
     without what does not show, and is neither on the surface nor of the color of anything that does."""
     if not len(region):
         return region
     members = scene[region.members]
-    sums = torch.zeros(len(region), 4, dtype=torch.float64)
-    for camera, mask in zip(cameras, masks, strict=True):
-        sums += alpha_weights(scene, camera, _within_rim(mask))[region.members]
     piece = connected_pieces(members)
-    inside, shown = (np.bincount(piece, sums[:, column].numpy()) for column in (0, 2))
+    inside, shown = (np.bincount(piece, part[region.members].numpy()) for part in (inner, evidence.weight))
     whole = (inside > _INNER * shown) & (inside > _LITTLE * inside.max()) | (inside == inside.max())
     kept = torch.from_numpy(whole[piece])
-    hidden = sums[:, 2] < HIDDEN * bare_weight(members.opacities) * sums[:, 3].clamp_min(1.0)
+    hidden = _hidden(evidence)[region.members]
     if bool(hidden.any()) and bool((kept & ~hidden).any()):
         colors = sh0_to_rgb(members.sh0).numpy()
         shown_colors = colors[kept & ~hidden]
@@ -143,28 +143,29 @@ def _drop_strays(
 
 
 def _vote_on_rim(
-    scene: Gaussians, region: Region, cameras: Sequence[Camera], masks: Sequence[Tensor], least: float
+    region: Region, evidence: Evidence, inner: Tensor, surface_vote: SurfaceVote, least: float
 ) -> Region:
     """The region, with what shows along the rim of a change, or not at all, as its own surface is inside it.
 
     A mask is a pixel or two too wide, and a Gaussian that something changed all but hides shows there alone:
     it would hand its membership on to all that is hidden of its surface.
     """
-    sums, rims = torch.zeros(len(scene), 4, dtype=torch.float64), torch.zeros(len(scene), dtype=torch.float64)
-    for camera, mask in zip(cameras, masks, strict=True):
-        sums += alpha_weights(scene, camera, mask)
-        rims += alpha_weights(scene, camera, mask & ~_within_rim(mask))[:, 0]
-    member = torch.zeros(len(scene), dtype=torch.bool).index_fill(0, region.members, True)
-    hidden = sums[:, 2] < HIDDEN * bare_weight(scene.opacities) * sums[:, 3].clamp_min(1.0)
-    doubtful = hidden | member & (rims > _AT_RIM * sums[:, 2])
+    member = torch.zeros_like(inner, dtype=torch.bool).index_fill(0, region.members, True)
+    at_rim = evidence.inside - inner > _AT_RIM * evidence.weight
+    doubtful = _hidden(evidence) | member & at_rim
     if not bool((member & ~doubtful).any()):
         return region
     rows = doubtful.nonzero()[:, 0]
-    vote = surface_vote(scene, member, rows)
+    vote = surface_vote(member, rows)
     member[rows] = vote > 0
     score = region.score.clone()
     score[rows] = torch.where(vote > 0, least + (1 - least) * vote, torch.zeros(()))
     return Region(region.name, member.nonzero()[:, 0], score)
+
+
+def _hidden(evidence: Evidence) -> Tensor:
+    """Which Gaussians are next to hidden in the mean of the views, not only in the best one. [N] bool"""
+    return evidence.weight < HIDDEN * bare_weight(evidence.opacities) * evidence.pixels.clamp_min(1.0)
 
 
 def _within_rim(mask: Tensor) -> Tensor:

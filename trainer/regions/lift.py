@@ -16,7 +16,7 @@ from progdf.region import Region
 from trainer.options import LiftRule
 
 from .few_masks import FEW, drop_strays, find_holes
-from .surface import surface_vote
+from .surface import SurfaceVote
 
 THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "count": 0.8, "paper": 0.8}
 """Least score of a member under each rule; those of `count` and `paper` are the paper's."""
@@ -120,7 +120,7 @@ def lift_masks(
     Returns:
         The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
         is the rule's for Gaussians that the views decide; for the others it tells how much of the surface
-        around them belongs to the members (see `surface.surface_vote`), half of it being the threshold.
+        around them belongs to the members (see `surface.SurfaceVote`), half of it being the threshold.
         Where the views decide on no member there is none. Under the rule `paper` the score alone decides, as
         printed: there is no surface, and no cleaning.
 
@@ -128,12 +128,25 @@ def lift_masks(
     """
     least = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)
+    return lift_evidence(scene, evidence, SurfaceVote(scene), name, rule, least, 2 <= len(masks) <= FEW, say)
+
+
+def lift_evidence(
+    scene: Gaussians,
+    evidence: Evidence,
+    surface_vote: SurfaceVote,
+    name: str,
+    rule: LiftRule,
+    least: float,
+    few: bool,
+    say: Callable[[str], None] | None = None,
+) -> Region:
+    """`lift_masks` of gathered evidence; `few`: whether the region is cleaned as that of few masks."""
     scores = score(evidence, rule)
     if rule == "paper":
         return Region(name, (scores >= least).nonzero()[:, 0], scores)
     rows = undecided_rows(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
-    few = 2 <= len(masks) <= FEW
     if few:
         # what rough borders cut through, and what one of two masks holds, is as its surroundings are
         mixed = (scores > min(_DOUBTFUL[0], least)) & (scores < least)
@@ -144,7 +157,7 @@ def lift_masks(
         rows = open_.nonzero()[:, 0]
     scores[rows] = 0.0
     if bool(member.any()):
-        vote = surface_vote(scene, member, rows)
+        vote = surface_vote(member, rows)
         below = (least * (1 + vote)).clamp_max(_below(least))
         scores[rows] = torch.where(vote > 0, least + (1 - least) * vote, below)
         member[rows] = vote > 0

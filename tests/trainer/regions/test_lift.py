@@ -18,7 +18,7 @@ from tests.helpers.scenes import concatenate, front_camera, one_gaussian, random
 from tests.helpers.trained import label_mask
 from trainer.regions import lift
 from trainer.regions.lift import Evidence, gather, lift_masks, score
-from trainer.regions.surface import surface_vote
+from trainer.regions.surface import SurfaceVote, surface_likeness
 
 WALL = 15
 
@@ -164,7 +164,7 @@ def test_what_no_view_shows_goes_with_the_surface_it_continues() -> None:
     member = torch.zeros(len(scene), dtype=torch.bool)
     member[len(front) :] = True
     inner = ((scene.means[:, :2].abs() < 0.35).all(dim=1)).nonzero()[:, 0]
-    vote = surface_vote(scene, member, inner)
+    vote = SurfaceVote(scene)(member, inner)
     assert torch.equal(vote > 0, member[inner])
 
 
@@ -186,7 +186,24 @@ def test_a_hidden_gaussian_takes_no_label_from_what_covers_it() -> None:
 
 def test_nothing_in_reach_is_no_vote() -> None:
     scene = random_gaussians(30, seed=1)
-    assert surface_vote(scene, torch.ones(30, dtype=torch.bool), torch.arange(30)).tolist() == [0.0] * 30
+    assert SurfaceVote(scene)(torch.ones(30, dtype=torch.bool), torch.arange(30)).tolist() == [0.0] * 30
+
+
+def test_weak_ties_are_left_out_and_a_second_vote_is_as_a_first(demo: DemoScene) -> None:
+    """Beside the plain form, every neighbor's likelihood in a dense table."""
+    scene = demo.gaussians
+    member = demo.labels == 1
+    rows = (scene.means[:, 2] > scene.means[:, 2].median()).nonzero()[:, 0]
+    near, likeness = surface_likeness(scene, rows)
+    plain = 2.0 * member.float() - 1.0
+    plain[rows] = 0.0
+    for _ in range(100):
+        plain[rows] = (likeness * plain[near]).sum(dim=1)
+    surface_vote = SurfaceVote(scene)
+    surface_vote(~member, rows[::2])
+    vote = surface_vote(member, rows)
+    assert torch.equal(vote, SurfaceVote(scene)(member, rows))
+    assert float((vote - plain[rows]).abs().max()) < 0.03
 
 
 # ---------------------------------------------------------------------------------------------- neighbors
