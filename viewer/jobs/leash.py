@@ -13,8 +13,17 @@ import os
 import sys
 import threading
 
-NICE = 10
+LEAST_URGENT = 19
 TALKS = "--talks"
+
+
+def _step_back() -> None:
+    """Leave the processor to the window wherever it wants it (docs/benchmarks.md, A scene in the hand)."""
+    with contextlib.suppress(OSError):
+        if sys.platform != "win32":
+            os.nice(LEAST_URGENT)
+        if sys.platform == "linux":
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _hold() -> None:
@@ -28,10 +37,8 @@ def _hold() -> None:
 def main() -> int:
     """The exit status of the command."""
     talks = sys.argv[1:2] == [TALKS]
-    if hasattr(os, "nice") and not talks:
-        with contextlib.suppress(OSError):
-            os.nice(NICE)
     if not talks:
+        _step_back()
         threading.Thread(target=_hold, daemon=True).start()
     from progdf.__main__ import main as run
 
