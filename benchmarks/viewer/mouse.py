@@ -70,14 +70,16 @@ class Mouse:
         self.main_view.close()
         self._screen.release()
 
-    def frame(self, seconds: float = _STEP_S) -> float:
+    def frame(self, seconds: float = _STEP_S, event: bool = True) -> float:
         """Milliseconds from now to a frame's finished pixels.
 
         Args:
             seconds: that have passed on the main view's clock since the last one
+            event: whether something has happened; else time alone brings this frame
         """
         began = time.perf_counter()
-        self.main_view.wake()
+        if event:
+            self.main_view.wake()
         self.main_view.frame(self._screen, self.pixels, seconds, arrived=began)
         self._ctx.finish()
         return 1e3 * (time.perf_counter() - began)

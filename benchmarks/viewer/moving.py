@@ -33,7 +33,7 @@ from .scenes import copies, scenes_of
 SIZE, STEPS, TURN_PX, WARM_UP = (980, 800), 60, 10.0, 3
 MILLION, JUDGED = 1_000_000, 6
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_POLL_S, _SETTLE_S, _LONGEST_S = 0.005, 3.0, 20.0
+_POLL_S, _SETTLE_S, _LONGEST_S = 0.02, 3.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -97,20 +97,20 @@ def measure(
                 error, apart = _compare(mouse, scene)
                 db, luminance = min(db, error), max(luminance, apart, key=abs)
         began = time.perf_counter()
-        meanwhile = _rest(mouse, until_sharp=True)
+        meanwhile = _rest(mouse, began - 1e-3 * turning[-1], until_sharp=True)
         sharp, full = 1e3 * (time.perf_counter() - began), mouse.main_view.canvas.timings.total_ms
         mouse.release()
         mouse.frame(seconds=1.0)
-        click = max(mouse.press(), mouse.release(), mouse.frame(), _rest(mouse))
+        click = max(mouse.press(), mouse.release(), mouse.frame(), _rest(mouse, time.perf_counter()))
         held = mouse.main_view.work.view
         mouse.main_view.change(replace(held, select=replace(held.select, tool="lasso")))
-        _rest(mouse)
+        _rest(mouse, time.perf_counter())
         middle, reach = (size[0] / 2, size[1] / 2), 0.25 * min(size)
         mouse.move(middle[0], middle[1] - reach)
         mouse.press()
         for turn in np.linspace(0.0, 2.0 * np.pi, 40):
             mouse.move(middle[0] + reach * np.sin(turn), middle[1] - reach * np.cos(turn))
-        lasso = max(mouse.release(), _rest(mouse))
+        lasso = max(mouse.release(), _rest(mouse, time.perf_counter()))
     engine.release()
     return Moving(len(scene), tuple(turning[WARM_UP:]), sharp, meanwhile, click, lasso, full, db, luminance)
 
@@ -161,15 +161,19 @@ def _compare(mouse: Mouse, scene: Gaussians) -> tuple[float, float]:
     return error, float((moving @ _LUMINANCE).mean() / (full @ _LUMINANCE).mean()) - 1.0
 
 
-def _rest(mouse: Mouse, until_sharp: bool = False) -> float:
-    """Frames while the hand rests, as the window draws them; the longest one, ms."""
-    began = last = time.perf_counter()
-    longest = 0.0
+def _rest(mouse: Mouse, last: float, until_sharp: bool = False) -> float:
+    """Frames while the hand rests, as the window draws them; the longest one, ms.
+
+    Args:
+        last: when the last frame began
+    """
+    began, longest = time.perf_counter(), 0.0
     while time.perf_counter() - began < (_LONGEST_S if until_sharp else _SETTLE_S):
         if until_sharp and mouse.main_view.canvas.pixels == 1:
             break
-        now = time.perf_counter()
-        longest = max(longest, mouse.frame(seconds=now - last))
-        last = now
-        time.sleep(min(max(mouse.main_view.next_frame_delay() or 0.0, _POLL_S), 4 * _POLL_S))
+        if mouse.main_view.is_due():
+            now = time.perf_counter()
+            longest, last = max(longest, mouse.frame(seconds=now - last, event=not until_sharp)), now
+        wait = mouse.main_view.next_frame_delay()
+        time.sleep(_POLL_S if wait is None else min(wait, _POLL_S))
     return longest

@@ -27,7 +27,7 @@ ANTIALIAS_FLOOR = 0.005
 
 @dataclass(frozen=True)
 class Simplification:
-    """How `simplify` weighs: found on six real scenes of a million (docs/experiments.md, The viewer).
+    """How `simplify` weighs: found on seven real scenes of a million (docs/experiments.md, The viewer).
 
     Args:
         cell: side of a cell of the grid in which optical depth is added up, pixels
@@ -40,7 +40,7 @@ class Simplification:
     cell: int = 8
     slices: int = 224
     least_light: float = 0.05
-    most_times: float = 4.0
+    most_times: float = 5.0
     dense: float = 8.0
 
 

@@ -134,7 +134,8 @@ class App:
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
                 self.main_view.request("quit")
-            self.draw()
+            if self.main_view.is_due():
+                self.draw()
         self.file_actions.on_close()
 
     def draw(self) -> None:

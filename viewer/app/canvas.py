@@ -55,6 +55,7 @@ class Canvas:
         self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
         self._sliding = False  # the mouse holds what moves the edits
         self._awaited: object = None  # what is being made while the last picture stays on screen
+        self._begun: tuple[ViewState, tuple[int, int]] | None = None  # what was not done yet
         self._follows = last is not None and engine.follow(last.comparer.engine)
         if last is not None and self._follows:
             self._resolution, self._last = last._resolution, last._last
@@ -94,13 +95,13 @@ class Canvas:
             view, focus, overlap, pointed, self._sliding
         )
         wanted = aim, edits, self.comparer.engine.highlight
-        shown = self.pictures_drawn or self._follows
+        shown, self._begun = self.pictures_drawn or self._follows, None
         if mode != "off" and shown and dynamic_resolution.takes_long(before, self._resolution):
             moves = turned or (held and self._awaited not in (None, wanted))
             if moves or not self.comparer.prepare(view, size):
                 stays = not moves and before.pixels == 1 and view.compare.mode == "off"
                 self._resolution = dynamic_resolution.wait(self._resolution, now, coarsely=not stays)
-                self._awaited = wanted
+                self._awaited, self._begun = wanted, None if moves else (view, size)
                 if stays:
                     self.comparer.engine.show_last(view, screen, size)
                     return
@@ -121,6 +122,10 @@ class Canvas:
     def next_frame_delay(self, now: float) -> float | None:
         """Seconds until the picture has to be drawn in full; None where it is."""
         return dynamic_resolution.next_frame_delay(self._resolution, now)
+
+    def awaits_picture(self) -> bool:
+        """Whether a picture is being made that is not done yet."""
+        return self._begun is not None and not self.comparer.prepare(*self._begun)
 
     def image(self, view: ViewState, size: tuple[int, int]) -> Image:
         """The picture as an array, in full; see `Comparer.image`. [H,W,3]"""

@@ -140,6 +140,11 @@ class MainView:
         film = playback.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
+    def is_due(self) -> bool:
+        """Whether a frame would show anything new; not if it could only look for a picture that is not done:
+        where the processor draws the window too, that takes the time from it."""
+        return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
+
     def show_message(self, text: str, error: bool = False) -> None:
         """Show one line at the bottom of the picture for a while."""
         self.work = workspace.with_message(self.work, text, self._clock, error)

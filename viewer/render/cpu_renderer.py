@@ -20,11 +20,12 @@ from progdf.rasterize import ActivatedGaussians, Crop, render
 from progdf.rasterize.cpu.parallel import stopped_by
 from progdf.rasterize.lines import lines_behind
 from progdf.rasterize.pixel_cells import area, dirty_rectangles, mark_cells, no_cells
+from progdf.rasterize.screen_bytes import fill_screen
 from progdf.rasterize.simplification import simplify
 from progdf.sh import C0
 from viewer.camera.up_axis import Vec3
 from viewer.gl.layout import SPLATS_PER_ROW
-from viewer.gl.present import Presenter
+from viewer.gl.present import ScreenCopy
 from viewer.gl.scene_textures import row_runs
 
 from .ground_grid import CLEAR, Lines
@@ -117,11 +118,10 @@ class CpuRenderer:
 
     def __init__(self, ctx: moderngl.Context | None = None) -> None:
         self._ctx = ctx
-        self._presenter = None if ctx is None else Presenter(ctx)
-        self._texture: moderngl.Texture | None = None
-        self._stale: list[Crop] | None = None  # where the texture is behind the picture; None is everywhere
+        self._copy: ScreenCopy | None = None
+        self._stale: list[Crop] | None = None  # where the copy is behind the picture; None is everywhere
         self._kept: _Kept | None = None
-        self._grid: Lines | None = None  # what the texture shows of it
+        self._grid: Lines | None = None  # what the copy shows of it
         self._lent = False  # whether the picture's array is in other hands
         self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
@@ -146,6 +146,8 @@ class CpuRenderer:
         nobody = np.zeros(0, np.int64)  # compiled now, and not under the first touch of a slider
         camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
         mark_cells(no_cells(1, 1), self._drawn, nobody, camera)
+        for side in (1, 2):
+            fill_screen(np.zeros((1, 1, 3), np.float32), np.zeros((side, side, 4), np.uint8))
         if len(scene.means) > BUDGETS[2]:
             simplify(self._drawn.select(torch.arange(2)), camera, 1)
 
@@ -274,39 +276,36 @@ class CpuRenderer:
     ) -> None:
         """See `Renderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
-        assert self._presenter is not None
         kept, image = self._picture(), self._picture().image
-        pixels = (image.shape[1], image.shape[0])
-        if self._texture is None or self._texture.size != pixels:
-            if self._texture is not None:
-                self._texture.release()
-            self._texture, self._stale = self._ctx.texture(pixels, 3, dtype="f4"), None
+        size = size or (image.shape[1], image.shape[0])
+        if self._copy is None or (self._copy.size, self._copy.left) != (size, left):
+            if self._copy is not None:
+                self._copy.release()
+            self._copy, self._stale = ScreenCopy(self._ctx, size, left), None
         if grid is not self._grid:
             self._grid, self._stale = grid, None
         if grid is None or self._stale == []:
-            self._send(self._texture, image)
+            self._send(self._copy, image)
         else:  # cheaper than another picture, or another pass of software GL
             lines = grid.view(np.float32).reshape(len(grid), -1)
             with lines_behind(image, kept.through, lines, CLEAR):
-                self._send(self._texture, image)
-        self._presenter.show(self._texture, framebuffer, size, left)
+                self._send(self._copy, image)
+        self._copy.show(framebuffer)
 
-    def _send(self, texture: moderngl.Texture, image: Image) -> None:
-        """Bring the texture up to the picture."""
-        if self._stale is None:
-            texture.write(image)
-        for x0, y0, x1, y1 in self._stale or ():
-            part = np.ascontiguousarray(image[y0:y1, x0:x1])
-            texture.write(part, viewport=(x0, y0, x1 - x0, y1 - y0))
+    def _send(self, copy: ScreenCopy, image: Image) -> None:
+        """Bring the copy up to the picture."""
+        if self._stale is None or (self._stale and copy.size != (image.shape[1], image.shape[0])):
+            copy.write(image)
+        else:
+            for x0, y0, x1, y1 in self._stale:
+                copy.write_part(image[y0:y1, x0:x1], x0, y0)
         self._stale = []
 
     def release(self) -> None:
         """Give back what it holds."""
         self._drop()
-        if self._texture is not None:
-            self._texture.release()
-        if self._presenter is not None:
-            self._presenter.release()
+        if self._copy is not None:
+            self._copy.release()
 
     def _keep(self, picture: _Kept) -> None:
         """A whole new picture."""

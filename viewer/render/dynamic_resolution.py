@@ -15,7 +15,7 @@ SLOW_MS = 40.0
 REST_S = 0.06
 """How long nothing moves before the picture in full is begun. What is begun keeps nobody waiting."""
 
-POLL_S = 0.02
+POLL_S = 0.01
 """Between two looks whether it is done."""
 
 MANY = 150_000

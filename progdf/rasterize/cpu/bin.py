@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 
 from .jit import kernel
 from .project import EXTENT_Y, INV_L11, L22, MX, MY, R2, SLOPE, Pinhole, Splats
+from .simd import prefetch
 
 Array = NDArray[Any]
 
 TILE_W, TILE_H = 64, 8
 """Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
+
+
+_AHEAD = 8  # splats whose tiles are fetched before it is their turn: they lie far apart
 
 
 class TileLists(NamedTuple):
@@ -128,7 +132,11 @@ def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_
 @kernel(cache=True)
 def _fill(order: Array, tiles: Array, offsets: Array, places: Array, members: Array, slots: Array) -> None:
     """Put the splats into the lists of their tiles. places: where the next of each tile goes; used up."""
-    for i in order:
+    last = order.size - 1
+    for k in range(order.size):
+        prefetch(offsets, order[min(k + 2 * _AHEAD, last)])
+        prefetch(tiles, offsets[order[min(k + _AHEAD, last)]])
+        i = order[k]
         for slot in range(offsets[i], offsets[i + 1]):
             at = places[tiles[slot]]
             places[tiles[slot]] = at + 1

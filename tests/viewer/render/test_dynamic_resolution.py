@@ -177,6 +177,12 @@ def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
     hand.main_view.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
     hand.frame()
     assert (hand.picture() == before).all(), "the last picture stays"
+    hand.settle()
+    with monkeypatch.context() as slow:
+        slow.setattr(hand.main_view.canvas.comparer, "prepare", lambda *_: False)
+        assert not hand.main_view.is_due(), "no frame takes the time from it"
+        hand.main_view.wake()
+        assert hand.main_view.is_due(), "but what comes in is seen at once"
     settle_sharply(hand)
     old, new = hand.picture(), hand.main_view.engine
     other = ViewEngine(hand.main_view.context, new.scene, (), "cpu")

@@ -144,7 +144,8 @@ def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
     kept = torch.from_numpy(~mask)
     less = ViewEngine(ctx, engine.gaussians(some)[kept.nonzero()[:, 0]], (), draw)
     assert np.abs(found - shown(less, replace(view(), layers=()), ctx)).max() < 1e-5
-    assert np.abs(engine.image(some, SIZE) - found).max() < 1e-5
+    shown_as = 0.51 / 255.0 if draw == "cpu" else 1e-5  # bytes; floats
+    assert np.abs(engine.image(some, SIZE) - found).max() < shown_as
     slid = replace(some, layers=view(1.0).layers)
     shown(engine, slid, ctx)
     assert np.array_equal(shown(engine, some, ctx), found), "a slider brings nothing back"
