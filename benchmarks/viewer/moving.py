@@ -29,11 +29,13 @@ from viewer.state.view_state import ViewState
 
 from .mouse import Mouse
 from .scenes import copies, scenes_of
+from .training import Training
 
 SIZE, STEPS, TURN_PX, WARM_UP = (980, 800), 60, 10.0, 3
 MILLION, JUDGED = 1_000_000, 6
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _POLL_S, _SETTLE_S, _LONGEST_S = 0.02, 3.0, 20.0
+_UNDER_WAY_S = 0.2  # a training that goes on has its threads at work
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Moving:
     Args:
         count: Gaussians
         turning: frames while the picture turns
+        beside: the same while a training runs
         sharp: from the last of these to the picture in full, the hand at rest on the button
         meanwhile: the longest frame until then
         click, lasso: the longest frame of a click on the picture; of letting go of a lasso
@@ -53,6 +56,7 @@ class Moving:
 
     count: int
     turning: tuple[float, ...]
+    beside: tuple[float, ...]
     sharp: float
     meanwhile: float
     click: float
@@ -76,26 +80,36 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
         opened.append(copies(opened[-1], round(MILLION / len(opened[-1]))))
     ctx = headless_context()
     try:
-        return [table([measure(ctx, scene) for scene in opened])]
+        with Training(opened[0]) as training:
+            return [table([measure(ctx, scene, training) for scene in opened])]
     finally:
         ctx.release()
 
 
 @one_thread()
 def measure(
-    ctx: moderngl.Context, scene: Gaussians, steps: int = STEPS, size: tuple[int, int] = SIZE
+    ctx: moderngl.Context,
+    scene: Gaussians,
+    training: Training,
+    steps: int = STEPS,
+    size: tuple[int, int] = SIZE,
 ) -> Moving:
-    """A hand at a window that shows `scene`, always with pictures in motion."""
+    """A hand at a window that shows `scene`, always with pictures in motion; at times beside a training."""
     engine = ViewEngine(ctx, scene, (), "cpu")
     view = ViewState(first_camera(scene), dynamic_resolution="on")
     with Mouse(ctx, engine, scene, (), view, size) as mouse:
         mouse.grip_picture()
-        turning, db, luminance = [], math.inf, 0.0
+        turning, beside, db, luminance = [], [], math.inf, 0.0
         for step in range(-WARM_UP, steps):
             turning.append(mouse.turn(TURN_PX))
             if step >= 0 and step % max(steps // JUDGED, 1) == 0:
                 error, apart = _compare(mouse, scene)
                 db, luminance = min(db, error), max(luminance, apart, key=abs)
+                with training.runs():
+                    time.sleep(_UNDER_WAY_S)
+                    mouse.turn(TURN_PX)
+                    beside += [mouse.turn(TURN_PX) for _ in range(max(steps // JUDGED, 1))]
+                mouse.turn(TURN_PX)
         began = time.perf_counter()
         meanwhile = _rest(mouse, began - 1e-3 * turning[-1], until_sharp=True)
         sharp, full = 1e3 * (time.perf_counter() - began), mouse.main_view.canvas.timings.total_ms
@@ -112,19 +126,21 @@ def measure(
             mouse.move(middle[0] + reach * np.sin(turn), middle[1] - reach * np.cos(turn))
         lasso = max(mouse.release(), _rest(mouse, time.perf_counter()))
     engine.release()
-    return Moving(len(scene), tuple(turning[WARM_UP:]), sharp, meanwhile, click, lasso, full, db, luminance)
+    turned = tuple(turning[WARM_UP:])
+    return Moving(len(scene), turned, tuple(beside), sharp, meanwhile, click, lasso, full, db, luminance)
 
 
 def table(results: Sequence[Moving]) -> Table:
     """A row a scene."""
     rows = []
     for result in results:
-        middle, late = np.percentile(result.turning, (50, 95))
+        alone, beside = (np.percentile(frames, (50, 95)) for frames in (result.turning, result.beside))
         rows.append(
             (
                 f"{result.count:,}".replace(",", " "),
                 f"{result.full:.0f}",
-                f"**{middle:.0f}** / {late:.0f}",
+                f"**{alone[0]:.0f}** / {alone[1]:.0f}",
+                f"{beside[0]:.0f} / {beside[1]:.0f}",
                 f"{result.sharp:.0f} ({result.meanwhile:.0f})",
                 f"{result.click:.0f}",
                 f"{result.lasso:.0f}",
@@ -139,6 +155,7 @@ def table(results: Sequence[Moving]) -> Table:
             "Gaussians",
             "picture in full",
             "frame while turning p50 / p95",
+            "beside a training",
             "sharp after (longest frame)",
             "click",
             "lasso let go",

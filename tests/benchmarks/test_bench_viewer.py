@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.mouse import Mouse
 from benchmarks.viewer.scenes import copies, edit_for, scenes_of
 from benchmarks.viewer.slider import SliderCase
+from benchmarks.viewer.training import Training
 from benchmarks.viewer.window import Dragging, Idle
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
@@ -75,12 +77,15 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
 
 
 @pytest.mark.gl
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="no process is halted there")
 def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(moving, "_SETTLE_S", 0.05)
     ctx = headless_context()
-    result = moving.measure(ctx, bear(2000).gaussians, steps=2, size=(240, 200))
+    with Training(bear(600).gaussians) as training:
+        result = moving.measure(ctx, bear(2000).gaussians, training, steps=2, size=(240, 200))
     ctx.release()
-    assert len(result.turning) == 2
+    assert len(result.turning) == len(result.beside) == 2
     assert 20.0 < result.db < 60.0
     assert abs(result.luminance) < 0.02
     assert moving.table([result]).rows[0][0] == "2 000"
