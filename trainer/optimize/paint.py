@@ -21,6 +21,9 @@ _ROUNDS = 3
 _WHOLE = 0.15
 """Share of the change's energy that one function of color may leave: stripes leave half, a fill a tenth."""
 
+_COVERED, _TOUCHED = 0.8, 0.3
+"""A change covers all where so much of what shows has changed, by so much of what is typical."""
+
 
 @dataclass(frozen=True)
 class Paint:
@@ -32,6 +35,8 @@ class Paint:
         slope: derivative of the new color by the old one, less the old one's own, rows in, columns out. [3,3]
         trust: share of the change's energy that this explains, 0..1
         whole: the amount is 1 everywhere
+        general: what a function of color without amounts makes of each member, where nearly all that shows
+            has changed; else None. [M,3]
     """
 
     full: Tensor
@@ -39,6 +44,7 @@ class Paint:
     slope: Tensor
     trust: float
     whole: bool
+    general: Tensor | None
 
 
 def fit_paint(colors: Tensor, change: Tensor, weights: Tensor) -> Paint:
@@ -59,15 +65,18 @@ def fit_paint(colors: Tensor, change: Tensor, weights: Tensor) -> Paint:
     full, slope = _fit_affine(colors, change, weights)
     left = unexplained(full, ones)
     if left <= _WHOLE:
-        return Paint(full, ones, slope, max(0.0, 1.0 - left), whole=True)
-    least = _TYPICAL * (energy / weights.sum().clamp_min(1e-30)).sqrt()
+        return Paint(full, ones, slope, max(0.0, 1.0 - left), True, full)
+    typical = (energy / weights.sum().clamp_min(1e-30)).sqrt()
+    touched = (weights * (change.norm(dim=1) > _TOUCHED * typical)).sum()
+    general = full if bool(touched >= _COVERED * weights.sum()) else None
+    least = _TYPICAL * typical
     telling, amounts = weights * (change.norm(dim=1) > least), ones
     for _ in range(_ROUNDS):
         divisor = amounts.clamp_min(_LEAST_AMOUNT)
         full, slope = _fit_affine(colors, change / divisor[:, None], telling * divisor.square())
         along = (change * full).sum(dim=1) / full.square().sum(dim=1).clamp_min(1e-9)
         amounts = along.clamp(0.0, 1.0)
-    return Paint(full, amounts, slope, max(0.0, 1.0 - unexplained(full, amounts)), whole=False)
+    return Paint(full, amounts, slope, max(0.0, 1.0 - unexplained(full, amounts)), False, general)
 
 
 def _fit_affine(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

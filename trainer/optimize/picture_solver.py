@@ -43,6 +43,10 @@ _TIES = 0.01
 _RIDGE = 1e-5
 """The same for being what the paint says, or as they were."""
 
+_LOOSE = 0.01
+"""Share of the ridge that holds what no picture shows, where the change covers all, but with several paints:
+what is near on the surface tells more than their mean (a panda's back is white, its arms are black)."""
+
 _WEAKEST_TIE = 5e-3  # of all of a member's: most of its neighbors are hardly alike
 
 _BRIGHTEST, _GLARE = 0.99, 1.0
@@ -53,6 +57,7 @@ _PAINTS, _ROUNDS, _GAIN = 3, 12, 2e-3
 """How often the paint is fitted; rounds of descent each time, until one gains less than this share."""
 
 _STEPS, _EXACT, _SHORTEST = 15, 1e-2, 0.05  # of conjugate gradients; of a round's way
+_FILLED = 300  # most steps of these from member to member, where no picture looks
 
 
 @dataclass(frozen=True)
@@ -93,11 +98,15 @@ class PictureSolver:
             change = self._descend(change, bands, prior, targets)
             low, high = self._limits(0.0)
             paint = fit_paint(self.colors, change.clamp(low, high), self.shown)
-            # where one function of color is the edit, what no picture shows follows it too
-            prior = paint.full if paint.whole else torch.zeros_like(change)
+            # where the change covers all that shows, what no picture shows follows it too
+            prior = torch.zeros_like(change) if paint.general is None else paint.general
             amounts = paint.trust * paint.amounts
             bands = amounts[:, None, None] * (self.bands @ paint.slope)
-        return self._offsets(self._descend(change, bands, prior, targets), bands)
+        ridge = self.ridge if paint.whole or paint.general is None else _LOOSE * self.ridge
+        unseen = (self.shown == 0)[:, None]
+        change = self._fill(torch.where(unseen, prior, change), prior, ridge)
+        change = self._descend(change, bands, prior, targets)
+        return self._offsets(self._fill(change, prior, ridge), bands)
 
     def left(self, offsets: Tensor, targets: Sequence[Tensor]) -> tuple[float, float]:
         """Mean squared and mean absolute difference from the targets."""
@@ -132,6 +141,26 @@ class PictureSolver:
             if error > (1.0 - _GAIN) * before:
                 break
         return change
+
+    def _fill(self, change: Tensor, prior: Tensor, ridge: float) -> Tensor:
+        """The change with that of the members which no picture shows as the ties have it: in a descent over
+        the pictures it would take far too many steps to travel around a body. [M,3]"""
+        unseen = (self.shown == 0).numpy()
+        rest = (change - prior).numpy()
+        ties = self.ties[unseen]
+        inner, asked = ties[:, unseen], -(ties[:, ~unseen] @ rest[~unseen])
+        diagonal = torch.from_numpy(inner.diagonal() + ridge)[:, None]
+
+        def apply(x: Tensor) -> Tensor:
+            return torch.from_numpy(inner @ x.numpy()) + ridge * x
+
+        start = torch.from_numpy(rest[unseen])
+        left = torch.from_numpy(asked) - apply(start)
+        colors = self.colors[unseen]
+        found = prior[unseen] + start + conjugate_gradients(apply, diagonal, left, _FILLED)
+        filled = change.clone()
+        filled[unseen] = found.clamp(colors.clamp_max(0.0) - colors, colors.clamp_min(1.0) - colors)
+        return filled
 
     def _limits(self, glare: float) -> tuple[Tensor, Tensor]:
         """How far the members' colors may change, `glare` beyond the brightest. [M,3] each"""
@@ -178,24 +207,40 @@ class PictureSolver:
         """
         asked = (self.shown > 0)[:, None]
         diagonal = (self.shown + torch.from_numpy(self.ties.diagonal()) + self.ridge)[:, None]
-        x, r = torch.zeros_like(b), b * rows
-        z = r / diagonal
-        p, rz = z.clone(), (r * z).sum(dim=0)
-        enough = _EXACT**2 * rz
-        for _ in range(_STEPS):
-            if bool((rz <= enough).all()):
-                break
+
+        def apply(p: Tensor) -> Tensor:
             shown = p * asked
             pictures = [
                 view.map.picture(shown) * passed for view, passed in zip(self.views, free, strict=True)
             ]
-            applied = rows * (self._transpose(pictures) + self._tie(p))
-            length = rz / (p * applied).sum(dim=0).clamp_min(1e-300)
-            x, r = x + length * p, r - length * applied
-            z = r / diagonal
-            after = (r * z).sum(dim=0)
-            p, rz = z + after / rz.clamp_min(1e-300) * p, after
-        return x
+            return rows * (self._transpose(pictures) + self._tie(p))
+
+        return conjugate_gradients(apply, diagonal, b * rows, _STEPS)
+
+
+def conjugate_gradients(apply: Callable[[Tensor], Tensor], diagonal: Tensor, b: Tensor, steps: int) -> Tensor:
+    """Nearly the solution x of A x = b, channel by channel, from 0. [M,3]
+
+    Args:
+        apply: x -> A x, symmetric and positive. [M,3] -> [M,3]
+        diagonal: of A, or nearly. [M,1]
+        b: [M,3]
+        steps: at most
+    """
+    x, r = torch.zeros_like(b), b
+    z = r / diagonal
+    p, rz = z.clone(), (r * z).sum(dim=0)
+    enough = _EXACT**2 * rz
+    for _ in range(steps):
+        if bool((rz <= enough).all()):
+            break
+        applied = apply(p)
+        length = rz / (p * applied).sum(dim=0).clamp_min(1e-300)
+        x, r = x + length * p, r - length * applied
+        z = r / diagonal
+        after = (r * z).sum(dim=0)
+        p, rz = z + after / rz.clamp_min(1e-300) * p, after
+    return x
 
 
 def make_picture_solver(

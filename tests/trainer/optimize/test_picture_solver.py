@@ -70,6 +70,17 @@ def test_what_lies_beside_the_picture_follows_a_fill() -> None:
     assert float((change[corner] - torch.tensor([-0.4, -0.25, -0.1])).abs().max()) < 0.05
 
 
+def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
+    scene, camera = wall(0.0, torch.tensor([0.5, 0.5, 0.5])), ahead(0.3)
+    painted = torch.tensor([0.9, 0.2, 0.2]).expand(96, 96, 3).clone()
+    painted[:, 48:] = torch.tensor([0.2, 0.2, 0.9])
+    change = C0 * solver_of(scene, camera).solve([painted], torch.zeros(len(scene), 1, 3))[:, 0]
+    right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight
+    for side, channel in ((right < -0.8, 0), (right > 0.8, 2)):
+        assert float(change[side, channel].mean()) > 0.3  # of .4
+        assert float(change[side, 2 - channel].mean()) < -0.2  # of -.3: neither as it was nor their mixture
+
+
 def test_the_way_is_recorded_and_goes_on_from_where_it_was_stopped() -> None:
     scene, camera = two_walls(), ahead()
     original, solver = pack(scene), solver_of(scene, camera)
