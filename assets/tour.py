@@ -24,6 +24,7 @@ from viewer.camera.view_camera import first_camera
 from viewer.files.document import load_edits
 from viewer.panel import panel
 from viewer.state import selection
+from viewer.state.actions import perform
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
@@ -46,26 +47,20 @@ def compare(hand: Rig) -> None:
     hand.frame(3)
 
 
-def difference(hand: Rig) -> None:
-    """What differs, four times as bright, with the PSNR."""
-    _at(hand, (1.0,) * len(hand.strengths))
-    hand.key("D")
-
-
 def recorded(hand: Rig) -> None:
     """The field beside what training recorded at the same strengths, with the PSNR."""
     hand.key("Alt+Y")
 
 
 def session(hand: Rig) -> None:
-    """Snapshots of five mixtures in the panel, back at one of them."""
-    for strengths in ((1.0, 0.0), (0.3, 0.0), (0.3, 1.0), (0.6, 1.0), (1.0, 1.0)):
+    """Snapshots of two mixtures in the panel, and a blend of them."""
+    for strengths in ((1.0, 0.2), (0.3, 1.0)):
         _at(hand, strengths)
         hand.key("F3")
+    hand.key("Alt+G")
     hand.frame(8)
-    hand.wheel(1130.0, 600.0, -100.0)
-    hand.click(1130.0, 672.0)
-    hand.settle()
+    hand.main_view.work = perform(hand.main_view.work, "blend_snapshots:0.4", hand.main_view.facts)
+    hand.main_view.wake()
 
 
 def timeline(hand: Rig) -> None:
@@ -96,16 +91,6 @@ def _at(hand: Rig, strengths: Sequence[float]) -> None:
     layers = (replace(layer, strength=s) for layer, s in zip(view.layers, strengths, strict=False))
     hand.main_view.change(replace(view, layers=tuple(layers)))
     hand.settle()
-
-
-def timings(hand: Rig) -> None:
-    """A slider in the hand: only its part of the picture is drawn, and the figures say so."""
-    hand.key("F10")
-    first = hand.strengths[0]
-    hand.move(*hand.slider(0, first))
-    hand.press()
-    for step in range(1, 25):
-        hand.move(*hand.slider(0, first - 0.01 * step))
 
 
 def painted(hand: Rig) -> None:
@@ -142,11 +127,9 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
     "paint": painted,
     "select": selected,
     "compare": compare,
-    "difference": difference,
     "recorded": recorded,
     "session": session,
     "timeline": timeline,
-    "timings": timings,
 }
 """What a hand does before the picture is taken."""
 
