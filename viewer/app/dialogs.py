@@ -14,9 +14,9 @@ from imgui_bundle import imgui
 
 from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
-from viewer.ui.context import PALETTE, SMALL_PX, Rgba, UiContext
+from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import elide, section, small, tip
+from viewer.ui.widgets import elide, section, small, tip, wrapped
 
 from .studio import deliver_fields
 
@@ -130,7 +130,7 @@ def _content(
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.text(TITLES[dialog.kind])
     imgui.pop_font()
-    _wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
+    wrapped(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
@@ -143,7 +143,7 @@ def _content(
         if dialog.kind == "log":
             _log(Path(dialog.text), bottom, ui)
         if dialog.kind == "about":
-            _wrapped_text(dialog.text, PALETTE.text)
+            wrapped(dialog.text, PALETTE.text)
             imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
@@ -165,7 +165,7 @@ def _content(
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
-        _wrapped_text(escape_text(dialog.error), PALETTE.error)
+        wrapped(escape_text(dialog.error), PALETTE.error)
     if dialog.options is not None and dialog.kind in ("render_picture", "render_film"):
         kind = dialog.kind.removeprefix("render_")
         text, options = deliver_fields.draw(kind, dialog.text, dialog.options, ui)
@@ -203,15 +203,6 @@ def _submit(dialog: Dialog, path: str) -> Answer:
     if dialog.kind == "replace":
         return Answer(None, (f"replace_by:{dialog.then}:{path}",))
     return Answer(None, (f"open_file:{path}",))
-
-
-def _wrapped_text(text: str, color: Rgba) -> None:
-    """Small text in as many lines as it takes."""
-    imgui.push_font(None, SMALL_PX)
-    imgui.push_text_wrap_pos(0.0)
-    imgui.text_colored(imgui.ImVec4(*color), text)
-    imgui.pop_text_wrap_pos()
-    imgui.pop_font()
 
 
 def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiContext) -> str:
@@ -279,7 +270,7 @@ def _log(path: Path, bottom: float, ui: UiContext) -> None:
     imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.scrim))
     padded = imgui.ChildFlags_.always_use_window_padding.value
     imgui.begin_child("log", imgui.ImVec2(0.0, tall), padded)
-    _wrapped_text(_escape_lines(text), PALETTE.text)
+    wrapped(_escape_lines(text), PALETTE.text)
     if imgui.is_window_appearing():
         imgui.set_scroll_here_y(1.0)
     imgui.end_child()

@@ -52,12 +52,9 @@ class FileActions:
         name, _, argument = request.partition(":")
         if name in ("save", "save_as"):
             self._save_where(argument, ask=name == "save_as")
-        elif name == "save_to":
+        elif name in ("save_to", "overwrite"):
             asked = self._app.main_view.work.dialog
-            self._save_to(argument, asked.then if asked else "")
-        elif name == "overwrite":
-            asked = self._app.main_view.work.dialog
-            self._save_to(argument, asked.then if asked else "", overwrite=True)
+            self._save_to(argument, asked.then if asked else "", overwrite=name == "overwrite")
         elif name == "open":
             self._app.main_view.ask(Dialog("open"))
         elif name == "browse":

@@ -89,7 +89,6 @@ def _gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
     if not equals or not colon or not name:
         raise ProgdfError(f"--gain {text} is not a gain; {right}")
     known_edit(name, gdfs, "--gain")
-    kind = {"color": "color"}.get(kind, kind)
     if kind not in kinds:
         raise ProgdfError(f"--gain {text}: there is no gain '{kind}'; the gains are {', '.join(kinds)}")
     try:

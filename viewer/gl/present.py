@@ -92,6 +92,14 @@ class ScreenCopy:
         self._texture.release()
 
 
+def picture_texture(ctx: moderngl.Context, pixels: NDArray[np.uint8]) -> moderngl.Texture:
+    """A small picture [H,W,3] for the panel."""
+    height, width, _ = pixels.shape
+    texture = ctx.texture((width, height), 3, np.ascontiguousarray(pixels).tobytes(), alignment=1)
+    texture.filter = moderngl.LINEAR, moderngl.LINEAR
+    return texture
+
+
 def read_rgb(framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Its lower left `size` pixels (width, height), upper row first. [H,W,3] uint8
 

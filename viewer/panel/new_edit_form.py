@@ -21,6 +21,8 @@ from viewer.jobs.new_edit import (
 )
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.widgets import (
+    accent_button,
+    card,
     choice,
     elide,
     group_digits,
@@ -30,6 +32,7 @@ from viewer.ui.widgets import (
     small,
     tip,
     value_slider,
+    wrapped,
 )
 
 COLUMN_PX = 66.0
@@ -56,13 +59,12 @@ class FormInput:
 
 def draw(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
     """The form as the hand leaves it, and what was asked for: "train", "new_edit" to close it, or ""."""
-    scale, action = ui.scale, ""
-    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.card_focused))
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * scale, 8 * scale))
-    child = imgui.ChildFlags_
-    flags = child.auto_resize_y.value | child.always_use_window_padding.value
-    imgui.begin_child("new edit", imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
-    right = right_edge()
+    with card("new edit", PALETTE.card_focused, ui):
+        return _content(form, shown, ui)
+
+
+def _content(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
+    action, right = "", right_edge()
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.align_text_to_frame_padding()
     imgui.text("New edit")
@@ -71,9 +73,9 @@ def draw(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
     if icon_button("close form", Icon.CLOSE, ui, dim=True):
         action = "new_edit"
     tip("Close (Ctrl+N). What is being trained goes on")
-    column = COLUMN_PX * scale
+    column = COLUMN_PX * ui.scale
     form = _region(form, shown, column)
-    form = _editor(form, column, ui)
+    form = _editor(form, column)
     form = _settings(form, column, ui)
     label("Name", column)
     imgui.set_next_item_width(-1.0)
@@ -86,18 +88,12 @@ def draw(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
     form = _preview(form, shown, column, ui)
     error = form.error or missing_package(form.choice)
     if error:
-        _wrapped(error, PALETTE.error)
+        wrapped(error, PALETTE.error)
     imgui.begin_disabled(bool(form.obstacle))
-    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*PALETTE.accent_dark))
-    imgui.push_style_color(imgui.Col_.button_hovered, imgui.ImVec4(*PALETTE.accent))
-    if imgui.button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
+    if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
         action = "train"
-    imgui.pop_style_color(2)
     imgui.end_disabled()
     tip(form.obstacle or f"Train it; it comes as a layer with a slider. {_effort(form)}")
-    imgui.end_child()
-    imgui.pop_style_var()
-    imgui.pop_style_color()
     return form, action
 
 
@@ -138,7 +134,7 @@ def _region(form: NewEdit, shown: FormInput, column: float) -> NewEdit:
     return form
 
 
-def _editor(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
+def _editor(form: NewEdit, column: float) -> NewEdit:
     label("Editor", column)
     imgui.set_next_item_width(-1.0)
     if imgui.begin_combo("##editor", form.choice.title):
@@ -234,7 +230,7 @@ def _preview(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> N
     imgui.end_disabled()
     tip("Strength of the preview. Training learns all strengths")
     if form.preview and shown.failed:
-        _wrapped(shown.picture, PALETTE.error)
+        wrapped(shown.picture, PALETTE.error)
     else:
         small(shown.picture or " ", PALETTE.dim)  # always a line, so that nothing below moves
     return form
@@ -242,12 +238,6 @@ def _preview(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> N
 
 def _text(name: str, hint: str, text: str) -> str:
     return str(imgui.input_text_with_hint(name, hint, text)[1])
-
-
-def _wrapped(text: str, color: tuple[float, float, float, float]) -> None:
-    imgui.push_text_wrap_pos(0.0)
-    imgui.text_colored(imgui.ImVec4(*color), text)
-    imgui.pop_text_wrap_pos()
 
 
 def _effort(form: NewEdit) -> str:

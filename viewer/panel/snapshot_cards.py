@@ -8,7 +8,7 @@ from imgui_bundle import imgui
 
 from viewer.panel import strength_slider
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import elide, grip, icon_button, menu, right_edge, section, tip, typed_name
+from viewer.ui.widgets import elide, grip, icon_button, menu, picture, right_edge, section, tip, typed_name
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -156,13 +156,7 @@ def _card(
     elif item:
         actions.append(dict(_ITEMS)[item] + (str(index) if item == "Delete" else card.name))
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
-    if card.texture:
-        zero, one = imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0)
-        white = u32((1.0, 1.0, 1.0, 1.0))
-        texture = imgui.ImTextureRef(card.texture)
-        canvas.add_image_rounded(texture, at, end, zero, one, white, 4.0 * ui.scale)
-    else:
-        canvas.add_rect_filled(at, end, u32(PALETTE.card), 4.0 * ui.scale)
+    picture(card.texture, at, end, 4.0 * ui.scale)
     if hovered or dragged:
         canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
     imgui.push_font(ui.fonts.bold, SMALL_PX)

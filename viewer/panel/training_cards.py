@@ -10,7 +10,7 @@ from imgui_bundle import imgui
 from viewer.jobs.delivery import Delivery
 from viewer.jobs.training_job import TrainingJob, duration
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import elide, right_edge, small, small_toggle, tip
+from viewer.ui.widgets import card, elide, right_edge, small, small_toggle, tip
 
 BAR_PX = 5.0
 
@@ -74,25 +74,16 @@ def _job_row(job: TrainingJob) -> _Row:
 
 
 def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
-    scale = ui.scale
-    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.card))
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * scale, 8 * scale))
-    child = imgui.ChildFlags_
-    flags = child.auto_resize_y.value | child.always_use_window_padding.value
-    imgui.begin_child("card", imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
-    right = right_edge()
-    wide = imgui.calc_text_size(row.word).x
-    imgui.align_text_to_frame_padding()
-    imgui.text(elide(row.name, right - wide - 16.0 * scale))
-    tip(row.tip)
-    imgui.same_line(right - wide)
-    imgui.text_colored(imgui.ImVec4(*(PALETTE.error if row.failed else PALETTE.dim)), row.word)
-    _bar(row, ui)
-    actions = [f"{action}:{number}" for action in _foot(row, right, ui)]
-    imgui.end_child()
-    imgui.pop_style_var()
-    imgui.pop_style_color()
-    return actions
+    with card("card", PALETTE.card, ui):
+        right = right_edge()
+        wide = imgui.calc_text_size(row.word).x
+        imgui.align_text_to_frame_padding()
+        imgui.text(elide(row.name, right - wide - 16.0 * ui.scale))
+        tip(row.tip)
+        imgui.same_line(right - wide)
+        imgui.text_colored(imgui.ImVec4(*(PALETTE.error if row.failed else PALETTE.dim)), row.word)
+        _bar(row, ui)
+        return [f"{action}:{number}" for action in _foot(row, right, ui)]
 
 
 def _status(job: TrainingJob) -> str:

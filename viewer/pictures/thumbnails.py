@@ -10,6 +10,7 @@ import numpy as np
 
 from progdf.errors import ProgdfError
 from viewer.camera.view_camera import ViewCamera
+from viewer.gl.present import picture_texture
 from viewer.render.engine import ViewEngine
 from viewer.state.snapshots import SliderSnapshot, restore
 from viewer.state.view_state import Comparison, ViewState
@@ -59,9 +60,7 @@ class Thumbnails:
             pixels = to_pixels(self._engine.image(wanted, SIZE))
         except ProgdfError:  # an edit that is not open
             pixels = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-        texture = self._ctx.texture(SIZE, 3, np.ascontiguousarray(pixels).tobytes(), alignment=1)
-        texture.filter = moderngl.LINEAR, moderngl.LINEAR
-        return texture
+        return picture_texture(self._ctx, pixels)
 
 
 def _key(index: int, snapshot: SliderSnapshot) -> tuple[object, ViewCamera]:

@@ -42,6 +42,50 @@ def small(text: str, color: Rgba, room: float | None = None) -> None:
     imgui.pop_font()
 
 
+def wrapped(text: str, color: Rgba) -> None:
+    """Small text in as many lines as it takes."""
+    imgui.push_font(None, SMALL_PX)
+    imgui.push_text_wrap_pos(0.0)
+    imgui.text_colored(imgui.ImVec4(*color), text)
+    imgui.pop_text_wrap_pos()
+    imgui.pop_font()
+
+
+def picture(texture: int, at: imgui.ImVec2, end: imgui.ImVec2, rounding: float) -> None:
+    """A picture by its GL name; where there is none, 0, an empty card."""
+    canvas = imgui.get_window_draw_list()
+    if not texture:
+        canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
+        return
+    corners, white = (imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0)), u32((1.0, 1.0, 1.0, 1.0))
+    canvas.add_image_rounded(imgui.ImTextureRef(texture), at, end, *corners, white, rounding)
+
+
+@contextmanager
+def card(name: str, color: Rgba, ui: UiContext) -> Iterator[None]:
+    """What is drawn within lies on a card of its own height."""
+    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*color))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * ui.scale, 8 * ui.scale))
+    child = imgui.ChildFlags_
+    flags = child.auto_resize_y.value | child.always_use_window_padding.value
+    imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
+    try:
+        yield
+    finally:
+        imgui.end_child()
+        imgui.pop_style_var()
+        imgui.pop_style_color()
+
+
+def accent_button(text: str, size: imgui.ImVec2) -> bool:
+    """The button that one is most likely here for; True when it was pressed."""
+    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*PALETTE.accent_dark))
+    imgui.push_style_color(imgui.Col_.button_hovered, imgui.ImVec4(*PALETTE.accent))
+    pressed = imgui.button(text, size)
+    imgui.pop_style_color(2)
+    return bool(pressed)
+
+
 def tip(text: str) -> None:
     """What the last item does, told when the mouse rests on it."""
     flags = imgui.HoveredFlags_

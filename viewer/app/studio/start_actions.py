@@ -12,6 +12,7 @@ from progdf.errors import ProgdfError
 from progdf.io.user_folders import state_folder
 from viewer.app.application import failure_line
 from viewer.files import small_pictures
+from viewer.gl.present import picture_texture
 from viewer.jobs.delivery import Deliveries
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
@@ -124,8 +125,6 @@ class StartActions:
             self._textures[path] = None
             pixels = small_pictures.load(path, self._memory)
             if pixels is not None:
-                made = self._context.texture(small_pictures.SIZE, 3, pixels.tobytes(), alignment=1)
-                made.filter = moderngl.LINEAR, moderngl.LINEAR
-                self._textures[path] = made
+                self._textures[path] = picture_texture(self._context, pixels)
         texture = self._textures[path]
         return int(texture.glo) if texture is not None else 0

@@ -12,7 +12,7 @@ from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import elide, section, tip
+from viewer.ui.widgets import accent_button, elide, picture, section, tip
 
 KEYS = ("open", "quit", "full_screen", "window_picture", "help", "unfocus", "about")
 """Actions of keys that mean something here."""
@@ -70,11 +70,8 @@ def _head(ui: UiContext) -> list[str]:
     imgui.pop_font()
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
     size = imgui.ImVec2(150.0 * scale, 34.0 * scale)
-    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*PALETTE.accent_dark))
-    imgui.push_style_color(imgui.Col_.button_hovered, imgui.ImVec4(*PALETTE.accent))
-    if imgui.button(f"{Icon.OPEN}  Open…", size):
+    if accent_button(f"{Icon.OPEN}  Open…", size):
         actions.append("open")
-    imgui.pop_style_color(2)
     tip("A scene (.ply, .spz, .sog …) or a session (Ctrl+O)")
     imgui.same_line(0.0, 10.0 * scale)
     if imgui.button("Try the demo", size):
@@ -107,11 +104,8 @@ def _card(file: RecentFile, ui: UiContext) -> bool:
     hovered = imgui.is_item_hovered()
     tip(escape_text(str(file.path)))
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
-    canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
-    if file.texture:
-        zero, one, white = imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0), u32((1.0, 1.0, 1.0, 1.0))
-        canvas.add_image_rounded(imgui.ImTextureRef(file.texture), at, end, zero, one, white, rounding)
-    else:
+    picture(file.texture, at, end, rounding)
+    if not file.texture:
         size = imgui.calc_text_size(Icon.PICTURE)
         middle = imgui.ImVec2(round(at.x + (wide - size.x) / 2), round(at.y + (tall - size.y) / 2))
         canvas.add_text(middle, u32(PALETTE.field_hovered), Icon.PICTURE)

@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import moderngl
-import numpy as np
 
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import first_camera
 from viewer.files import known_ups
+from viewer.gl.present import picture_texture
 from viewer.panel.panel import UPS
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
@@ -107,7 +107,6 @@ class UpActions:
     def _draw(self, choice: UpChoice, engine: ViewEngine) -> int:
         background = self._app.main_view.work.view.background
         pixels = to_pixels(engine.image(ViewState(choice.camera, background=background), SIZE))
-        texture = self._context.texture(SIZE, 3, np.ascontiguousarray(pixels).tobytes(), alignment=1)
-        texture.filter = moderngl.LINEAR, moderngl.LINEAR
+        texture = picture_texture(self._context, pixels)
         self._textures.append(texture)
         return int(texture.glo)

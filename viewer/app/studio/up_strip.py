@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 from viewer.camera.view_camera import ViewCamera
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import right_edge
+from viewer.ui.widgets import picture, right_edge
 
 SIZE = (160, 120)
 """Pixels of a picture."""
@@ -93,10 +93,7 @@ def _picture(choice: UpChoice, wide: float, now: bool, ui: UiContext) -> bool:
     at, rounding = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
     pressed = bool(imgui.invisible_button(choice.name, imgui.ImVec2(wide, 0.75 * wide)))
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + 0.75 * wide)
-    canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
-    if choice.texture:
-        zero, one, white = imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0), u32((1.0, 1.0, 1.0, 1.0))
-        canvas.add_image_rounded(imgui.ImTextureRef(choice.texture), at, end, zero, one, white, rounding)
+    picture(choice.texture, at, end, rounding)
     if now or imgui.is_item_hovered():
         ink = PALETTE.accent if imgui.is_item_hovered() else PALETTE.dim
         canvas.add_rect(at, end, u32(ink), rounding, 2.0 * ui.scale)
