@@ -248,18 +248,19 @@ def _show_place(
 ) -> None:
     """A veil over what is dragged and a line where it would lie; near an edge the list scrolls."""
     imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ns)
-    canvas, left = imgui.get_window_draw_list(), imgui.get_window_pos().x
-    right = left + imgui.get_window_width()
+    below, canvas = imgui.get_window_draw_list(), imgui.get_foreground_draw_list()  # that is over the cards
+    canvas.push_clip_rect(below.get_clip_rect_min(), below.get_clip_rect_max())
+    left = imgui.get_cursor_screen_pos().x
+    right = left + imgui.get_content_region_avail().x
     for row in rows:
         if {*row.layers} <= {*layers}:
             veil = imgui.ImVec2(left, row.top), imgui.ImVec2(right, row.bottom)
             canvas.add_rect_filled(*veil, u32((*PALETTE.panel[:3], 0.6)), 6.0 * ui.scale)
     if y is not None:
         start = left + INSET_PX * ui.scale * joins
-        canvas.push_clip_rect_full_screen()
         ends = imgui.ImVec2(start, y - ui.scale), imgui.ImVec2(right, y + ui.scale)
         canvas.add_rect_filled(*ends, u32(PALETTE.accent), ui.scale)
-        canvas.pop_clip_rect()
+    canvas.pop_clip_rect()
     mouse, margin, step = imgui.get_mouse_pos().y, 24.0 * ui.scale, 6.0 * ui.scale
     if mouse < imgui.get_window_pos().y + margin:
         imgui.set_scroll_y(max(imgui.get_scroll_y() - step, 0.0))
