@@ -195,6 +195,9 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
     desktop.until("the turn", lambda: changed(first, desktop.shot()) > 1000)
     orbited = desktop.rest()
     desktop.xdotool("keydown", "ctrl", "keydown", "a", "keyup", "ctrl")  # as hands let go of a chord
+    desktop.until("the tint of all that is selected", lambda: changed(orbited, desktop.shot()) > 1000)
+    desktop.rest()
+    desktop.xdotool("key", "ctrl+z")
     assert changed(orbited, desktop.rest()) == 0, "what is left of Ctrl+A does not fly"
     desktop.xdotool("keyup", "a")
     desktop.xdotool("keydown", "w")
