@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -71,14 +73,19 @@ def test_what_lies_beside_the_picture_follows_a_fill() -> None:
 
 
 def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
-    scene, camera = wall(0.0, torch.tensor([0.5, 0.5, 0.5])), ahead(0.3)
+    scene, camera = wall(0.0, torch.zeros(3)), ahead(0.3)
+    right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight, and darker
+    generator = torch.Generator().manual_seed(0)
+    gray = torch.where(right.abs() > 0.6, 0.35, 0.4 + 0.2 * torch.rand(len(scene), generator=generator))
+    scene = replace(scene, sh0=rgb_to_sh0(gray[:, None].expand(-1, 3)).clone())
     painted = torch.tensor([0.9, 0.2, 0.2]).expand(96, 96, 3).clone()
     painted[:, 48:] = torch.tensor([0.2, 0.2, 0.9])
     change = C0 * solver_of(scene, camera).solve([painted], torch.zeros(len(scene), 1, 3))[:, 0]
-    right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight
+    colors = gray[:, None] + change
     for side, channel in ((right < -0.8, 0), (right > 0.8, 2)):
-        assert float(change[side, channel].mean()) > 0.3  # of .4
-        assert float(change[side, 2 - channel].mean()) < -0.2  # of -.3: neither as it was nor their mixture
+        found = colors[side].mean(dim=0)
+        assert float(found[channel] - found[2 - channel]) > 0.15  # of .7, where the other paint is far
+        assert abs(float(found[1]) - 0.2) < 0.03  # both paints, and not as much darker as it was before
 
 
 def test_the_way_is_recorded_and_goes_on_from_where_it_was_stopped() -> None:
