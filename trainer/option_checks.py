@@ -108,6 +108,11 @@ def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
 def _check_editor_options(options: TrainOptions) -> None:
     """No option is passed over in silence: one that the editor does not know is refused."""
     kind = options.editor.partition(":")[0]
+    if kind == "pictures" and options.kind not in ("auto", "color"):
+        raise ProgdfError(
+            f"--kind {options.kind} does not apply to pictures: few views do not tell how deep a part lies; "
+            "give more as folder:DIR, of views that --cameras has"
+        )
     of_instruct = ("model", "guidance", "edit_steps")
     of_painters = ("edit_size", "reedit_every")
     for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):

@@ -141,6 +141,7 @@ def test_a_run_with_edits_on_the_way_is_the_same_again_and_after_a_stop(
         ("instruct:x", {"edit_steps": 0}),
         ("style:14", {"edit_size": 8}),
         ("style:14", {"reedit_every": -1}),
+        ("pictures:A.png", {"kind": "geometry"}),
     ],
 )
 def test_an_option_that_means_nothing_to_the_editor_is_one_line(
