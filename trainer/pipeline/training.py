@@ -148,6 +148,7 @@ def optimize_members(
             kept.step_done()
 
         if pictures is not None:
+            advance(state.step, "")  # nearly all is done before the first step
             way_there = solve_pictures(original, pictures, stages, state, step_done)
         elif solver is not None:
             way_there = solve(original, solver, stages, state, step_done, unseen_members)

@@ -144,7 +144,8 @@ def _said(job: TrainingJob) -> str:
     match job.status:
         case "running":
             left = job.seconds_left
-            words = [progress.said]
+            finding = not progress.doing and job.order.region == "changed"
+            words = ["Finding what changed" if finding else progress.said]
             words += [f"{duration(left)} left"] if left is not None else []
             words += [f"loss {progress.loss}"] if progress.loss and progress.doing == "optimize" else []
             return "  ·  ".join(words)
