@@ -54,18 +54,20 @@ class Chosen(NamedTuple):
         rows: they. [M] integers
         weights: what each matters. [N] float32
         places: in the flat grid, where there is a weight. [N] int32
-        enough: share of its slice's optical depth that covers. float32
+        density: optical depth of each slice of the flat grid. float32
         threshold: of a weight; a lighter one stands for several
         dilation: of the fine picture, in pixels of the coarse one
+        dense: optical depth of a slice that covers
         most_times: as much of its area one takes at most
     """
 
     rows: Array
     weights: Array
     places: Array
-    enough: Array
+    density: Array
     threshold: float
     dilation: float
+    dense: float
     most_times: float
 
 
@@ -89,14 +91,17 @@ def simplify(
     with compilation("simplification", 5):
         weights, places = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
         density = _weigh_all(scene, view, dilation, weights, places)
-        threshold, enough = 0.0, np.minimum(rules.dense / np.maximum(density, 1e-6), 1.0)
+        threshold = 0.0
         if np.count_nonzero(weights) > budget:
-            light = np.maximum(np.exp(-optical_depths(density)), rules.least_light)
+            before, light = np.empty_like(density), np.empty_like(density)
+            light_at(density, before, light, rules.least_light)
             threshold = _hide_all(weights, places, light.ravel(), budget)
             rows = _choose_all(weights, threshold)
         else:
             rows = np.flatnonzero(weights).astype(np.int32)
-        chosen = Chosen(rows, weights, places, enough.ravel(), threshold, dilation, rules.most_times)
+        chosen = Chosen(
+            rows, weights, places, density.ravel(), threshold, dilation, rules.dense, rules.most_times
+        )
         out = Scene(*(np.empty((len(rows), width), np.float32) for width in (3, 4, 3, 1, 3)))
         share_gaussians(
             lambda begin, end: _take(begin, end, chosen, scene, view, out, np.empty(16)), len(rows)
@@ -105,14 +110,34 @@ def simplify(
     return ActivatedGaussians(torch.from_numpy(out.means), turned, sizes, covers[:, 0], shown)
 
 
-def optical_depths(density: Array) -> Array:
-    """What lies before each slice of a cell and of those around it, the least. [rows,columns,slices]"""
-    before: Array = np.cumsum(density, axis=2) - density
-    for least in (before, before.transpose(1, 0, 2)):
-        around = least.copy()
-        np.minimum(least[1:], around[:-1], out=least[1:])
-        np.minimum(least[:-1], around[1:], out=least[:-1])
-    return before
+@kernel(cache=True)
+def light_at(density: Array, before: Array, light: Array, least: float) -> None:
+    """What is left of the light at each slice in which something lies, by what is before it in its cell and
+    in those around it, the least.
+
+    Args:
+        density: optical depth of each slice. [rows,columns,slices] float32
+        before: scratch of that shape
+        light: out, `least` .. 1. The same shape
+    """
+    rows, columns, slices = density.shape
+    for y in range(rows):
+        for x in range(columns):
+            total = np.float32(0.0)
+            for k in range(slices):
+                before[y, x, k] = total
+                total += density[y, x, k]
+    for y in range(rows):
+        for x in range(columns):
+            for k in range(slices):
+                light[y, x, k] = before[y, x, k]
+            for v in range(max(y - 1, 0), min(y + 2, rows)):
+                for u in range(max(x - 1, 0), min(x + 2, columns)):
+                    for k in range(slices):
+                        light[y, x, k] = min(light[y, x, k], before[v, u, k])
+            for k in range(slices):
+                if density[y, x, k] > 0.0:
+                    light[y, x, k] = max(math.exp(-light[y, x, k]), least)
 
 
 def find_threshold(counts: Array, sums: Array, budget: int) -> float:
@@ -252,7 +277,8 @@ def _take(
         seen = footprint(camera, scene, i)
         opacity, stands_for = np.float64(scene.opacities[i]), chosen.threshold / chosen.weights[i]
         denser = max(min(stands_for, ALPHA_MAX / opacity), 1.0)
-        larger = min(max(chosen.enough[chosen.places[i]] * stands_for / denser, 1.0), chosen.most_times)
+        enough = min(chosen.dense / max(chosen.density[chosen.places[i]], 1e-6), 1.0)
+        larger = min(max(enough * stands_for / denser, 1.0), chosen.most_times)
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (larger * dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
         a, b, c = vec(scene.scales, i)
