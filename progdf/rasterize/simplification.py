@@ -214,7 +214,7 @@ def _weigh(
         density: its optical depth is added here, see `places`. float32
     """
     x1, y1 = float(camera.window[2]), float(camera.window[3])
-    focal, share = camera.fx * camera.fy, _FULL_TURN / (size * size)
+    focal, share, cells = camera.fx * camera.fy, _FULL_TURN / (size * size), 1.0 / size
     columns = -(-camera.window[2] // size)
     for i in range(begin, end):
         weights[i] = 0.0
@@ -224,12 +224,12 @@ def _weigh(
             continue
         a, b, c = abs(scene.scales[i, 0]), abs(scene.scales[i, 1]), abs(scene.scales[i, 2])
         longest, middle = max(a, max(b, c)), max(min(a, b), min(max(a, b), c))
-        longest2, middle2 = longest * longest * focal / (z * z), middle * middle * focal / (z * z)
+        nearer = focal / (z * z)
+        longest2, middle2 = longest * longest * nearer, middle * middle * nearer
         more = 0.0 if camera.antialiased else dilation
         area = math.sqrt((longest2 + more) * (middle2 + more))
         weights[i] = min(scene.opacities[i] * area, _MOST)
-        column = int(min(max(px, 0.0), x1 - 1.0)) // size
-        row = int(min(max(py, 0.0), y1 - 1.0)) // size
+        column, row = int(min(max(px, 0.0), x1 - 1.0) * cells), int(min(max(py, 0.0), y1 - 1.0) * cells)
         # of the logarithm of the depth, nearly
         at: Number = (np.float32(z / camera.near).view(np.int32) - _ONE) >> _SLICE_SHIFT
         places[i] = (row * columns + column) * slices + min(max(at, 0), slices - 1)

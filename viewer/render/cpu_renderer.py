@@ -50,7 +50,7 @@ CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
 """Pixels that take as long as another call of the rasterizer, and as its look at one more Gaussian."""
 
 
-BUDGETS = 60_000, 140_000, 500_000
+BUDGETS = 50_000, 140_000, 500_000
 """How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
 
 MOVING_MS = 40.0, 65.0
