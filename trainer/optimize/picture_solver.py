@@ -156,18 +156,16 @@ class PictureSolver:
 
         start = torch.from_numpy(rest[unseen])
         left = torch.from_numpy(asked) - apply(start)
-        colors = self.colors[unseen]
         found = prior[unseen] + start + conjugate_gradients(apply, diagonal, left, _FILLED)
+        low, high = self._limits(0.0)
         filled = change.clone()
-        filled[unseen] = found.clamp(colors.clamp_max(0.0) - colors, colors.clamp_min(1.0) - colors)
+        filled[unseen] = found.clamp(low[unseen], high[unseen])
         return filled
 
     def _limits(self, glare: float) -> tuple[Tensor, Tensor]:
         """How far the members' colors may change, `glare` beyond the brightest. [M,3] each"""
         most = max(1.0, float(np.quantile(self.colors.numpy(), _BRIGHTEST))) + glare
-        low, high = self.colors.clamp_max(0.0) - self.colors, self.colors.clamp_min(most) - self.colors
-        shown = (self.shown > 0)[:, None]  # the others shine in no picture
-        return torch.where(shown, low, -math.inf), torch.where(shown, high, math.inf)
+        return self.colors.clamp_max(0.0) - self.colors, self.colors.clamp_min(most) - self.colors
 
     def _look(
         self, change: Tensor, bands: Tensor, prior: Tensor, targets: Sequence[Tensor]
