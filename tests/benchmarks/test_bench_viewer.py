@@ -19,7 +19,7 @@ from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.mouse import Mouse
 from benchmarks.viewer.scenes import copies, edit_for, scenes_of
 from benchmarks.viewer.slider import SliderCase
-from benchmarks.viewer.training import Training
+from benchmarks.viewer.training import begin_training
 from benchmarks.viewer.window import Dragging, Idle
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
@@ -82,7 +82,7 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
 def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(moving, "_SETTLE_S", 0.05)
     ctx = headless_context()
-    with Training(bear(600).gaussians) as training:
+    with begin_training(bear(600).gaussians) as training:
         result = moving.measure(ctx, bear(2000).gaussians, training, steps=2, size=(240, 200))
     ctx.release()
     assert len(result.turning) == len(result.beside) == 2

@@ -58,6 +58,11 @@ class Child:
         return found
 
     @property
+    def pid(self) -> int:
+        """Of its process, and of its group where there are such."""
+        return self._process.pid
+
+    @property
     def output(self) -> IO[bytes]:
         """What it writes to standard output."""
         assert self._process.stdout is not None

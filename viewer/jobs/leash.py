@@ -1,8 +1,8 @@
 """A `progdf` command on a leash: python -m viewer.jobs.leash [--talks] COMMAND …
 
-It runs at low priority, is interrupted when its standard input closes, and so never outlives the window that
-holds the other end, however that ended. One that talks has somebody
-waiting for it: it keeps its priority, reads its input itself, and ends with it.
+It takes only what the window leaves of the processor, is interrupted when its standard input closes, and so
+never outlives the window that holds the other end, however that ended. One that talks has somebody waiting
+for it: it keeps its priority, reads its input itself, and ends with it.
 """
 
 from __future__ import annotations
