@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -174,12 +175,11 @@ def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
         wait(hand, REST_S)
     monkeypatch.setattr(dynamic_resolution, "JUMP_MS", 0.0)
     before = hand.picture()
-    hand.main_view.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
-    hand.frame()
-    assert (hand.picture() == before).all(), "the last picture stays"
-    hand.settle()
-    with monkeypatch.context() as slow:
-        slow.setattr(hand.main_view.canvas.comparer, "prepare", lambda *_: False)
+    with not_done(hand, monkeypatch):
+        hand.main_view.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
+        hand.frame()
+        assert (hand.picture() == before).all(), "the last picture stays"
+        hand.settle()
         assert not hand.main_view.is_due(), "no frame takes the time from it"
         hand.main_view.wake()
         assert hand.main_view.is_due(), "but what comes in is seen at once"
@@ -187,12 +187,21 @@ def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
     old, new = hand.picture(), hand.main_view.engine
     other = ViewEngine(hand.main_view.context, new.scene, (), "cpu")
     hand.main_view.set_engine(other, hand.main_view.facts)
-    hand.main_view.change(replace(hand.main_view.work.view, layers=()))
-    hand.frame()
-    assert (hand.picture() == old).all(), "also that of another engine, as while an edit is trained"
+    with not_done(hand, monkeypatch):
+        hand.main_view.change(replace(hand.main_view.work.view, layers=()))
+        hand.frame()
+        assert (hand.picture() == old).all(), "also that of another engine, as while an edit is trained"
     settle_sharply(hand)
     hand.main_view.set_engine(new, hand.main_view.facts)
     other.release()
+
+
+@contextmanager
+def not_done(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Meanwhile no picture is done, however quick the machine is."""
+    with monkeypatch.context() as slow:
+        slow.setattr(hand.main_view.canvas.comparer, "prepare", lambda *_: False)
+        yield
 
 
 def settle_sharply(hand: Rig) -> None:
