@@ -56,17 +56,18 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         ValueError: shapes differ, or the mask counts nothing.
     """
     _check_pair(image, target)
-    x, y = (v.movedim(-1, 0)[:, None] for v in (image, target))
+    x, y = (v.movedim(-1, 0) for v in (image, target))
     # beyond the border the window is cut off and its weights scaled back to a sum of 1
     share = _blur(torch.ones_like(x[:1]))
-    mean_x, mean_y = _blur(x) / share, _blur(y) / share
-    var_x = (_blur(x * x) / share - mean_x * mean_x).clamp(min=0)
-    var_y = (_blur(y * y) / share - mean_y * mean_y).clamp(min=0)
-    covariance = _blur(x * y) / share - mean_x * mean_y
+    planes = torch.cat([x, y, x * x, y * y, x * y])
+    mean_x, mean_y, square_x, square_y, product = (_blur(planes) / share).chunk(5)
+    var_x = (square_x - mean_x * mean_x).clamp(min=0)
+    var_y = (square_y - mean_y * mean_y).clamp(min=0)
+    covariance = product - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity = similarity / ((mean_x * mean_x + mean_y * mean_y + c1) * (var_x + var_y + c2))
-    per_pixel = similarity[:, 0].mean(dim=0)
+    per_pixel = similarity.mean(dim=0)
     if mask is not None:
         weights = _mask(mask, image).to(per_pixel.dtype)
         return (per_pixel * weights).sum() / weights.sum()
@@ -77,13 +78,14 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Weighted sums over the window, zero beyond the border. [C,1,H,W]"""
+    """Weighted sums over the window, zero beyond the border. [C,H,W]"""
     offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
     kernel = torch.exp(-offsets.square() / (2 * SIGMA**2))
-    kernel = kernel / kernel.sum()
-    edge = WINDOW // 2
-    across = conv2d(planes, kernel[None, None, None], padding=(0, edge))
-    return conv2d(across, kernel[None, None, :, None], padding=(edge, 0))
+    kernel, count = kernel / kernel.sum(), len(planes)
+    across = kernel.expand(count, 1, 1, -1).contiguous()
+    # planes as groups: as a batch of pictures they take ten times as long
+    rows = conv2d(planes[None], across, padding=(0, WINDOW // 2), groups=count)
+    return conv2d(rows, across.transpose(2, 3), padding=(WINDOW // 2, 0), groups=count)[0]
 
 
 def _check_pair(image: Tensor, target: Tensor) -> None:
