@@ -16,6 +16,7 @@ PAPER, INK, PALE, GRID = (250, 249, 246), (38, 36, 34), (118, 113, 107), (228, 2
 LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158, 28), (70, 160, 180))
 
 _DPI = 100
+_LEFT, _RIGHT, _TOP, _BOTTOM, _LEGEND = 56, 16, 30, 44, 20  # pixels around the axes; a legend's line is below
 _MARKED = 20  # lines of at most so many points show them
 _DECADES = 4  # a logarithmic axis shows no more, the least values lie below its floor
 
@@ -50,7 +51,7 @@ class Plot:
 def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     """The plot as a picture. `width` × `height` in pixels, at least 200 × 150."""
     paper, ink, pale, grid = (_shade(color) for color in (PAPER, INK, PALE, GRID))
-    figure = Figure((width / _DPI, height / _DPI), _DPI, facecolor=paper, layout="constrained")
+    figure = Figure((width / _DPI, height / _DPI), _DPI, facecolor=paper)
     axes = figure.add_subplot(facecolor=paper)
     axes.set_title(plot.title, loc="left", fontsize=10, color=ink)
     axes.set_xlabel(plot.across, fontsize=9, color=pale)
@@ -81,16 +82,20 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
         axes.update_datalim([(x, x) for x in place], updatex=name == "x", updatey=name == "y")
     if plot.scale == "linear":
         axes.autoscale_view()
+    legend = 0
     if len(lines) > 1:
         columns = 2 if sum(map(len, lines)) > 30 else len(lines)
+        legend = _LEGEND * -(-len(lines) // columns)
         figure.legend(
-            loc="outside lower left",
+            loc="lower left",
             ncols=columns,
             fontsize=8,
             frameon=False,
             labelcolor=ink,
             handlelength=1.2,
         )
+    below = _BOTTOM - 14 * (not plot.across) + legend
+    figure.subplots_adjust(_LEFT / width, below / height, 1.0 - _RIGHT / width, 1.0 - _TOP / height)
     return _image(figure)
 
 
