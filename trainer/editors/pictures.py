@@ -170,11 +170,15 @@ def lay_over(original: Tensor, picture: Tensor) -> Tensor:
     edges = np.max(steps, axis=0) > _EDGE
     if not edges.any():
         return picture
-    rows = range(-_SHIFT, _SHIFT + 1)
-    shifts = sorted(((y, x) for y in rows for x in rows), key=lambda shift: abs(shift[0]) + abs(shift[1]))
+    reach = range(-_SHIFT, _SHIFT + 1)
+    shifts = sorted(((y, x) for y in reach for x in reach), key=lambda shift: abs(shift[0]) + abs(shift[1]))
+
+    rows, columns = np.nonzero(edges)
+    expected, (height, width) = a[rows, columns], edges.shape
 
     def misfit(shift: tuple[int, int]) -> float:
-        return float(np.quantile(np.abs(move_image(b, shift) - a).max(axis=2)[edges], _STILL))
+        found = b[(rows - shift[0]).clip(0, height - 1), (columns - shift[1]).clip(0, width - 1)]
+        return float(np.quantile(np.abs(found - expected).max(axis=1), _STILL))
 
     errors = [misfit(shift) for shift in shifts]
     best = int(np.argmin(errors))
