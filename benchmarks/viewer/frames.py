@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from benchmarks.table import Table
 from progdf.formats.ply import save_ply
 from progdf.metrics.image import psnr
+from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
 from viewer.render.dynamic_resolution import COARSE, REST_S
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
-from viewer.render.threads import one_thread
 from viewer.state.view_state import ViewState
 
 from . import display as bench_display

@@ -21,11 +21,11 @@ from benchmarks.table import Table
 from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
+from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.render.dynamic_resolution import COARSE
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
-from viewer.render.threads import one_thread
 from viewer.state.view_state import ViewState
 
 from .mouse import Mouse

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.sh import rgb_to_sh0
+from progdf.torch_threads import one_thread
 
 from .light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, view_dependent_light
 from .noise import lattice
@@ -67,24 +67,13 @@ def assemble(
     table = lattice(seed)
     pieces: list[Gaussians] = []
     labels: list[Tensor] = []
-    with _one_thread():
+    with one_thread():  # hundreds of small tensor operations
         counts, shown = _budget(parts, size)
         for part, count, share in zip(parts, counts, shown, strict=True):
             at = _sample_visible(parts, part, count, share, random)
             pieces.append(_make_gaussians(parts, part, at, paint(part, at, table), daylight, random))
             labels.append(torch.full((count,), label_names.index(part.label), dtype=torch.uint8))
     return _concatenate(pieces), torch.cat(labels)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Hundreds of small tensor operations: more threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:

@@ -25,6 +25,7 @@ from progdf.color.path import bend_of, interpolate_colors
 from progdf.gaussians import Gaussians, unpack
 from progdf.rasterize.color_maps import ColorMap
 from progdf.sh import C0, sh0_to_rgb
+from progdf.torch_threads import one_thread
 from trainer.regions.lift import HIDDEN, bare_weight
 from trainer.regions.surface import surface_likeness
 from trainer.views.crops import CropScene
@@ -299,7 +300,8 @@ def solve_pictures(
     for index in range(state.stage, len(stages)):
         stage = stages[index]
         before = state.previous[:, columns].reshape(len(original), -1, 3)
-        end = solver.solve(stage.targets, before)
+        with one_thread():
+            end = solver.solve(stage.targets, before)
         if not math.isfinite(float(end.sum())):
             raise FloatingPointError(f"the solution for strength {stage.strength:g} is not finite")
         way = _color_way(solver, before, end)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, load_gdf
-from viewer.render.threads import all_threads
+from progdf.torch_threads import all_threads
 from viewer.state import layers as stack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import focus_layer

@@ -16,10 +16,10 @@ from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.io.atomic import atomic_write
 from progdf.terminal import print_line
+from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import known_ups
 from viewer.files.document import empty
-from viewer.render.threads import one_thread
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState

@@ -20,13 +20,13 @@ from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write
 from progdf.io.picture_camera import camera_chunk
 from progdf.terminal import print_line
+from progdf.torch_threads import one_thread
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
-from viewer.render.threads import one_thread
 from viewer.state import recordings, timeline
 from viewer.state.layers import shown_edits
 from viewer.state.snapshots import compare_sides

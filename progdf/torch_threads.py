@@ -1,6 +1,6 @@
 """On how many threads torch works: on one, but where it has much to do at once.
 
-The viewer asks torch for hundreds of small things a second. Its threads wait for each other at every one, and
+Where torch is asked for hundreds of small things a second, its threads wait for each other at every one, and
 spin against the rasterizer's (docs/experiments.md, The viewer).
 """
 
