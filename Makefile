@@ -5,8 +5,8 @@ BIN    := $(VENV)/bin
 APT    := $(if $(shell command -v apt-get),apt,none)
 
 # A worker for each core, each at its own end of the list, so that what a file's tests share is made once; threads
-# that wait let the other workers have the core.
-PYTEST := OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n auto --dist worksteal
+# that wait let the other workers have the core, and what they import is kept compiled for their children.
+PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n auto --dist worksteal
 
 EXTRAS := styles,diffusion,segment,clip,colmap,video,formats
 

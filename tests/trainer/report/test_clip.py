@@ -130,6 +130,7 @@ def test_an_instruction_is_what_one_sees_after_unless_something_else_is_said() -
     assert make_plan(replace(told, editor="recolor:#fff")).texts.after == ""
 
 
+@pytest.mark.slow
 def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_words(
     tmp_path: Path, saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -226,6 +226,7 @@ def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop:
     desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
 
 
+@pytest.mark.slow
 @pytest.mark.window
 @pytest.mark.gl
 def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_saves(
