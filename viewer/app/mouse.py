@@ -16,7 +16,7 @@ from viewer.select.gesture import Click, Gesture
 from viewer.state import layers as stack
 from viewer.state import paint, workspace
 from viewer.state.paint import Stroke
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
 from viewer.ui import axis_gizmo
 from viewer.ui.context import UiContext
@@ -39,6 +39,7 @@ class MouseTool:
         click: the last of a tool that selects by one, while it follows the tool's tolerance
         divider: where that of a split stood when it was gripped, share of the picture's width
         axis: the end of an axis that was pressed, of `named_views.AXES`, or another part of the axes
+        settings: of the tools that select and paint, as they were before a button was pressed
     """
 
     drag: str | None = None
@@ -47,6 +48,7 @@ class MouseTool:
     click: Click | None = None
     divider: float = 0.5
     axis: str = ""
+    settings: tuple[SelectTool, Brush] | None = None
 
 
 def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
@@ -63,7 +65,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     if tool.drag == axis_gizmo.DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
         work = _look_along(work, tool.axis)
     if not inputs.any_button_down():
-        tool = replace(tool, drag=None)
+        tool = replace(tool, drag=None, settings=(work.view.select, work.view.brush))
     if io.want_capture_mouse:
         return tool, work
     if grips_divider(tool, work.view, pointer):
@@ -91,8 +93,12 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
 
 
 def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
-    """What is dragged goes back to where it was; undo knows where, but for the divider, which is no edit."""
+    """What is dragged goes back to where it was; undo knows where, but for the settings of the tools and the
+    divider, which are no edits."""
     work = workspace.cancel_drag(work)
+    if tool.settings is not None:
+        select, brush_settings = tool.settings
+        work = replace(work, view=replace(work.view, select=select, brush=brush_settings))
     if tool.drag != compare_overlay.DIVIDER:
         return work
     return replace(work, view=compare_overlay.place_divider(work.view, tool.divider))

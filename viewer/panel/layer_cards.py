@@ -237,8 +237,10 @@ def _nearest_gap(
         group = row.group if inside else over.group if not over.heads and {over.group} == own else ""
         gaps.append((row.top, max(row.layers) + 1, "" if whole else group))
     last = rows[-1]
-    stays = not (whole or last.heads) and {last.group} == own
+    stays = bool(last.group) and not (whole or last.heads) and {last.group} == own
     gaps.append((last.bottom + 2 * gap, min(last.layers), last.group if stays else ""))
+    if stays:  # half a row further down it leaves the group
+        gaps.append((last.bottom + 2 * gap + imgui.get_frame_height() / 2, min(last.layers), ""))
     y, place, group = min(gaps, key=lambda found: abs(found[0] - gap - mouse))
     return y - gap, place, group
 

@@ -9,13 +9,14 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.panel.timeline_bar import HEIGHT_PX, ROW_PX
-from viewer.state.view_state import Brush, Keyframe, Timeline
+from viewer.state.view_state import Brush, Keyframe, SelectTool, Timeline
 
 pytestmark = pytest.mark.gl
 POINTS = (700, 640)
 LEFT = POINTS[0] - 300.0
 HEADS = 112.0
 TIMELINE = round(HEIGHT_PX + ROW_PX)
+TOLERANCE = 519.0
 CallOff = Callable[[Rig], None]
 
 
@@ -165,3 +166,14 @@ def test_escape_without_a_drag_and_while_the_camera_turns_focuses_no_layer(hand:
     hand.key("1")
     hand.key("Escape")
     assert hand.main_view.work.focus is None
+
+
+@ways
+def test_a_tools_tolerance_goes_back_with_what_it_selected(hand: Rig, call_off: CallOff) -> None:
+    hand.key("J")
+    hand.click(170.0, 320.0)
+    hand.frame(2)
+    dragged_and_called_off(hand, call_off, (600.0, TOLERANCE), (640.0, TOLERANCE))
+    hand.pause(0.5)  # no double click
+    hand.drag((600.0, TOLERANCE), (640.0, TOLERANCE))
+    assert hand.main_view.work.view.select.tolerance > SelectTool.tolerance, "what was called off was a drag"

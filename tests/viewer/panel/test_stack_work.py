@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from imgui_bundle import imgui
@@ -174,3 +176,19 @@ def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
             hand.key("Ctrl+Z")
         hand.move(5.0, 5.0)  # a name that the mouse rests on shows its region
         assert np.array_equal(hand.picture(), bright)
+
+
+def test_a_member_of_the_last_group_is_dragged_to_its_end_or_below_it() -> None:
+    stack, view = many_edits(bear(), 12)
+    members = {i: replace(layer, group="ends") for i, layer in enumerate(view.layers[:3])}
+    grouped = replace(view, layers=(*members.values(), *view.layers[3:]), groups=(LayerGroup("ends"),))
+    with rig(grouped, SIZE, stack=stack) as hand:
+        second, last = TOP + STEP * 11, TOP + STEP * 12  # a row for the group lies above them
+        hand.drag((NAME, second), (NAME, last + 0.5 * STEP))
+        assert order(hand)[:3] == [EDITS[1], EDITS[0], EDITS[2]]
+        assert all(layer.group for layer in hand.main_view.work.view.layers[:3]), "to the group's end"
+        hand.pause(0.5)
+        hand.drag((NAME, last), (NAME, last + 1.5 * STEP))
+        assert order(hand)[:3] == [EDITS[1], EDITS[0], EDITS[2]]
+        assert [layer.group for layer in hand.main_view.work.view.layers[:3]] == ["", "ends", "ends"]
+        assert len(hand.main_view.work.past.past) == 2
