@@ -19,6 +19,7 @@ from progdf.errors import ProgdfError
 
 PATIENCE_S = 120.0
 PROGRAMS = ("Xvfb", "xdotool")
+_FIRST_DISPLAY, _DISPLAYS = 1000, 50_000
 
 
 def missing_tools() -> str:
@@ -38,12 +39,11 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
             f"{missing_tools()} is not installed; install xvfb and xdotool to measure the window"
         )
     receive, send = os.pipe()
-    screen = ("-screen", "0", f"{width}x{height}x24")
-    server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(send), *screen, "-nolisten", "tcp"],
-        pass_fds=[send],
-        stderr=subprocess.DEVNULL,
-    )
+    # a number of this process's own: servers that look for a free one at once may find the same
+    own = (f":{_FIRST_DISPLAY + os.getpid() % _DISPLAYS}", "-displayfd", str(send))
+    # -r: on a busy machine a key may stay down long enough to repeat
+    command = ["Xvfb", *own, "-screen", "0", f"{width}x{height}x24", "-nolisten", "tcp", "-r"]
+    server = subprocess.Popen(command, pass_fds=[send], stderr=subprocess.DEVNULL)
     os.close(send)
     try:
         with os.fdopen(receive) as told:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from benchmarks.viewer import frames as bench_frames
 from benchmarks.viewer import moving
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
+from benchmarks.viewer.display import missing_tools
 from benchmarks.viewer.mouse import Mouse
 from benchmarks.viewer.scenes import copies, edit_for, scenes_of
 from benchmarks.viewer.slider import SliderCase
@@ -195,8 +195,8 @@ def test_one_odd_sample_is_no_leak_and_a_steady_rise_is_one() -> None:
 def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
-        pytest.skip("Xvfb and xdotool are not installed")
+    if missing := missing_tools():
+        pytest.skip(f"{missing} is not installed")
     monkeypatch.setattr(bench_window, "SETTLED_S", 0.2)
     scene = bear(600).gaussians
     resting = bench_window.idle(scene, wall_s=0.2)
@@ -213,8 +213,8 @@ def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
 @pytest.mark.gl
 @pytest.mark.slow
 def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path) -> None:
-    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
-        pytest.skip("Xvfb and xdotool are not installed")
+    if missing := missing_tools():
+        pytest.skip(f"{missing} is not installed")
     save_ply(tmp_path / "bear.ply", bear(600).gaussians)
     start = bench_frames.measure_starts(tmp_path / "bear.ply", "gl", times=1, size=SIZE)
     assert 0.0 < start.imports_s < start.first_s

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.viewer.display import display, missing_tools
 from progdf.__main__ import main
 from tests.helpers.paths import ROOT
 from tests.helpers.ui_rig import bear
@@ -107,33 +107,20 @@ class Desktop:
         self.until(what, idle)
 
 
-def start_display() -> tuple[subprocess.Popen[bytes], dict[str, str]]:
-    """A server, and the environment of what shall open on it."""
-    for _ in range(5):  # two that start at once may take the same number, and then one of them is not there
-        receive, send = os.pipe()
-        screen = ("-screen", "0", f"{WIDTH + 100}x{HEIGHT + 100}x24")
-        # -r: on a busy machine a key may stay down long enough to repeat
-        command = ["Xvfb", "-displayfd", str(send), *screen, "-nolisten", "tcp", "-r"]
-        server = subprocess.Popen(command, pass_fds=[send], stderr=subprocess.DEVNULL)
-        os.close(send)
-        with os.fdopen(receive) as display:
-            number = display.readline().strip()
-        environment = os.environ | {"DISPLAY": f":{number}", "NUMBA_NUM_THREADS": "2"}
-        environment.pop("WAYLAND_DISPLAY", None)
-        answer = subprocess.run(["xdotool", "getdisplaygeometry"], env=environment, capture_output=True)
-        if answer.returncode == 0:
-            return server, environment
-        server.terminate()
-        server.wait(timeout=PATIENCE_S)
-    pytest.fail("Xvfb gives no display")
+@pytest.fixture
+def screen() -> Iterator[str]:
+    """The name of a virtual display."""
+    if missing := missing_tools():
+        pytest.skip(f"{missing} is not installed")
+    with display(WIDTH + 100, HEIGHT + 100) as name:
+        yield name
 
 
 @pytest.fixture
-def desktop(tmp_path: Path) -> Iterator[Desktop]:
-    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
-        pytest.skip("Xvfb and xdotool are not installed")
+def desktop(screen: str, tmp_path: Path) -> Iterator[Desktop]:
     paths = bear().save(tmp_path)
-    server, environment = start_display()
+    environment = os.environ | {"DISPLAY": screen, "NUMBA_NUM_THREADS": "2"}
+    environment.pop("WAYLAND_DISPLAY", None)
     process = subprocess.Popen(
         [
             sys.executable,
@@ -154,9 +141,8 @@ def desktop(tmp_path: Path) -> Iterator[Desktop]:
         made.open()
         yield made
     finally:
-        for started in (process, server):
-            started.terminate()
-            started.communicate(timeout=PATIENCE_S)
+        process.terminate()
+        process.communicate(timeout=PATIENCE_S)
 
 
 def slider(layer: int, strength: float) -> tuple[float, float]:
