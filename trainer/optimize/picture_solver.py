@@ -86,6 +86,7 @@ class PictureSolver:
         """How many members no picture tells anything of."""
         return int((self.shown == 0).sum())
 
+    @one_thread()
     def solve(self, targets: Sequence[Tensor], start: Tensor) -> Tensor:
         """The offsets of DC and bands that the pictures ask for. [M,B,3] -> [M,B,3]
 
@@ -300,8 +301,7 @@ def solve_pictures(
     for index in range(state.stage, len(stages)):
         stage = stages[index]
         before = state.previous[:, columns].reshape(len(original), -1, 3)
-        with one_thread():
-            end = solver.solve(stage.targets, before)
+        end = solver.solve(stage.targets, before)
         if not math.isfinite(float(end.sum())):
             raise FloatingPointError(f"the solution for strength {stage.strength:g} is not finite")
         way = _color_way(solver, before, end)
