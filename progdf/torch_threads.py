@@ -1,7 +1,7 @@
 """On how many threads torch works: on one, but where it has much to do at once.
 
 Where torch is asked for hundreds of small things a second, its threads wait for each other at every one, and
-spin against the rasterizer's (docs/experiments.md, The viewer).
+spin against the rasterizer's: an edit of one picture was solved in 5.2 s on two threads and in 2.6 on one.
 """
 
 from __future__ import annotations
