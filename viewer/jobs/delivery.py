@@ -56,7 +56,7 @@ class Delivery:
         status: where it stands
         done, total: frames; 0 of 0 while nothing is known
         note: what the command said last
-        seconds: that it has run
+        seconds: that it has run, whole ones
         error: the one line of a failure
     """
 
@@ -67,7 +67,7 @@ class Delivery:
     done: int = 0
     total: int = 0
     note: str = ""
-    seconds: float = 0.0
+    seconds: int = 0
     error: str = ""
 
     @property
@@ -122,11 +122,12 @@ class Deliveries:
                 continue
             status = child.status
             if status is None:
-                note = last_line(child.log)
-                found = re.search(r"frame (\d+)/(\d+)", note)
-                done, total = (int(found[1]), int(found[2])) if found else (0, 0)
-                seconds = time.monotonic() - self._began[delivery.number]
-                self._change(replace(delivery, done=done, total=total, note=note, seconds=seconds))
+                seconds = int(time.monotonic() - self._began[delivery.number])
+                if seconds != delivery.seconds:  # each look is a frame of the window
+                    note = last_line(child.log)
+                    found = re.search(r"frame (\d+)/(\d+)", note)
+                    done, total = (int(found[1]), int(found[2])) if found else (0, 0)
+                    self._change(replace(delivery, done=done, total=total, note=note, seconds=seconds))
                 continue
             self._children.pop(delivery.number).close()
             if status and delivery.status != "stopping":

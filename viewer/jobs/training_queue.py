@@ -14,6 +14,9 @@ from .training_job import EditOrder, Progress, TrainingJob
 POLL_S = 0.4
 """Between two looks at a child."""
 
+LOOK_S = 1.0
+"""Between two at how far it is: the window draws its card at each."""
+
 
 class TrainingQueue:
     """Trains what is asked for, in turn. `close` it: what runs then is stopped and can be resumed."""
@@ -23,7 +26,7 @@ class TrainingQueue:
         self._numbers = itertools.count(1)
         self._child: Child | None = None
         self._running = 0  # the number of the job that the child is
-        self._began = 0.0
+        self._began = self._look_at = 0.0
 
     @property
     def busy(self) -> bool:
@@ -82,13 +85,14 @@ class TrainingQueue:
         job = self.job(self._running)
         if self._child is not None and job is not None:
             status = self._child.status
-            if status is None:
+            if status is not None:
+                ended.append(self._end(job, status))
+            elif (now := time.monotonic()) >= self._look_at:
+                self._look_at = now + LOOK_S
                 progress = run_files.read_progress(job.order, job.progress)
                 if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
-                    self._began = time.monotonic()
-                self._change(replace(job, progress=progress, seconds=time.monotonic() - self._began))
-            else:
-                ended.append(self._end(job, status))
+                    self._began = now
+                self._change(replace(job, progress=progress, seconds=now - self._began))
         if self._child is None:
             waiting = next((job for job in self.jobs if job.status == "queued"), None)
             if waiting is not None and (failed := self._start(waiting)) is not None:

@@ -9,10 +9,11 @@ import pytest
 
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import load_gdf
+from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
 from viewer.jobs import run_files
 from viewer.jobs.training_job import EditOrder, TrainingJob
-from viewer.jobs.training_queue import TrainingQueue
+from viewer.jobs.training_queue import LOOK_S, TrainingQueue
 
 PATIENCE_S = 600.0
 EARS = "sphere:0,1.9,0,0.6"
@@ -41,13 +42,16 @@ def wait(queue: TrainingQueue, until: str = "") -> list[TrainingJob]:
     return ended
 
 
-def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path) -> None:
+def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     queue = TrainingQueue()
     queue.add(order(scene, "nowhere", "sphere:99,99,99,1"))
     number = queue.add(order(scene, "blue", EARS))
     queue.poll()
     assert [job.status for job in queue.jobs] == ["running", "queued"]
+    shown, begun = Count(monkeypatch, TrainingQueue, "_change"), time.monotonic()
     failed, done = wait(queue)
+    # the training would have half of the processor otherwise: each change is drawn
+    assert shown.calls <= (time.monotonic() - begun) / LOOK_S + 4, "its card changes once a second"
     assert failed.status == "failed"
     assert failed.error.startswith("region 'sphere:99,99,99,1' holds no Gaussian")
     assert done.number == number
