@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +12,8 @@ from progdf.camera import Camera
 
 from .cpu.engine import bin_view, make_pinhole, share_tiles, to_float32
 from .cpu.jit import compilation
-from .cpu.parallel import run_chunks
 from .cpu.weights import Runs, add_gradients, add_images, list_weights
 from .engines import ActivatedGaussians, Crop, RasterView
-
-_PART = 200_000  # weights that one thread sums at once: half a millisecond
 
 
 @dataclass(frozen=True)
@@ -28,31 +24,23 @@ class ColorMap:
         count: M
         size: height and width of the window
         runs: the weights
-        cuts: runs at which parts begin that share no pixel and can be summed at once, and the last one's end
     """
 
     count: int
     size: tuple[int, int]
     runs: Runs
-    cuts: Sequence[int]
 
     def picture(self, colors: Tensor) -> Tensor:
         """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
         image = np.zeros((self.size[0] * self.size[1], 3), np.float32)
-        shown = to_float32(colors).numpy()
-        self._sum(lambda part, begin, end: add_images(begin, end, self.runs, shown, image))
+        add_images(self.runs, to_float32(colors).numpy(), image)
         return torch.from_numpy(image).view(*self.size, 3)
 
     def gradient(self, image: Tensor) -> Tensor:
         """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
-        colors = np.zeros((len(self.cuts) - 1, self.count, 3), np.float32)
-        shown = to_float32(image).numpy().reshape(-1, 3)
-        self._sum(lambda part, begin, end: add_gradients(begin, end, self.runs, shown, colors[part]))
-        return torch.from_numpy(colors).sum(dim=0)
-
-    def _sum(self, kernel: Callable[[int, int, int], None]) -> None:
-        """Call `kernel(part, begin, end)` for each part's runs."""
-        run_chunks(lambda part: kernel(part, self.cuts[part], self.cuts[part + 1]), len(self.cuts) - 1)
+        colors = np.zeros((self.count, 3), np.float32)
+        add_gradients(self.runs, to_float32(image).numpy().reshape(-1, 3), colors)
+        return torch.from_numpy(colors)
 
 
 def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: Tensor) -> ColorMap:
@@ -74,11 +62,8 @@ def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: T
         runs = _new_runs(*counts.sum(axis=0).tolist())
         places = np.cumsum(counts, axis=0) - counts
         share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, places, runs)
-    parts = 1 + int(counts[:, 1].sum()) // _PART
-    whole = np.searchsorted(places[:, 1], np.linspace(0, len(runs.pixels), parts + 1)[1:-1])
-    cuts = sorted({0, *np.append(places[:, 0], len(runs.rows))[whole].tolist(), len(runs.rows)})
     x0, y0, x1, y1 = crop
-    return ColorMap(len(rows), (y1 - y0, x1 - x0), runs, cuts)
+    return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
 
 
 def _new_runs(runs: int, entries: int) -> Runs:

@@ -191,9 +191,9 @@ def list_weights(
 
 
 @kernel(fast=True, cache=True)
-def add_images(begin: int, end: int, runs: Runs, colors: Array, image: Array) -> None:
-    """image += Σ w·c of runs begin … end − 1. colors: [M,3] float32; image: [h·w,3] float32"""
-    for run in range(begin, end):
+def add_images(runs: Runs, colors: Array, image: Array) -> None:
+    """image += Σ w·c. colors: [M,3] float32; image: [h·w,3] float32"""
+    for run in range(runs.rows.size):
         row = runs.rows[run]
         red, green, blue = colors[row, 0], colors[row, 1], colors[row, 2]
         for k in range(runs.starts[run], runs.starts[run + 1]):
@@ -204,10 +204,9 @@ def add_images(begin: int, end: int, runs: Runs, colors: Array, image: Array) ->
 
 
 @kernel(fast=True, cache=True)
-def add_gradients(begin: int, end: int, runs: Runs, gradient: Array, by_colors: Array) -> None:
-    """by_colors += Σ w·g of runs begin … end − 1. gradient: of the image, [h·w,3] float32; by_colors: [M,3]
-    float32"""
-    for run in range(begin, end):
+def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
+    """by_colors += Σ w·g. gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32"""
+    for run in range(runs.rows.size):
         red = green = blue = np.float32(0.0)
         for k in range(runs.starts[run], runs.starts[run + 1]):
             p, w = runs.pixels[k], runs.weights[k]
