@@ -24,7 +24,7 @@ class Camera:
         height: image height in pixels, ≥ 1
         name: where it came from, for messages and file names
         lens: what bends photographs that this camera took; a render is straight, so nothing that draws asks
-        near: depth at and below which a training draws nothing, world units, see `framing.near_plane`
+        near: depth at and below which a training draws nothing, world units, see `bounds.near_plane`
 
     Raises:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite.

@@ -95,7 +95,7 @@ class SliderTimes:
         parts: what of that the engine took
         psnr_db: against `progdf.render`, the worst of three strengths
         apart: largest difference of a picture that was drawn step by step from the same drawn afresh
-        edit_error: largest difference of an attribute from `progdf.compose` (see `Engine.edit_error`)
+        edit_error: largest difference of an attribute from `progdf.compose` (see `ViewEngine.edit_error`)
     """
 
     case: SliderCase

@@ -59,7 +59,7 @@ class AnalyticEdit:
 
 
 def recolor_edit(target: Tensor) -> AnalyticEdit:
-    """`color.recolor` of every Gaussian, seen from the members' own color; `target` [3] sRGB."""
+    """`edits.recolor` of every Gaussian, seen from the members' own color; `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         rgb = sh0_to_rgb(part.sh0)
@@ -81,7 +81,7 @@ def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
 
 
 def darken_edit(stops: float = 3.0) -> AnalyticEdit:
-    """Night falls: `color.night`, view-dependent light fading with the rest."""
+    """Night falls: `edits.night`, view-dependent light fading with the rest."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         dark = color.night(sh0_to_rgb(part.sh0), strength, stops)

@@ -1,7 +1,7 @@
 """What a .gdf file says of itself before its tensors are read: enough to list it and to refuse it.
 
 A few kB at the file's beginning: the header and the table of tensors, with a SHA-256 of both. What the
-tensors hold is checked when they are read (`checkpoint.load_gdf`), before anything of them is used.
+tensors hold is checked when they are read (`file.load_gdf`), before anything of them is used.
 """
 
 from __future__ import annotations

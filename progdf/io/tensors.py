@@ -51,7 +51,7 @@ def write_tensors(
     """Write a safetensors file.
 
     Args:
-        path: where to; see `files.atomic_write` for a file that is whole or absent
+        path: where to; see `atomic.atomic_write` for a file that is whole or absent
         tensors: by name, of the types in the table above; on the CPU
         metadata: texts, or JSON as it is, by name
         checksum: add one of everything, which `read_tensors` compares

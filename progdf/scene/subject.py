@@ -47,7 +47,7 @@ def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
 
     Args:
         scene: N Gaussians, finite; of many an even sample is looked at
-        up: see `framing.guess_up`. [3]
+        up: see `up_axis.guess_up`. [3]
 
     Returns:
         Sorted rows, at least one where there is one at all. [M] int64

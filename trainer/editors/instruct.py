@@ -79,7 +79,7 @@ class InstructEditor:
         return self._paint(view, view.image, strength, "" if strength == 1.0 else f"{strength:g}")
 
     def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """See `Painter.edit_again`."""
+        """See `RepaintingEditor.edit_again`."""
         return self._paint(view, current, strength, f"step_{step:05d}")
 
     def _paint(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:

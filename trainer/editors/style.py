@@ -62,7 +62,7 @@ class StyleEditor:
         return self._mix(view, strength, view.image, "")
 
     def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """See `Painter.edit_again`."""
+        """See `RepaintingEditor.edit_again`."""
         return self._mix(view, strength, current, f"step_{step:05d}")
 
     def _mix(self, view: View, strength: float, source: Tensor | None, place: str) -> Tensor:

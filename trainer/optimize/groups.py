@@ -203,7 +203,7 @@ def group_path(
         count: recordings over all stages, about
 
     Returns:
-        (step, stage, ends_stage, offsets [M,C] float16) in order, as `trajectory.record` takes them
+        (step, stage, ends_stage, offsets [M,C] float16) in order, as `retime.record` takes them
     """
     placement, own, begun = groups.rest, torch.zeros_like(original), 0
     each = max(2, count // len(ends))

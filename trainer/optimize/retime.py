@@ -27,7 +27,8 @@ def record(
 
     Args:
         snapshots: (step, stage, ends_stage, offsets [M,C] float16) in order; the original is added before
-        them end: the last offsets in full precision. [M,C] float32
+            them
+        end: the last offsets in full precision. [M,C] float32
         strengths: what the editor was asked for, of each stage
     """
     offsets = torch.stack([torch.zeros_like(snapshots[0][3]), *(offset for *_, offset in snapshots)])

@@ -58,7 +58,7 @@ class UnseenMembers:
 
 
 def unseen_members_of(setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
-    """Those of a run: nobody but in an edit of colors that is to be followed (`--follow`)."""
+    """Those of a run; none unless the edit is one of colors alone."""
     if kind != "color":
         nobody = torch.zeros(0, dtype=torch.int64)
         return UnseenMembers(nobody, nobody[:, None], torch.zeros(0, 1))

@@ -19,7 +19,7 @@ class ErrorCurve:
         s: slider values, ascending
         psnr: over the pixels that count, dB, at most 99
         ssim: over the same, at most 1
-        lpips: of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `edit.perceptual`)
+        lpips: of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
     """
 
     s: tuple[float, ...]

@@ -48,7 +48,7 @@ class FileActions:
         app.main_view.recent = self._remember(*files)
 
     def handle(self, request: str) -> None:
-        """One request of `actions.REQUESTS` that is about files, or "quit"."""
+        """One request of `workspace.REQUESTS` that is about files, or "quit"."""
         name, _, argument = request.partition(":")
         if name in ("save", "save_as"):
             self._save_where(argument, ask=name == "save_as")

@@ -24,7 +24,7 @@ from . import timeline_file
 CAMERAS = ".cameras.json"
 
 REQUESTS = ("picture", "take_view", "window_picture", "timeline_file")
-"""Those of `actions.REQUESTS` that end here."""
+"""Those of `workspace.REQUESTS` that end here."""
 
 
 def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> str:

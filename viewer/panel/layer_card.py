@@ -57,7 +57,7 @@ class Cards:
         rows: one per .gdf, indexed by `LayerState.gdf`
         focus: the focused layer, an index into `ViewState.layers`, or None
         reveal: scroll to it, and to what is cut of the selected ones
-        active_slider: which of `stack.SLIDERS` of it the arrow keys move
+        active_slider: which of `layers.SLIDERS` of it the arrow keys move
         renaming: the layer whose name is being typed, or None
         selected: `LayerState.gdf` of the layers that are selected with the focused one
         compact: rows of one line in place of cards

@@ -67,7 +67,7 @@ class PanelInput:
         undos, redos: how many entries there are either way
         reveal: scroll to the focused layer
         snapshots: the original and what was kept
-        active_slider: which of `stack.SLIDERS` of the focused layer the arrow keys move
+        active_slider: which of `layers.SLIDERS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
         unrecorded: why there is nothing recorded to compare with, "" where there is
         form: of a new edit; None while it is closed

@@ -100,7 +100,7 @@ class Comparer:
         return mode == "off" or self._second(view).prepare(self._other_view(view), camera)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
-        """The same as an array, without labels. [H,W,3] float32, see `Engine.image`"""
+        """The same as an array, without labels. [H,W,3] float32, see `ViewEngine.image`"""
         if view.compare.mode == "off":
             return self.engine.image(view, size, camera)
         if view.compare.mode == "beside":

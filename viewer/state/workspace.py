@@ -127,7 +127,7 @@ class Workspace:
         search: what the panel's layers are filtered by, "" for all
         searching: its field was asked for and has no keyboard yet
         cards_fit: whether the panel has room for a whole card of each layer
-        active_slider: which of `stack.SLIDERS` of the focused layer the arrow keys move
+        active_slider: which of `layers.SLIDERS` of the focused layer the arrow keys move
         renaming: the layer whose name is being typed, or None
         help: whether the list of bindings is shown
         message: the line at the bottom, or None
