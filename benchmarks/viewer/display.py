@@ -146,7 +146,7 @@ def window(
     environment.pop("WAYLAND_DISPLAY", None)
     own = [str(time.time()), f"{size[0]}x{size[1]}", "leave" if leave else "stay"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.viewer.watched", *own, *map(str, arguments)],
+        [sys.executable, "-P", "-m", "benchmarks.viewer.watched", *own, *map(str, arguments)],
         env=environment,
         cwd=folder,
         stdout=subprocess.PIPE,

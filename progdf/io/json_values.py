@@ -11,9 +11,14 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from progdf.errors import ProgdfError
+
+from .atomic import read_file
+
 DEEPEST = 64
 """Lists and tables in one another that a file may have: what walks through them never runs out of stack."""
 
+_MOST_BYTES = 1 << 20  # of the files that programs keep for themselves
 _LONGEST_INT = 18  # digits; what is longer is a float, as in most languages
 
 _T = TypeVar("_T")
@@ -57,6 +62,21 @@ def convert_json(value: object, kind: type[_T], closed: bool = False) -> _T:
     if closed:
         _refuse_unknown(value, plain(found), "")
     return found
+
+
+def read_json(path: Path, kind: type[_T]) -> _T:
+    """A small file of the program's own as `kind`, see `convert_json`.
+
+    Raises:
+        ProgdfError: it is missing, no file, damaged or larger than any of them; one line.
+    """
+    content = read_file(path, _MOST_BYTES + 1)
+    try:
+        if len(content) > _MOST_BYTES:
+            raise ValueError("it is too large")
+        return convert_json(decode_json(content), kind)
+    except ValueError as error:
+        raise ProgdfError(f"{path} is damaged ({error}); delete it") from None
 
 
 def one_of(names: Sequence[str]) -> msgspec.Meta:

@@ -170,7 +170,7 @@ def main(argv: Sequence[str]) -> int:
     )
     if options.window and _has_display():
         # another process, as the trainer and the viewer share nothing but files
-        return subprocess.run([sys.executable, "-m", "progdf", *command], check=False).returncode
+        return subprocess.run([sys.executable, "-P", "-m", "progdf", *command], check=False).returncode
     return 0
 
 

@@ -43,7 +43,8 @@ class RunLog:
         quiet: the file only
         refits: a later command on a finished run, whose own time counts apart
         progress: a file for programs that wait for the run: what it does, how many steps of how many are
-            done, and the short word, as JSON, rewritten a few times a second; None writes none
+            done, the short word, and the run's seconds so far, as JSON, rewritten a few times a second; None
+            writes none
     """
 
     def __init__(
@@ -163,7 +164,7 @@ class RunLog:
         if self._progress is None or (now - self._written < _FILE_EVERY_S and done < total):
             return
         self._written = now
-        state = {"doing": what, "done": done, "total": total, "note": word}
+        state = {"doing": what, "done": done, "total": total, "note": word, "seconds": self._total()}
         with suppress(OSError, ProgdfError), atomic_write(self._progress) as temporary_file:
             temporary_file.write_text(json.dumps(state, ensure_ascii=False), encoding="utf-8")
 

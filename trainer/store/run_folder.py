@@ -6,6 +6,7 @@ RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: fin
 RUN/views/painted/…                              what a learned editor painted, see editors/cache.py
 RUN/segmented/PROMPT/VIEW.png                    where text:"…" found it; a folder for masks:DIR
 RUN/state/…                                      what a stopped run needs to go on, see state.py
+RUN/run.lock                                     locked while it is trained
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,11 +26,13 @@ from progdf.field.trajectory import FILE_NAME
 from progdf.io.atomic import atomic_write, is_temporary, remove_abandoned
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json
+from progdf.io.locks import LOCK, LockedError, hold_lock
 
 from .picture_list import add_pictures, remove_pictures_but_of
 from .state import StateFolder
 
 _SIGNATURE = "progdf train"
+_LOOK_S = 1.0  # a window that asks whether a run is locked holds the lock for a moment
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,8 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
         raise ProgdfError(f"{root} is a file; give --out a folder")
     folder = RunFolder(root)
     if root.is_dir() and not all(
-        is_temporary(entry.name) or entry == folder.segmented for entry in root.iterdir()
+        is_temporary(entry.name) or entry.name == LOCK or entry == folder.segmented
+        for entry in root.iterdir()
     ):
         first = (
             folder.log.read_text(encoding="utf-8", errors="replace").split("\n", 1)[0]
@@ -152,28 +155,19 @@ def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
 
 @contextlib.contextmanager
 def lock_folder(folder: RunFolder) -> Iterator[None]:
-    """Nobody else trains in this folder meanwhile; the system lets go when the process ends, however.
+    """Nobody else trains in this folder meanwhile.
 
     Raises:
-        ProgdfError: somebody does.
+        ProgdfError: somebody does, or the folder cannot be written to.
     """
-    if sys.platform == "win32":
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(hold_lock(folder.root / LOCK, _LOOK_S))
+        except LockedError:
+            raise ProgdfError(
+                f"{folder.root} is being trained by another process; wait for it, or stop it first"
+            ) from None
         yield
-        return
-    import fcntl
-
-    handle = os.open(folder.root, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):  # a file system without locks
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ProgdfError(
-                    f"{folder.root} is being trained by another process; wait for it, or stop it first"
-                ) from None
-        yield
-    finally:
-        os.close(handle)
 
 
 def remove_leftovers(folder: RunFolder) -> None:

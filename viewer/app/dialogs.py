@@ -31,6 +31,7 @@ TITLES = {
     "overwrite": "File already exists",
     "restore": "Recover unsaved work?",
     "training": "Training is not finished",
+    "discard_run": "Discard training",
     "delivery": "Still being written",
     "log": "Training log",
     "export": "Export the edited scene",
@@ -46,6 +47,7 @@ _HINTS = {
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
     "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
     "training": "{} is being trained. A run that is stopped can go on when the scene is opened again.",
+    "discard_run": "Discard {} of training? It cannot be brought back.",
     "delivery": "{} is not finished. What is stopped now is not kept.",
     "log": "{}",
     "export": "A plain 3DGS .ply of what the sliders show, which any viewer opens.",
@@ -77,6 +79,7 @@ _CHOICES = {
     "leave": (_Button("Save", ("Enter", "S")), _Button("Discard", ("D",)), _Button("Cancel")),
     "overwrite": (_Button("Rename…", ("Enter", "R")), _Button("Replace"), _Button("Cancel")),
     "training": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
+    "discard_run": (_Button("Keep", ("Enter",)), _Button("Discard", ("D",))),
     "delivery": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
     "log": (_Button("Close", ("Enter",)),),
     "about": (_Button("Close", ("Enter",)),),
@@ -228,6 +231,8 @@ def _answer(dialog: Dialog, button: str) -> Answer:
             return Answer(Dialog("save", path, dialog.then))
         case "training", "Stop and quit":
             return Answer(None, ("stop_and_quit",))
+        case "discard_run", "Discard":
+            return Answer(None, (f"discard_run:{dialog.then}",))
         case "delivery", "Stop and quit":
             return Answer(None, ("drop_and_quit",))
         case "restore", "Restore":

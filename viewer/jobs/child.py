@@ -1,21 +1,32 @@
-"""A `progdf` command as a child process: niced, in its own group, stopped with the window."""
+"""A `progdf` command as a child process: at low priority, in its own group, stopped with the window.
+
+As a program of its own, python -P -m viewer.jobs.child [--talks] COMMAND …, this runs a command with a parent
+watchdog: it is interrupted when its standard input closes, and so never outlives the window that holds the
+other end, however that ended. One that talks reads its input itself, and ends with it.
+"""
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from .leash import TALKS
-
 GRACE_S = 8.0
 """After which a child that was asked to stop is killed: it may be saving its state."""
+
+NICE = 10
+"""As by nice(1): a child gets a tenth of a core that the window, or another program, keeps busy. SCHED_IDLE
+would give it nothing, and a process without privileges cannot leave that again."""
+
+_TALKS = "--talks"
 
 
 class Child:
@@ -25,7 +36,7 @@ class Child:
         arguments: words after `progdf`
         log: file that takes what it prints
         talks: it reads its standard input, and what it prints is read here, by `output`; it has to end by
-            itself when its input does
+            itself when its input does. Somebody waits for it: it keeps the window's priority
 
     Raises:
         OSError: it cannot be started, or the log not written.
@@ -33,19 +44,24 @@ class Child:
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
         log.parent.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"process_group": 0} if sys.platform != "win32" else {}
+        options: dict[str, Any] = {"process_group": 0}
         if sys.platform == "win32":
-            flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.BELOW_NORMAL_PRIORITY_CLASS
-            options["creationflags"] = flags
+            flags = 0 if talks else subprocess.BELOW_NORMAL_PRIORITY_CLASS
+            options = {"creationflags": flags | subprocess.CREATE_NEW_PROCESS_GROUP}
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "viewer.jobs.leash", *[TALKS] * talks, *arguments],
+                # -P: a module in the current folder, which may be a stranger's scene, is not run
+                [sys.executable, "-P", "-m", "viewer.jobs.child", *[_TALKS] * talks, *arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE if talks else sink,
                 stderr=sink if talks else subprocess.STDOUT,
                 env={**os.environ, "NO_COLOR": "1", "COLUMNS": "4096"},
                 **options,
             )
+        if sys.platform != "win32" and hasattr(os, "setpriority") and not talks:
+            with contextlib.suppress(OSError):
+                nice = os.getpriority(os.PRIO_PROCESS, 0) + NICE
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
         self.log = log
         self._asked_at: float | None = None
 
@@ -61,6 +77,18 @@ class Child:
     def pid(self) -> int:
         """Of its process, and of its group where there are such."""
         return self._process.pid
+
+    @property
+    def processor_s(self) -> tuple[float, float] | None:
+        """Seconds that its threads have run, and that they were ready to but waited; None where unknown."""
+        ran = waited = 0
+        try:
+            for task in Path(f"/proc/{self.pid}/task").iterdir():
+                times = (task / "schedstat").read_text(encoding="ascii").split()
+                ran, waited = ran + int(times[0]), waited + int(times[1])
+        except (OSError, ValueError, IndexError):  # not Linux, or a thread that ends just now
+            return None
+        return 1e-9 * ran, 1e-9 * waited
 
     @property
     def output(self) -> IO[bytes]:
@@ -86,10 +114,10 @@ class Child:
     def kill(self) -> None:
         """End it and all that it started, at once."""
         with contextlib.suppress(OSError):
-            if sys.platform == "win32":
-                self._process.kill()
-            else:
+            if sys.platform != "win32" and hasattr(os, "killpg"):
                 os.killpg(self._process.pid, signal.SIGKILL)
+            else:
+                self._process.kill()
 
     def close(self) -> None:
         """Stop it and wait until it is gone."""
@@ -114,3 +142,27 @@ def last_line(log: Path) -> str:
     except OSError:
         return ""
     return lines[-1].removeprefix("progdf: ").strip() if lines else ""
+
+
+def main() -> int:
+    """The child: the exit status of its command."""
+    talks = sys.argv[1:2] == [_TALKS]
+    if not talks:
+        # ignored where the window was started by `&` in a script, and then nothing would stop this
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        threading.Thread(target=_watch_parent, daemon=True).start()
+    from progdf.__main__ import main as run
+
+    return run(sys.argv[1 + talks :])
+
+
+def _watch_parent() -> None:
+    """Wait until nobody holds the other end any more; then stop as by Ctrl+C."""
+    with contextlib.suppress(OSError):
+        while os.read(0, 4096):
+            pass
+    _thread.interrupt_main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
+from progdf.io.json_values import convert_json, decode_json
 
 from .child import Child
 
@@ -91,12 +92,12 @@ class PreviewChild:
             ended = self._child.status is not None
             return PreviewPicture(-1, None, self._child.error() or "the preview ended") if ended else None
         try:
-            told = msgspec.json.decode(found, type=_Answer)
+            told = convert_json(decode_json(found), _Answer)
             if told.error:
                 return PreviewPicture(told.number, None, told.error)
             with Image.open(self.folder / f"{told.number % 8}.png") as picture:
                 return PreviewPicture(told.number, np.asarray(picture.convert("RGB")))
-        except (OSError, ValueError, msgspec.MsgspecError) as error:
+        except (OSError, ValueError) as error:
             return PreviewPicture(-1, None, f"the preview cannot be read: {error}")
 
     def close(self) -> None:

@@ -3,6 +3,7 @@
 SCENE.edits/NAME/              the run's folder, see `progdf train --out`
 SCENE.edits/NAME.train.json    what was asked for, so that a stopped run can go on another day
 SCENE.edits/NAME.train.log     what it printed
+SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
 SCENE.edits/NAME.region.npy    the selection that it was made for
 """
 
@@ -14,6 +15,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import torch
@@ -23,13 +25,15 @@ from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.atomic import atomic_write, make_folder
+from progdf.io.json_values import read_json
+from progdf.io.locks import LOCK, LockedError, hold_lock, is_locked
 from progdf.io.tensors import read_tensors
 from progdf.io.user_folders import state_folder
 from progdf.region import Region
 
 from .training_job import EditOrder, Progress, progress_of
 
-ORDER, LOG = ".train.json", ".train.log"
+ORDER, LOG, WINDOW_LOCK = ".train.json", ".train.log", ".train.lock"
 
 
 class _Said(msgspec.Struct):
@@ -39,6 +43,7 @@ class _Said(msgspec.Struct):
     done: int
     total: int
     note: str = ""
+    seconds: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # of all sessions of the run
 
 
 class _Order(msgspec.Struct):
@@ -96,32 +101,77 @@ def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:
     """Runs of this scene that were stopped and can go on."""
     for path in sorted(folder.glob(f"*{ORDER}")):
         out = path.with_name(path.name.removesuffix(ORDER))
-        if not (out / "state" / "run.json").is_file():
+        if not is_begun(out):
             continue
-        with contextlib.suppress(OSError, msgspec.MsgspecError):
-            kept = msgspec.json.decode(path.read_bytes(), type=_Order)
+        with contextlib.suppress(ProgdfError):
+            kept = read_json(path, _Order)
             if Path(kept.scene) == scene.resolve():
                 yield EditOrder(
                     Path(kept.scene), out, kept.name, kept.region, kept.editor, kept.quick, kept.threads
                 )
 
 
+def is_begun(out: Path) -> bool:
+    """Whether a run has saved something that it can go on with."""
+    return os.path.isfile(out / "state" / "run.json")  # False where it may not be looked at
+
+
+@contextlib.contextmanager
+def hold_run(order: EditOrder) -> Iterator[None]:
+    """This window alone resumes, trains or discards the run meanwhile.
+
+    Raises:
+        LockedError: another window has it in its queue, or a process trains it.
+        ProgdfError: its folder cannot be written to.
+    """
+    make_folder(order.out.parent)
+    lock = _beside(order.out, WINDOW_LOCK)
+    try:
+        with hold_lock(lock):
+            if is_locked(order.out / LOCK):  # by a command, or by the child of a window that was killed
+                raise LockedError(str(lock))
+            yield
+    except LockedError:
+        raise LockedError(f"{order.name} trains in another window; stop it there first") from None
+    if not _beside(order.out, ORDER).exists():  # it was discarded
+        with contextlib.suppress(OSError):
+            lock.unlink(missing_ok=True)
+
+
+def is_held(order: EditOrder) -> bool:
+    """Whether another window, or a process, has the run; this one must not hold it itself."""
+    return is_locked(_beside(order.out, WINDOW_LOCK)) or is_locked(order.out / LOCK)
+
+
 def discard(order: EditOrder) -> None:
-    """Remove a run that was not finished, and what was written down of it."""
-    if not order.gdf.exists():
-        shutil.rmtree(order.out, ignore_errors=True)
-        for suffix in (ORDER, LOG):
-            with contextlib.suppress(OSError):
-                _beside(order.out, suffix).unlink(missing_ok=True)
+    """Remove a run that was not finished, and what was written down of it.
+
+    Raises:
+        ProgdfError: it cannot be removed, and is whole.
+    """
+    if order.gdf.exists():
+        return
+    run = order.out / "state" / "run.json"
+    if order.out.is_symlink() or run.parent.is_symlink():
+        raise ProgdfError(f"{order.out} is behind a link, which is not followed; remove the link")
+    try:
+        run.unlink(missing_ok=True)  # first: a rest without it is no run
+    except OSError as error:
+        reason = error.strerror or error
+        raise ProgdfError(f"{order.out} cannot be removed ({reason}); check its permissions") from error
+    shutil.rmtree(order.out, ignore_errors=True)
+    for suffix in (ORDER, LOG):
+        with contextlib.suppress(OSError):
+            _beside(order.out, suffix).unlink(missing_ok=True)
 
 
 def read_progress(order: EditOrder, before: Progress) -> Progress:
     """How far the run says that it is."""
     try:
-        said = msgspec.json.decode((order.out / "state" / "progress.json").read_bytes(), type=_Said)
-    except (OSError, msgspec.MsgspecError):
+        said = read_json(order.out / "state" / "progress.json", _Said)
+    except ProgdfError:
         return before
-    return progress_of(said.doing, said.done, said.total, said.note, before)
+    return progress_of(said.doing, said.done, said.total, said.note, before, said.seconds)
 
 
 def newest_recording(order: EditOrder) -> Path | None:

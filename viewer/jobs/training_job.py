@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-Status = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
+Status = Literal["queued", "running", "stopping", "stopped", "elsewhere", "failed", "done"]
 
 PHASES = (
     ("edit", 0.08, 0.38),
@@ -82,11 +82,13 @@ class Progress:
         share: of its whole time, 0..1, by what its part usually takes
         doing: in the words of the trainer
         loss: of the training, "" while there is none
+        seconds: that were spent on it, in all its sessions
     """
 
     share: float = 0.0
     doing: str = ""
     loss: str = ""
+    seconds: float = 0.0
 
     @property
     def said(self) -> str:
@@ -101,12 +103,13 @@ class TrainingJob:
     Args:
         number: what it is called by
         order: what is trained
-        status: where it stands
+        status: where it stands; "elsewhere" is in another window or process
         progress: how far it is
         seconds: that it has run, in this session of it
         error: the one line of a failure
         resumes: whether it goes on with what was stopped
         began_at: share that was done when this session of it began
+        starved: other programs keep the processor
     """
 
     number: int
@@ -117,6 +120,7 @@ class TrainingJob:
     error: str = ""
     resumes: bool = False
     began_at: float = 0.0
+    starved: bool = False
 
     @property
     def seconds_left(self) -> float | None:
@@ -127,12 +131,15 @@ class TrainingJob:
         return self.seconds * (1.0 - self.progress.share) / done
 
 
-def progress_of(doing: str, done: int, total: int, note: str, before: Progress) -> Progress:
+def progress_of(
+    doing: str, done: int, total: int, note: str, before: Progress, seconds: float = 0.0
+) -> Progress:
     """Progress by what the trainer says; the share never goes back."""
     low, high = next(((low, high) for name, low, high in PHASES if name == doing), (before.share,) * 2)
     share = low + (high - low) * min(max(done / max(total, 1), 0.0), 1.0)
     loss = re.search(r"loss\D*([\d.]+)", note)
-    return Progress(max(share, before.share), doing, loss[1].rstrip(".") if loss else before.loss)
+    spent = max(seconds, before.seconds)  # a run that goes on begins at 0 again, until it has its state
+    return Progress(max(share, before.share), doing, loss[1].rstrip(".") if loss else before.loss, spent)
 
 
 def duration(seconds: float) -> str:

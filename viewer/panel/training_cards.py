@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
 from viewer.jobs.delivery import Delivery
 from viewer.jobs.training_job import TrainingJob, duration
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import card, elide, right_edge, small, small_toggle, tip
+from viewer.ui.widgets import card, elide, menu, right_edge, small, small_toggle, tip
 
 BAR_PX = 5.0
+_MENU = "menu of a training"
 
 
 def draw(jobs: Sequence[TrainingJob], ui: UiContext) -> list[str]:
@@ -53,7 +54,7 @@ def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
 
 @dataclass(frozen=True)
 class _Row:
-    """A card: its name and tip, the word at the right, the bar, the line below and its buttons."""
+    """A card: its name and tip, the word at the right, the bar, the line below, its buttons and its menu."""
 
     name: str
     tip: str
@@ -63,14 +64,17 @@ class _Row:
     failed: bool
     runs: bool
     buttons: tuple[tuple[str, str, str], ...]
+    menu: tuple[tuple[str, str, bool], ...] = ()
 
 
 def _job_row(job: TrainingJob) -> _Row:
     order, failed = job.order, job.status == "failed"
     about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
     said = job.error if failed else _said(job)
-    runs = job.status == "running"
-    return _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
+    runs = job.status == "running" and not job.starved
+    items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
+    row = _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
+    return row if job.status == "queued" else replace(row, menu=items)
 
 
 def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
@@ -83,7 +87,8 @@ def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
         imgui.same_line(right - wide)
         imgui.text_colored(imgui.ImVec4(*(PALETTE.error if row.failed else PALETTE.dim)), row.word)
         _bar(row, ui)
-        return [f"{action}:{number}" for action in _foot(row, right, ui)]
+        actions = _foot(row, right, ui) + _menu(row, ui)
+        return [f"{action}:{number}" for action in actions]
 
 
 def _status(job: TrainingJob) -> str:
@@ -96,6 +101,8 @@ def _status(job: TrainingJob) -> str:
             return "Stopping"
         case "stopped":
             return "Stopped"
+        case "elsewhere":
+            return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
         case "failed":
             return "Failed"
     return ""
@@ -117,7 +124,9 @@ def _bar(row: _Row, ui: UiContext) -> None:
 def _foot(row: _Row, right: float, ui: UiContext) -> list[str]:
     """What it does, or why it failed; at the right its buttons."""
     imgui.push_font(None, SMALL_PX)
-    widths = [imgui.calc_text_size(text).x + 12.0 * ui.scale for text, _, _ in row.buttons]
+    more = (Icon.MENU, _MENU, "Log, discard (right-click)")
+    buttons = (*row.buttons, more) if row.menu else row.buttons
+    widths = [imgui.calc_text_size(text).x + 12.0 * ui.scale for text, _, _ in buttons]
     imgui.pop_font()
     if row.failed:
         imgui.push_text_wrap_pos(0.0)
@@ -129,19 +138,37 @@ def _foot(row: _Row, right: float, ui: UiContext) -> list[str]:
         tip(row.said)
     actions: list[str] = []
     x = right - sum(widths)
-    for (text, action, help_), wide in zip(row.buttons, widths, strict=True):
+    for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)
         if small_toggle(action, text, False, wide, ui):
-            actions.append(action)
+            if action == _MENU:
+                imgui.open_popup(_MENU)
+            else:
+                actions.append(action)
         if help_:
             tip(help_)
         x += wide
     return actions
 
 
+def _menu(row: _Row, ui: UiContext) -> list[str]:
+    """What is seldom wanted, and what cannot be undone."""
+    actions = []
+    right = imgui.is_mouse_clicked(imgui.MouseButton_.right.value)
+    if row.menu and right and imgui.is_window_hovered():
+        imgui.open_popup(_MENU)
+    with menu(_MENU, ui) as is_open:
+        for name, action, can in row.menu if is_open else ():
+            if imgui.menu_item(name, "", False, can)[0]:
+                actions.append(action)
+    return actions
+
+
 def _said(job: TrainingJob) -> str:
     progress = job.progress
     match job.status:
+        case "running" if job.starved:
+            return "Waits for the processor, which other programs use"
         case "running":
             left = job.seconds_left
             finding = not progress.doing and job.order.region == "changed"
@@ -153,20 +180,20 @@ def _said(job: TrainingJob) -> str:
             return "Waits for the one before"
         case "stopping":
             return "Saving what is done"
+        case "elsewhere":
+            return "Trains in another window"
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
 
 
 def _buttons(job: TrainingJob) -> tuple[tuple[str, str, str], ...]:
     """Text, action and help."""
-    log = ("Log", "run_log", "What the trainer said")
-    discard = (Icon.DELETE, "discard_run", "Discard: removes what was trained so far")
     match job.status:
         case "running":
-            return log, ("Stop", "stop_run", "Stop; it can be resumed, also another day")
+            return (("Stop", "stop_run", "Stop; it can be resumed, also another day"),)
         case "queued":
             return (("Cancel", "stop_run", "Take it off the queue"),)
-        case "stopping":
-            return (log,)
         case "stopped":
-            return log, ("Resume", "resume_run", "Go on where it was stopped"), discard
-    return log, ("Retry", "resume_run", "Try again"), discard
+            return (("Resume", "resume_run", "Go on where it was stopped"),)
+        case "failed":
+            return (("Retry", "resume_run", "Try again"),)
+    return ()

@@ -33,7 +33,7 @@ UNSAVED = "• "
 REQUESTS = (
     *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
-    *("train", "stop_run", "resume_run", "discard_run", "run_log", "stop_and_quit"),
+    *("train", "stop_run", "resume_run", "ask_discard", "discard_run", "run_log", "stop_and_quit"),
     *("export", "render_picture", "render_film", "deliver", "stop_delivery", "drop_and_quit"),
     *("about", "demo"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -18,7 +19,7 @@ from viewer.app.application import Application, failure_line
 from viewer.files.document import Document
 from viewer.jobs import run_files
 from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED, NewEdit
-from viewer.jobs.training_job import EditOrder, TrainingJob
+from viewer.jobs.training_job import EditOrder, TrainingJob, duration
 from viewer.jobs.training_queue import TrainingQueue, spare_threads
 from viewer.state.selection import NOBODY, SUFFIX, add_region, free_name, unpack
 from viewer.state.view_state import LayerState
@@ -70,9 +71,11 @@ class TrainingActions:
             case "stop_run":
                 self.queue.stop(int(argument))
             case "resume_run":
-                self.queue.resume(int(argument))
+                self._try(lambda: self.queue.resume(int(argument)))
+            case "ask_discard":
+                self._ask_discard(int(argument))
             case "discard_run":
-                self.queue.discard(int(argument))
+                self._try(lambda: self.queue.discard(int(argument)))
             case "run_log":
                 self._show_log(int(argument))
             case "quit" if self.queue.busy and not self._leaves:
@@ -154,6 +157,20 @@ class TrainingActions:
             temporary_file.write_bytes(stored.getvalue())
         return f"file:{path}"
 
+    def _try(self, act: Callable[[], None]) -> None:
+        """Do it, or say why it cannot be done."""
+        if error := failure_line(act):
+            self._app.main_view.show_message(error, error=True)
+
+    def _ask_discard(self, number: int) -> None:
+        """What was trained cannot be brought back: ask. What has not begun is no loss."""
+        job = self.queue.job(number)
+        if job is not None and run_files.is_begun(job.order.out):
+            spent = run_files.read_progress(job.order, job.progress).seconds
+            self._app.main_view.ask(Dialog("discard_run", duration(spent), str(number)))
+        else:
+            self._try(lambda: self.queue.discard(number))
+
     def _ended(self, job: TrainingJob) -> None:
         """A run is over: its edit comes on top, or its card says why not."""
         comes = job.status == "done" and self._scene == job.order.scene
@@ -162,6 +179,8 @@ class TrainingActions:
         main_view = self._app.main_view
         if job.status == "failed":
             main_view.show_message(f"{job.order.name} was not trained: {job.error}", error=True)
+        if job.status == "elsewhere" and job.order.gdf.is_file():
+            main_view.show_message(f"{job.order.name} was trained in another window: {job.order.gdf}")
         if job.status != "done":
             return
         self.queue.dismiss(job.number)
