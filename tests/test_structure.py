@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -183,6 +184,59 @@ def test_the_tests_of_imports_see_cycles_and_upward_imports() -> None:
     }
     assert set(import_cycle(import_graph(files))) == {"progdf.a.one", "progdf.b.two"}
     assert upward_imports("progdf", ["b", "a", "c"], files) == ["progdf.b.two imports progdf.a.one"]
+
+
+def unsafe_starts(source: str, where: str) -> list[str]:
+    """Where `source` starts Python so that modules of the current folder are run, as `where:line`."""
+    tree = parse(source)
+    safe = {
+        word
+        for words in ast.walk(tree)
+        if isinstance(words, ast.List)
+        for word, option in pairwise(words.elts)
+        if isinstance(option, ast.Constant) and option.value in ("-P", "-I")
+    }
+    found = []
+    for node in ast.walk(tree):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        starts = any(name.split(".")[0] in ("multiprocessing", "runpy") for name in names)
+        starts |= "ProcessPoolExecutor" in names or "executable" in names
+        if isinstance(node, ast.Attribute):
+            starts = node.attr == "executable" and node not in safe
+            starts |= node.attr.startswith(("exec", "spawn", "posix_spawn")) and is_os(node.value)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            starts = Path(node.value).name in ("python", "python3", "python.exe", "progdf.exe")
+        if starts:
+            found.append(f"{where}:{node.lineno}")  # type: ignore[attr-defined]
+    return found
+
+
+def is_os(node: ast.AST) -> bool:
+    return isinstance(node, ast.Name) and node.id == "os"
+
+
+def test_every_python_that_is_started_runs_no_code_of_the_current_folder(sources: dict[Path, str]) -> None:
+    unsafe = [where for path, source in sources.items() for where in unsafe_starts(source, path.as_posix())]
+    assert not unsafe, f"give -P: {unsafe}"
+    assert sum("sys.executable" in source for source in sources.values()) >= 5, "and these were looked at"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        'run([sys.executable, "-m", "progdf"])',
+        'words = [sys.executable, *options, "-P"]',
+        "run(command, executable=sys.executable)",
+        "from sys import executable",
+        "import multiprocessing.pool",
+        'os.execv(path, ["-P"])',
+        'run(["python3", "-P"])',
+    ],
+)
+def test_the_test_of_what_is_started_sees_each_way(code: str) -> None:
+    assert unsafe_starts(code, "x.py") == ["x.py:1"]
+    assert unsafe_starts('run([sys.executable, "-P", "-m", "progdf"])', "x.py") == []
 
 
 def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str]) -> None:

@@ -169,9 +169,13 @@ def main(argv: Sequence[str]) -> int:
         flush=True,
     )
     if options.window and _has_display():
-        # another process, as the trainer and the viewer share nothing but files
-        return subprocess.run([sys.executable, "-P", "-m", "progdf", *command], check=False).returncode
+        return _open_window(command)
     return 0
+
+
+def _open_window(command: Sequence[str]) -> int:
+    """Another process, as the trainer and the viewer share nothing but files; the exit status."""
+    return subprocess.run([sys.executable, "-P", "-m", "progdf", *command], check=False).returncode
 
 
 def _check(options: DemoOptions) -> None:

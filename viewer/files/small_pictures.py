@@ -12,6 +12,7 @@ from PIL import Image
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
+from progdf.io.images import flatten_onto, open_picture
 from progdf.io.user_folders import state_folder
 
 SIZE = (336, 252)
@@ -33,11 +34,10 @@ def keep(path: Path, pixels: NDArray[np.uint8], folder: Path | None = None) -> N
 
 
 def load(path: Path, folder: Path | None = None) -> NDArray[np.uint8] | None:
-    """The picture of a file, None where there is none. [H,W,3]"""
+    """The picture of a file, None where there is none or it is damaged: `keep` makes it again. [H,W,3]"""
     try:
-        with Image.open(_place(path, folder)) as picture:
-            return np.asarray(picture.convert("RGB").resize(SIZE))
-    except (OSError, ValueError):
+        return np.asarray(flatten_onto(open_picture(_place(path, folder)), "white", SIZE))
+    except ProgdfError:
         return None
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
+import pytest
 import torch
 
+from progdf.errors import ProgdfError
 from progdf.region import Region
 from tests.helpers.ui_rig import bear
 from trainer.store.progress import RunLog
@@ -48,6 +52,73 @@ def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Pa
     assert [*asked.out.parent.iterdir()] == []
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        b'{"scene": "a.ply", "na',
+        b"\xff\xfe{}",
+        b"[" * 100_000,
+        b'{"a":' * 100_000,
+        b"1" * 5000,
+        b"null",
+        b'{"doing": 1, "done": 1e400, "total": "x"}',
+        b'{"doing": "edit", "done": 1, "total": 2, "seconds": -1}',
+        b'{"scene": "\\ud800", "doing": "\\ud800", "done": 1, "total": 2}',
+        b" " * (1 << 21),
+        None,
+    ],
+    ids=lambda content: "a folder" if content is None else ascii(content[:20]),
+)
+def test_a_damaged_file_of_a_run_is_passed_over(tmp_path: Path, damaged: bytes | None) -> None:
+    asked, good = order(tmp_path), order(tmp_path, "gold")
+    for kept in (asked, good):
+        run_files.keep_order(kept)
+        (kept.out / "state").mkdir(parents=True)
+        (kept.out / "state" / "run.json").write_text("{}")
+    told = asked.out.with_name("blue.train.json"), asked.out / "state" / "progress.json"
+    told[0].unlink()
+    for path in told:
+        if damaged is None:
+            path.mkdir()
+        else:
+            path.write_bytes(damaged)
+    assert [*run_files.stopped_orders(asked.out.parent, asked.scene)] == [good]
+    assert run_files.read_progress(asked, Progress(0.1)) == Progress(0.1)
+
+
+def test_a_run_whose_files_are_pipes_is_not_waited_for(tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    (asked.out / "state").mkdir(parents=True)
+    (asked.out / "state" / "run.json").write_text("{}")
+    for path in (asked.out.with_name("blue.train.json"), asked.out / "state" / "progress.json"):
+        os.mkfifo(path)
+    assert [*run_files.stopped_orders(asked.out.parent, asked.scene)] == []
+    assert run_files.read_progress(asked, Progress(0.1)) == Progress(0.1)
+
+
+def test_what_cannot_be_removed_is_whole_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = order(tmp_path)
+    run_files.keep_order(asked)
+    (asked.out / "state").mkdir(parents=True)
+    (asked.out / "state" / "run.json").write_text("{}")
+
+    def refuse(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(ProgdfError, match=r"cannot be removed \(Permission"):
+            run_files.discard(asked)
+    assert [*run_files.stopped_orders(asked.out.parent, asked.scene)] == [asked]
+    elsewhere = tmp_path / "elsewhere"
+    (asked.out / "state").rename(elsewhere)
+    (asked.out / "state").symlink_to(elsewhere)
+    with pytest.raises(ProgdfError, match="behind a link"):
+        run_files.discard(asked)
+    assert (elsewhere / "run.json").is_file()
+
+
 def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
     asked = order(tmp_path)
     asked.out.mkdir(parents=True)
@@ -66,7 +137,9 @@ def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_pa
     with log.steps("optimize", 10) as advance:
         advance(10, "loss to the edit 0.5")
     log.close()
-    assert run_files.read_progress(asked, Progress()).loss == "0.5"
+    told = run_files.read_progress(asked, Progress())
+    assert told.loss == "0.5"
+    assert told.seconds > 0.0, "for the question whether to discard it"
     members = torch.tensor([1, 5])
     region = Region("blue", members, torch.zeros(len(scene)).index_fill(0, members, 1.0))
     folder.state.save("region", {"members": region.members, "score": region.score}, {"name": "blue"})

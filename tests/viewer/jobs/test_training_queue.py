@@ -3,21 +3,81 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import load_gdf
+from progdf.io.locks import LOCK, LockedError, hold_lock
 from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
-from viewer.jobs import run_files
+from viewer.jobs import child, run_files, training_queue
 from viewer.jobs.training_job import EditOrder, TrainingJob
 from viewer.jobs.training_queue import LOOK_S, TrainingQueue
 
 PATIENCE_S = 600.0
 EARS = "sphere:0,1.9,0,0.6"
 """A small region, which trains in half of the time."""
+
+
+@pytest.fixture(autouse=True)
+def children_as_urgent_as_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine they take as long as all else does, not ten times that."""
+    monkeypatch.setattr(child, "NICE", 0)
+
+
+class Waiting:
+    """Stands for a child that trains until it is told to stop, and has saved something by then."""
+
+    had = waited = 0.0
+
+    def __init__(self, arguments: Sequence[str], log: Path) -> None:
+        self.status: int | None = None
+        out = Path(next(word for word in arguments if word.startswith("--out=")).removeprefix("--out="))
+        begin(out)
+
+    @property
+    def processor_s(self) -> tuple[float, float]:
+        return self.had, self.waited
+
+    def stop(self) -> None:
+        self.status = 130
+
+    def close(self) -> None:
+        self.status = 130
+
+
+def begin(out: Path) -> None:
+    """What a run that was stopped leaves."""
+    (out / "state").mkdir(parents=True, exist_ok=True)
+    (out / "state" / "run.json").touch()
+
+
+@pytest.fixture
+def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
+    """A run that was stopped; children do nothing, and each look is at all of it."""
+    monkeypatch.setattr(training_queue, "Child", Waiting)
+    monkeypatch.setattr(training_queue, "LOOK_S", 0.0)
+    asked = order(scene, "blue")
+    run_files.keep_order(asked)
+    begin(asked.out)
+    return asked
+
+
+def window(stopped: EditOrder) -> TrainingQueue:
+    """The queue of a window on its scene."""
+    queue = TrainingQueue()
+    queue.add_stopped(stopped)
+    return queue
+
+
+def status(queue: TrainingQueue) -> str:
+    (job,) = queue.jobs
+    return job.status
 
 
 @pytest.fixture
@@ -93,3 +153,117 @@ def test_closing_leaves_no_child_and_forgets_what_waits(scene: Path) -> None:
     assert not waiting.out.with_name("red.train.json").exists()
     found = run_files.stopped_orders(waiting.out.parent, scene)
     assert all(order.out != waiting.out for order in found), "it had not begun"
+
+
+def test_what_one_window_trains_another_shows_and_leaves_alone(stopped: EditOrder) -> None:
+    first = window(stopped)
+    first.resume(1)
+    assert status(first) == "queued", "it waits, and is the first window's already"
+    second = window(stopped)
+    assert status(second) == "elsewhere"
+    assert second.next_poll() is not None, "it looks what becomes of it"
+    for act in (second.resume, second.discard, second.stop):
+        act(1)
+    second.poll()
+    assert (status(second), second.busy) == ("elsewhere", False)
+    first.poll()
+    assert status(first) == "running"
+    first.stop(1)
+    first.poll()
+    second.poll()
+    assert (status(first), status(second)) == ("stopped", "stopped")
+    second.discard(1)
+    assert [*stopped.out.parent.iterdir()] == []
+    with pytest.raises(ProgdfError, match="blue is not there any more"):
+        first.resume(1)
+    assert first.jobs == ()
+
+
+def test_a_card_that_does_not_know_it_yet_says_that_another_window_trains(stopped: EditOrder) -> None:
+    first, second = window(stopped), window(stopped)
+    first.resume(1)
+    for act in (second.discard, second.resume):
+        with suppress(LockedError):
+            act(1)
+        assert status(second) == "elsewhere"
+        assert run_files.is_begun(stopped.out)
+    first.close()
+    second.poll()
+    assert status(second) == "stopped"
+
+
+def test_a_run_that_a_command_trains_is_left_alone(stopped: EditOrder) -> None:
+    queue = window(stopped)
+    with hold_lock(stopped.out / LOCK):
+        assert status(window(stopped)) == "elsewhere"
+        with pytest.raises(LockedError, match="blue trains in another window; stop it there first"):
+            queue.discard(1)
+    queue.poll()
+    assert status(queue) == "stopped"
+
+
+def test_two_windows_never_write_one_log(stopped: EditOrder, scene: Path) -> None:
+    first, second = TrainingQueue(), TrainingQueue()
+    asked = order(scene, "red")
+    first.add(asked)
+    with pytest.raises(LockedError):
+        second.add(asked)
+    assert second.jobs == ()
+    first.close()
+
+
+def test_what_another_window_has_finished_leaves_the_list(stopped: EditOrder) -> None:
+    queue = TrainingQueue()
+    with hold_lock(stopped.out / LOCK):
+        queue.add_stopped(stopped)
+        assert queue.poll() == []
+    (stopped.out / "state" / "run.json").unlink()
+    stopped.gdf.touch()
+    (told,) = queue.poll()
+    assert told.status == "elsewhere"
+    assert (queue.jobs, queue.next_poll()) == ((), None)
+
+
+def test_a_run_that_waits_to_go_on_is_kept_when_it_is_taken_off_the_queue(stopped: EditOrder) -> None:
+    queue = window(stopped)
+    queue.resume(1)
+    queue.stop(1)
+    assert status(queue) == "stopped"
+    assert run_files.is_begun(stopped.out)
+    queue.resume(1)
+    queue.close()
+    assert run_files.is_begun(stopped.out)
+    assert not run_files.is_held(stopped), "closing lets go of it"
+
+
+def test_a_run_without_a_processor_says_so(stopped: EditOrder, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    queue = window(stopped)
+    queue.resume(1)
+    queue.poll()
+    for had, waited, starved in (
+        (5.0, 1.0, False),  # it trains
+        (5.1, 6.9, True),  # ready all the time, and had a fiftieth
+        (5.2, 7.0, False),  # it waits for the disk
+        (6.7, 30.0, False),  # its threads wait for each other
+    ):
+        Waiting.had, Waiting.waited = had, waited
+        clock[0] += training_queue.STARVED_S
+        queue.poll()
+        assert queue.jobs[0].starved == starved
+    queue.close()
+
+
+def test_a_run_that_cannot_be_started_fails_in_one_line(
+    stopped: EditOrder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(arguments: Sequence[str], log: Path) -> None:
+        raise ValueError("embedded null byte")
+
+    monkeypatch.setattr(training_queue, "Child", refuse)
+    queue = window(stopped)
+    queue.resume(1)
+    (failed,) = queue.poll()
+    assert (failed.status, failed.error) == ("failed", "training cannot start: embedded null byte")
+    assert not run_files.is_held(stopped)

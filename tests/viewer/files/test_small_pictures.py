@@ -1,0 +1,37 @@
+"""Thumbnails of the start page: kept, read again, and damaged in every way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from viewer.files import small_pictures
+
+
+def test_a_damaged_thumbnail_is_none_and_is_made_again(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    width, height = small_pictures.SIZE
+    pixels = np.kron(
+        rng.integers(0, 256, (height // 12, width // 12, 3), np.uint8), np.ones((12, 12, 1), np.uint8)
+    )
+    scene = tmp_path / "bear.ply"
+    small_pictures.keep(scene, pixels, tmp_path)
+    (file,) = (tmp_path / "thumbnails").iterdir()
+    whole = file.read_bytes()
+    cut = [whole[:size] for size in (0, 1, 8, 20, 33, 40, len(whole) // 2, len(whole) - 1)]
+    flipped = []
+    for at in [*range(60), *rng.integers(60, len(whole), 200)]:
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        flipped.append(bytes(damaged))
+    for content in (*cut, *flipped, b"\xff" * 100):
+        file.write_bytes(content)
+        found = small_pictures.load(scene, tmp_path)
+        assert found is None or found.shape == (height, width, 3)
+    file.write_bytes(whole[: len(whole) // 2])
+    assert small_pictures.load(scene, tmp_path) is None
+    small_pictures.keep(scene, pixels, tmp_path)
+    found = small_pictures.load(scene, tmp_path)
+    assert found is not None
+    assert np.array_equal(found, pixels)

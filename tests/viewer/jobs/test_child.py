@@ -1,0 +1,123 @@
+"""Commands as child processes: what they run, at which priority, and how they are stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from trainer.pipeline import demo
+from viewer.jobs.child import NICE, Child
+
+MODULES = ("numpy", "threading", "torch", "signal", "json", "progdf", "trainer")
+"""Of a stranger's folder; a package `viewer` beside them."""
+WAITING = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # as `progdf view &` in a script has it
+import progdf.__main__, viewer.jobs.child
+progdf.__main__.main = lambda arguments: print("began", flush=True) or time.sleep(600)
+viewer.jobs.child.main()
+"""
+
+
+@pytest.fixture
+def child(tmp_path: Path) -> Iterator[Callable[..., Child]]:
+    """Starts children, and ends them."""
+    started: list[Child] = []
+
+    def start(*arguments: str, talks: bool = False) -> Child:
+        started.append(Child(arguments, tmp_path / "child.log", talks))
+        return started[-1]
+
+    yield start
+    for found in started:
+        found.kill()
+        found.close()
+
+
+@pytest.fixture
+def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder is a stranger's, whose modules say when they are run."""
+    folder = tmp_path / "downloaded"
+    (folder / "viewer" / "jobs").mkdir(parents=True)
+    code = f"import os\nos.close(os.open({str(tmp_path / 'ran')!r}, os.O_CREAT | os.O_WRONLY))\n"
+    modules = [folder / f"{name}.py" for name in MODULES]
+    inits = [folder / "viewer" / "__init__.py", folder / "viewer" / "jobs" / "__init__.py"]
+    for path in (*modules, *inits, folder / "viewer" / "jobs" / "child.py"):
+        path.write_text(code)
+    monkeypatch.chdir(folder)
+    return tmp_path / "ran"
+
+
+def test_a_child_runs_no_code_of_the_current_folder(child: Callable[..., Child], stranger: Path) -> None:
+    started = child("info", "no.ply")  # imports numpy and torch, and ends
+    assert started._process.wait() == 2
+    assert started.error().startswith("no.ply does not exist")
+    assert not stranger.exists()
+
+
+def test_the_demo_s_window_runs_no_code_of_the_current_folder(
+    stranger: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "PYTHONSAFEPATH"):
+        monkeypatch.delenv(name, raising=False)
+    assert demo._open_window(["view", "no.ply"]) == 2
+    assert not stranger.exists()
+
+
+def test_the_stranger_s_modules_would_run(stranger: Path) -> None:
+    subprocess.run([sys.executable, "-c", "import numpy"], check=False)
+    assert stranger.exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks for the scheduling policy")
+def test_a_child_is_nice_and_no_more(child: Callable[..., Child]) -> None:
+    started = child("preview", "no.ply")
+    mine = os.getpriority(os.PRIO_PROCESS, 0)
+    assert os.getpriority(os.PRIO_PROCESS, started.pid) == min(mine + NICE, 19)
+    assert os.sched_getscheduler(started.pid) == os.SCHED_OTHER, "SCHED_IDLE gets nothing on a busy machine"
+    talking = child("preview", "no.ply", talks=True)
+    assert os.getpriority(os.PRIO_PROCESS, talking.pid) == mine, "somebody waits for it"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
+def test_a_child_tells_how_long_it_ran_and_waited(child: Callable[..., Child]) -> None:
+    started = child("info", "no.ply")
+    before = started.processor_s
+    assert before is not None
+    while started.status is None:
+        after = started.processor_s
+        if after is not None and after[0] > before[0]:
+            break
+    else:
+        pytest.fail("it never ran")
+    started.close()
+    assert started.processor_s is None, "it has ended"
+
+
+def test_a_child_stops_though_the_window_was_started_with_interrupts_ignored() -> None:
+    words = [sys.executable, "-P", "-c", WAITING, "train"]
+    process = subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"began\n"
+    process.communicate(timeout=300)  # closes its input
+    assert process.returncode in (1, 130, -signal.SIGINT)
+
+
+def test_a_child_starts_and_is_killed_where_there_are_no_process_groups_and_priorities(
+    child: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("killpg", "setpriority", "getpriority", "nice", "sched_setscheduler"):
+        monkeypatch.delattr(os, name, raising=False)
+    started = child("preview", "no.ply", talks=True)
+    assert started.status is None
+    started.kill()
+    started.close()
+    assert started.status is not None
