@@ -168,7 +168,7 @@ def _said(job: TrainingJob) -> str:
     progress = job.progress
     match job.status:
         case "running" if job.starved:
-            return "Waits for the processor, which other programs use"
+            return "Waits for the processor"
         case "running":
             left = job.seconds_left
             finding = not progress.doing and job.order.region == "changed"

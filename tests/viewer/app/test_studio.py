@@ -16,7 +16,7 @@ from viewer.app import app as application
 from viewer.camera.view_camera import first_camera
 from viewer.files import small_pictures
 from viewer.files.document import empty
-from viewer.jobs import delivery, training_queue
+from viewer.jobs import delivery, run_files, training_queue
 from viewer.jobs.new_edit import SELECTION, TYPED
 from viewer.state import selection
 from viewer.state.view_state import ViewState
@@ -136,6 +136,48 @@ def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
     press(window, "Enter")
     request(window, f"discard_run:{job.number}")
     assert window.main_view.work.jobs == ()
+
+
+def test_a_training_is_discarded_only_after_a_question(window: application.App) -> None:
+    request(window, "train")
+    (job,) = window.main_view.work.jobs
+    state = job.order.out / "state"
+    state.mkdir(parents=True)
+    (state / "run.json").touch()
+    (state / "progress.json").write_text('{"doing": "optimize", "done": 1, "total": 2, "seconds": 2280}')
+    request(window, f"stop_run:{job.number}")
+    turn(window)
+    assert window.main_view.work.jobs[0].status == "stopped"
+    request(window, f"ask_discard:{job.number}")
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert (asked.kind, asked.text) == ("discard_run", "38 min")
+    press(window, "Enter")
+    assert window.main_view.work.dialog is None
+    assert state.is_dir(), "Enter keeps it"
+    request(window, f"ask_discard:{job.number}")
+    press(window, "D")
+    turn(window)
+    assert window.main_view.work.jobs == ()
+    assert not job.order.out.exists()
+
+
+def test_what_trains_in_another_window_stays_its_own(window: application.App) -> None:
+    request(window, "train")
+    (job,) = window.main_view.work.jobs
+    (job.order.out / "state").mkdir(parents=True)
+    (job.order.out / "state" / "run.json").touch()
+    request(window, f"stop_run:{job.number}")
+    turn(window)
+    with run_files.hold_run(job.order):
+        for asked in ("resume_run", "discard_run"):
+            request(window, f"{asked}:{job.number}")
+            told = window.main_view.work.message
+            if asked == "resume_run":
+                assert told is not None
+                assert told.text == "blue trains in another window; stop it there first"
+            assert window.main_view.work.jobs[0].status == "elsewhere"
+    assert (job.order.out / "state" / "run.json").is_file()
 
 
 def test_quitting_asks_while_a_training_runs(window: application.App) -> None:

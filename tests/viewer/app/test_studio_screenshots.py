@@ -23,6 +23,7 @@ from viewer.state.workspace import Dialog
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
+FOOT_Y = 146  # of the first card of a run
 pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 
 
@@ -71,7 +72,9 @@ def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
         running,
         TrainingJob(2, replace(order, name="gold")),
         TrainingJob(3, replace(order, name="night"), "stopped", Progress(0.6)),
-        TrainingJob(4, replace(order, name="nowhere"), "failed", error=line),
+        TrainingJob(4, replace(order, name="dusk"), "elsewhere", Progress(0.3)),
+        replace(running, number=5, order=replace(order, name="frost"), starved=True),
+        TrainingJob(6, replace(order, name="nowhere"), "failed", error=line),
     )
     film = Delivery(1, "Rendering film.mp4", Path("/scenes/film.mp4"), done=30, total=96, seconds=10.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
@@ -87,3 +90,25 @@ def test_the_question_about_a_film(screenshot: Compare) -> None:
         hand.main_view.ask(Dialog("render_film", "/scenes/bear_edited.mp4", options=options))
         hand.frame(4)
         screenshot("ui_film", hand.image()[:420, :720])
+
+
+def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
+    order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
+    running = TrainingJob(1, order, "running", Progress(0.45, "optimize", "0.0114"), 20.0)
+    with rig(first_view(bear(), 0.7), SMALLEST) as hand:
+
+        def asked(job: TrainingJob, x: float, y: float) -> tuple[str, ...]:
+            hand.main_view.work = replace(hand.main_view.work, jobs=(job,))
+            hand.settle()
+            hand.click(x, y)
+            return hand.main_view.take_requests()
+
+        stops = [
+            (x, y)
+            for x in range(SMALLEST[0] - 90, SMALLEST[0] - 10, 12)
+            for y in (FOOT_Y - 5, FOOT_Y + 3)
+            if asked(running, x, y) == ("stop_run:1",)
+        ]
+        assert len(stops) >= 4
+        found = {asked(replace(running, status="stopped"), x, y) for x, y in stops}
+        assert found == {("resume_run:1",)}

@@ -12,16 +12,20 @@ from viewer.files import small_pictures
 def test_a_damaged_thumbnail_is_none_and_is_made_again(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     width, height = small_pictures.SIZE
-    pixels = np.kron(
-        rng.integers(0, 256, (height // 12, width // 12, 3), np.uint8), np.ones((12, 12, 1), np.uint8)
-    )
+    pixels = rng.integers(0, 256, (height, width, 3), np.uint8)  # noise takes several chunks of the file
     scene = tmp_path / "bear.ply"
     small_pictures.keep(scene, pixels, tmp_path)
     (file,) = (tmp_path / "thumbnails").iterdir()
     whole = file.read_bytes()
     cut = [whole[:size] for size in (0, 1, 8, 20, 33, 40, len(whole) // 2, len(whole) - 1)]
     flipped = []
-    for at in [*range(60), *rng.integers(60, len(whole), 200)]:
+    chunks = [at for at in range(len(whole)) if whole.startswith((b"IDAT", b"IEND"), at)]
+    assert len(chunks) > 2
+    for at in [
+        *range(60),
+        *(at + i for at in chunks for i in range(-8, 4)),
+        *rng.integers(60, len(whole), 20),
+    ]:
         damaged = bytearray(whole)
         damaged[at] ^= 1 << int(rng.integers(8))
         flipped.append(bytes(damaged))

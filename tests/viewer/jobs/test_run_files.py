@@ -58,6 +58,8 @@ def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Pa
         b"",
         b'{"scene": "a.ply", "na',
         b"\xff\xfe{}",
+        b'{"doing": "\xff", "done": 1, "total": 2}',
+        b'{"scene": "\xff", "name": "", "region": "", "editor": "", "quick": true}',
         b"[" * 100_000,
         b'{"a":' * 100_000,
         b"1" * 5000,
