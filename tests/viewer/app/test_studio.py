@@ -178,6 +178,13 @@ def test_what_trains_in_another_window_stays_its_own(window: application.App) ->
                 assert told.text == "blue trains in another window; stop it there first"
             assert window.main_view.work.jobs[0].status == "elsewhere"
     assert (job.order.out / "state" / "run.json").is_file()
+    (job.order.out / "state" / "run.json").unlink()
+    job.order.gdf.touch()
+    window.training.queue._look_at = 0.0
+    turn(window)
+    assert (window.main_view.work.jobs, window.main_view.work.view.layers) == ((), ())
+    assert window.main_view.work.message is not None
+    assert window.main_view.work.message.text.startswith("blue was trained in another window: ")
 
 
 def test_quitting_asks_while_a_training_runs(window: application.App) -> None:
