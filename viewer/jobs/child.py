@@ -26,6 +26,9 @@ NICE = 10
 """As by nice(1): a child gets a tenth of a core that the window, or another program, keeps busy. SCHED_IDLE
 would give it nothing, and a process without privileges cannot leave that again."""
 
+STARVED_S = 5.0
+"""Between two looks at whether a child gets the processor."""
+
 _TALKS = "--talks"
 
 
@@ -64,6 +67,7 @@ class Child:
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
         self.log = log
         self._asked_at: float | None = None
+        self._starved, self._seen = False, (time.monotonic(), 0.0, 0.0)
 
     @property
     def status(self) -> int | None:
@@ -89,6 +93,18 @@ class Child:
         except (OSError, ValueError, IndexError):  # not Linux, or a thread that ends just now
             return None
         return 1e-9 * ran, 1e-9 * waited
+
+    @property
+    def starved(self) -> bool:
+        """Whether other programs keep the processor from it: ready for half of the last seconds, it had less
+        than a tenth of a core. False where that is unknown."""
+        times, now, (since, had, waited) = self.processor_s, time.monotonic(), self._seen
+        if times is None:
+            return False
+        if (span := now - since) >= STARVED_S:
+            self._seen = now, *times
+            self._starved = times[0] - had < 0.1 * span and times[1] - waited > 0.5 * span
+        return self._starved
 
     @property
     def output(self) -> IO[bytes]:
@@ -161,7 +177,10 @@ def _watch_parent() -> None:
     with contextlib.suppress(OSError):
         while os.read(0, 4096):
             pass
-    _thread.interrupt_main()
+    if sys.platform != "win32":
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)  # wakes it where it waits
+    else:
+        _thread.interrupt_main()
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ class Delivery:
         note: what the command said last
         seconds: that it has run, whole ones
         error: the one line of a failure
+        starved: other programs keep the processor
     """
 
     number: int
@@ -69,6 +70,7 @@ class Delivery:
     note: str = ""
     seconds: int = 0
     error: str = ""
+    starved: bool = False
 
     @property
     def seconds_left(self) -> float | None:
@@ -127,7 +129,8 @@ class Deliveries:
                     note = last_line(child.log)
                     found = re.search(r"frame (\d+)/(\d+)", note)
                     done, total = (int(found[1]), int(found[2])) if found else (0, 0)
-                    self._change(replace(delivery, done=done, total=total, note=note, seconds=seconds))
+                    seen = replace(delivery, done=done, total=total, note=note, seconds=seconds)
+                    self._change(replace(seen, starved=child.starved))
                 continue
             self._children.pop(delivery.number).close()
             if status and delivery.status != "stopping":

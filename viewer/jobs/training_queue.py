@@ -21,9 +21,6 @@ POLL_S = 0.4
 LOOK_S = 1.0
 """Between two at how far it is: the window draws its card at each."""
 
-STARVED_S, HAD, WAITED = 5.0, 0.1, 0.5
-"""A run that was ready for half of so many seconds, and had less than a tenth of a core, is starved."""
-
 
 class TrainingQueue:
     """Trains what is asked for, in turn. `close` it: what runs then is stopped and can be resumed."""
@@ -34,7 +31,6 @@ class TrainingQueue:
         self._child: Child | None = None
         self._running = 0  # the number of the job that the child is
         self._began = self._look_at = 0.0
-        self._processor = 0.0, 0.0, 0.0  # at that time, what the child had had and had waited for
         self._held: dict[int, ExitStack] = {}  # jobs that no other window may touch
 
     @property
@@ -134,7 +130,7 @@ class TrainingQueue:
                 progress = run_files.read_progress(job.order, job.progress)
                 if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
                     self._began = now
-                starved = self._is_starved(job, now)
+                starved = self._child.starved
                 self._change(replace(job, progress=progress, seconds=now - self._began, starved=starved))
         if self._child is None:
             waiting = next((job for job in self.jobs if job.status == "queued"), None)
@@ -172,15 +168,6 @@ class TrainingQueue:
             return [job]
         return []
 
-    def _is_starved(self, job: TrainingJob, now: float) -> bool:
-        """Whether the child waits for a processor that other programs have; as before, between two looks."""
-        assert self._child is not None
-        times, (since, had, waited) = self._child.processor_s, self._processor
-        if times is None or now - since < STARVED_S:
-            return job.starved and times is not None
-        self._processor = now, *times
-        return times[0] - had < HAD * (now - since) and times[1] - waited > WAITED * (now - since)
-
     def _start(self, job: TrainingJob) -> TrainingJob | None:
         """Start a run; what became of it where that cannot be."""
         self._running, self._began = job.number, time.monotonic()
@@ -190,7 +177,6 @@ class TrainingQueue:
             self._release(job)
             line = f"training cannot start: {getattr(error, 'strerror', None) or error}"
             return self._change(replace(job, status="failed", error=line))
-        self._processor = self._began, 0.0, 0.0
         progress = job.progress if job.resumes else Progress()
         self._change(replace(job, status="running", progress=progress, began_at=progress.share, seconds=0.0))
         return None

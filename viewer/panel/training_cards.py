@@ -13,6 +13,7 @@ from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import card, elide, menu, right_edge, small, small_toggle, tip
 
 BAR_PX = 5.0
+STARVED = "Waits for the processor"
 _MENU = "menu of a training"
 
 
@@ -39,6 +40,7 @@ def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
             else [delivery.note or "Starting"]
         )
         said += [f"{duration(left)} left"] if left is not None else []
+        said = [STARVED] if delivery.starved else said
         failed = delivery.status == "failed"
         line = (
             delivery.error if failed else "Stopping" if delivery.status == "stopping" else "  ·  ".join(said)
@@ -168,7 +170,7 @@ def _said(job: TrainingJob) -> str:
     progress = job.progress
     match job.status:
         case "running" if job.starved:
-            return "Waits for the processor"
+            return STARVED
         case "running":
             left = job.seconds_left
             finding = not progress.doing and job.order.region == "changed"

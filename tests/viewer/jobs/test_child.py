@@ -6,13 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from trainer.pipeline import demo
-from viewer.jobs.child import NICE, Child
+from viewer.jobs.child import NICE, STARVED_S, Child
 
 MODULES = ("numpy", "threading", "torch", "signal", "json", "progdf", "trainer")
 """Of a stranger's folder; a package `viewer` beside them."""
@@ -100,6 +101,27 @@ def test_a_child_tells_how_long_it_ran_and_waited(child: Callable[..., Child]) -
     assert started.processor_s is None, "it has ended"
 
 
+def test_a_child_is_starved_that_is_ready_and_gets_next_to_nothing(
+    child: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    times: list[tuple[float, float] | None] = [(0.0, 0.0)]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(Child, "processor_s", property(lambda _: times[0]))
+    started = child("--version")
+    assert not started.starved
+    for now, starved in (
+        ((5.0, 1.0), False),  # it works
+        ((5.1, 5.9), True),  # ready all the time, it had a fiftieth
+        ((5.2, 6.0), False),  # it waits for the disk
+        ((6.7, 30.0), False),  # its threads wait for each other
+        (None, False),  # a system that does not tell
+    ):
+        clock[0] += STARVED_S
+        times[0] = now
+        assert started.starved == starved
+
+
 def test_a_child_stops_though_the_window_was_started_with_interrupts_ignored() -> None:
     words = [sys.executable, "-P", "-c", WAITING, "train"]
     process = subprocess.Popen(
@@ -107,7 +129,7 @@ def test_a_child_stops_though_the_window_was_started_with_interrupts_ignored() -
     )
     assert process.stdout is not None
     assert process.stdout.readline() == b"began\n"
-    process.communicate(timeout=300)  # closes its input
+    process.communicate()  # closes its input
     assert process.returncode in (1, 130, -signal.SIGINT)
 
 

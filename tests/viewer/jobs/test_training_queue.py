@@ -33,16 +33,12 @@ def children_as_urgent_as_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 class Waiting:
     """Stands for a child that trains until it is told to stop, and has saved something by then."""
 
-    had = waited = 0.0
+    starved = False
 
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self.status: int | None = None
         out = Path(next(word for word in arguments if word.startswith("--out=")).removeprefix("--out="))
         begin(out)
-
-    @property
-    def processor_s(self) -> tuple[float, float]:
-        return self.had, self.waited
 
     def stop(self) -> None:
         self.status = 130
@@ -237,22 +233,16 @@ def test_a_run_that_waits_to_go_on_is_kept_when_it_is_taken_off_the_queue(stoppe
 
 
 def test_a_run_without_a_processor_says_so(stopped: EditOrder, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     queue = window(stopped)
     queue.resume(1)
     queue.poll()
-    for had, waited, starved in (
-        (5.0, 1.0, False),  # it trains
-        (5.1, 6.9, True),  # ready all the time, and had a fiftieth
-        (5.2, 7.0, False),  # it waits for the disk
-        (6.7, 30.0, False),  # its threads wait for each other
-    ):
-        Waiting.had, Waiting.waited = had, waited
-        clock[0] += training_queue.STARVED_S
+    for starved in (True, False, True):
+        monkeypatch.setattr(Waiting, "starved", starved)
         queue.poll()
         assert queue.jobs[0].starved == starved
-    queue.close()
+    queue.stop(1)
+    queue.poll()
+    assert not queue.jobs[0].starved
 
 
 def test_a_run_that_cannot_be_started_fails_in_one_line(
