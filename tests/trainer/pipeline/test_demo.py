@@ -140,7 +140,7 @@ def test_with_a_display_the_window_opens_in_a_process_of_its_own(
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":99")
     assert demo.main(["--size", str(SIZE), "--out", str(tmp_path / "demo")]) == 3
-    assert commands[0][1:4] == ["-m", "progdf", "view"]
+    assert commands[0][1:5] == ["-P", "-m", "progdf", "view"]
     assert demo.main(["--size", str(SIZE), "--out", str(tmp_path / "other"), "--no-window"]) == 0
     assert len(commands) == 1
 
