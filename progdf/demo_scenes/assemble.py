@@ -87,7 +87,8 @@ def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     quotas = [max(1.0, size * wish / sum(wishes)) for wish in wishes]
     quotas = [quota * size / sum(quotas) for quota in quotas]
     counts = [math.floor(quota) for quota in quotas]
-    rest = sorted(range(len(parts)), key=lambda i: counts[i] - quotas[i])
+    # parts of the same size differ in the last bits of their quotas, by the processor: of these the later first
+    rest = sorted(range(len(parts)), key=lambda i: (round(counts[i] - quotas[i], 6), -i))
     for i in rest[: size - sum(counts)]:
         counts[i] += 1
     return counts, shown
