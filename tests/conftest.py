@@ -14,6 +14,7 @@ from filelock import FileLock
 from hypothesis import settings
 from PIL import Image
 
+from tests.helpers.goldens import SCREENSHOTS, difference
 from tests.helpers.kernels import run_all_kernels
 from tests.helpers.paths import SHARED_DATA
 
@@ -29,9 +30,6 @@ pytest.register_assert_rewrite(
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("search", derandomize=False, print_blob=True, deadline=None)
 settings.load_profile("same")
-
-SCREENSHOTS = Path(__file__).parent / "screenshots"
-LEVELS = 2  # of 255: the last bits of a software GPU differ between processors
 
 Compare = Callable[[str, np.ndarray], None]
 
@@ -101,16 +99,9 @@ def screenshot(request: pytest.FixtureRequest) -> Compare:
                 f"there is no golden {golden.name}; make it with --regenerate-screenshots, and look at it"
             )
         expected = np.asarray(Image.open(golden).convert("RGB"))
-        if expected.shape != found.shape:
+        if wrong := difference(expected, found):
             _write_difference(name, expected, found)
-            pytest.fail(f"{name}: the picture is {found.shape}, its golden {expected.shape}")
-        difference = np.abs(expected.astype(int) - found.astype(int)).max(axis=-1)
-        if difference.max(initial=0) > LEVELS:
-            _write_difference(name, expected, found)
-            pytest.fail(
-                f"{name}: {int((difference > LEVELS).sum())} pixels differ by more than {LEVELS}/255 "
-                f"(largest {int(difference.max())}); see screenshots/diff/{name}.png"
-            )
+            pytest.fail(f"{name}: {wrong}; see screenshots/diff/{name}.png")
 
     return compare
 

@@ -87,7 +87,7 @@ def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     quotas = [max(1.0, size * wish / sum(wishes)) for wish in wishes]
     quotas = [quota * size / sum(quotas) for quota in quotas]
     counts = [math.floor(quota) for quota in quotas]
-    # parts of the same size differ in the last bits of their quotas, by the processor: of these the later first
+    # quotas of equal parts differ in their last bits, by the processor: of these parts the later first
     rest = sorted(range(len(parts)), key=lambda i: (round(counts[i] - quotas[i], 6), -i))
     for i in rest[: size - sum(counts)]:
         counts[i] += 1

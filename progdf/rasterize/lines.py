@@ -44,11 +44,16 @@ def _draw(lines: Array, clear: float, image: Array, through: Array, places: Arra
         dx, dy = lines[i, 2] - x0, lines[i, 3] - y0
         first, last = _cut(x0, dx, width, 0.0, 1.0)
         first, last = _cut(y0, dy, height, first, last)
-        steps = int(np.ceil(max(abs(dx), abs(dy)) * max(last - first, 0.0)))
         near, far = 1.0 / lines[i, 4], 1.0 / lines[i, 5]
         steep = abs(dy) > abs(dx)
-        for step in range(min(steps, max(width, height) + 1)):
-            at = first + (step + 0.5) / steps * (last - first)
+        start, way, extent = (y0, dy, height) if steep else (x0, dx, width)
+        if way == 0.0 or not first < last:
+            continue
+        # pixel by pixel: the last bit would decide over the number of steps of about a pixel
+        ends = start + first * way, start + last * way
+        begin = int(max(np.ceil(min(ends[0], ends[1]) - 0.5), 0.0))
+        for pixel in range(begin, int(min(np.ceil(max(ends[0], ends[1]) - 0.5), extent))):
+            at = (pixel + 0.5 - start) / way
             along = (
                 at * far / ((1.0 - at) * near + at * far)
             )  # in the world, where it is not as in the picture
@@ -57,11 +62,10 @@ def _draw(lines: Array, clear: float, image: Array, through: Array, places: Arra
             left = lines[i, 13] * min((1.0 - np.sqrt(u * u + v * v)) / (1.0 - clear), 1.0)
             if not left > 0.0:
                 continue
-            x, y = x0 + at * dx, y0 + at * dy
-            beside = (x if steep else y) - 0.5
+            beside = (x0 + at * dx if steep else y0 + at * dy) - 0.5
             low = int(np.floor(beside))
             for side in range(2):
-                column, row = (low + side, int(y)) if steep else (int(x), low + side)
+                column, row = (low + side, pixel) if steep else (pixel, low + side)
                 if column < 0 or column >= width or row < 0 or row >= height:
                     continue
                 share = left * (beside - low if side == 1 else 1.0 - beside + low) * through[row, column]

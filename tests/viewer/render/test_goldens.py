@@ -7,7 +7,9 @@ from collections.abc import Callable
 import moderngl
 import numpy as np
 import pytest
+from PIL import Image
 
+from tests.helpers.goldens import LEVELS, SCREENSHOTS, difference
 from tests.helpers.stacks import Stack, view_of
 from viewer.render.engine import ViewEngine
 
@@ -42,3 +44,24 @@ def test_a_wrong_golden_is_noticed(
         return
     with pytest.raises(pytest.fail.Exception, match="100 pixels differ by more than 2/255"):
         screenshot("scene_wrong", gl_engine.image(view_of(stack, 1.0, 1.0), (240, 180)))
+
+
+@pytest.mark.parametrize("name", ["scene_bear_0.5", "ui_main", "ui_training"])
+def test_a_golden_lets_pass_what_processors_round_otherwise_and_nothing_that_one_sees(name: str) -> None:
+    golden = np.asarray(Image.open(SCREENSHOTS / f"{name}.png").convert("RGB"))
+    rng = np.random.default_rng(0)
+    steps = (rng.random(golden.shape[:2]) < 1e-3)[..., None] * rng.integers(-LEVELS, LEVELS + 1, golden.shape)
+    assert not difference(golden, (golden + steps).clip(0, 255).astype(np.uint8))
+    for axis in (0, 1):
+        assert "pixels differ by more than 2/255" in difference(golden, np.roll(golden, 1, axis)), "shifted"
+    brighter = golden + (golden < 255).astype(np.uint8)
+    assert "pixels differ by more than 0/255" in difference(golden, brighter), "by one step"
+
+
+def test_a_missing_widget_is_noticed_however_small_it_is() -> None:
+    golden = np.asarray(Image.open(SCREENSHOTS / "ui_main.png").convert("RGB"))
+    detail = np.abs(np.diff(golden.astype(int), axis=0)).max(axis=-1) > LEVELS
+    for y, x in np.random.default_rng(0).choice(np.argwhere(detail), 20):
+        bare = golden.copy()
+        bare[y + 1, x] = bare[y, x]  # a dot of one pixel goes
+        assert difference(golden, bare).startswith("1 pixels differ")
