@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +35,15 @@ settings.load_profile("same")
 Compare = Callable[[str, np.ndarray], None]
 
 
+def pytest_configure() -> None:
+    """What nohup, a script's `&` or a supervisor had ignored goes on being ignored here, but not in children:
+    these inherit what is ignored, and start anew what is handled."""
+    for name in ("SIGINT", "SIGHUP", "SIGTERM", "SIGQUIT"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--regenerate-screenshots",
@@ -52,6 +62,16 @@ def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
         if not (shared / "kernels.ready").exists():
             run_all_kernels()
             (shared / "kernels.ready").touch()
+
+
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """SIGINT and SIGHUP end this process as they end one that is started from a terminal."""
+    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    earlier = {number: signal.signal(number, handler) for number, handler in defaults.items()}
+    yield
+    for number, handler in earlier.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

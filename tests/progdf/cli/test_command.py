@@ -15,6 +15,7 @@ import progdf
 from progdf.__main__ import COMMANDS, main
 from progdf.formats.ply import save_ply
 from progdf.io.atomic import atomic_write
+from tests.helpers.paths import ROOT
 from tests.helpers.scenes import random_gaussians
 
 
@@ -194,6 +195,7 @@ def test_too_little_memory_is_one_line(
     assert "out of memory; " in stderr_of(capsys, "check", "scene.ply")
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
 def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
     number: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -217,6 +219,20 @@ def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch)
         assert main(["check", "scene.ply"]) == 0
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_child_of_a_test_heeds_signals() -> None:
+    code = "import signal as s; print([s.getsignal(n) for n in (s.SIGINT, s.SIGHUP, s.SIGTERM)])"
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "SIG_IGN" not in child.stdout
+
+
+def test_tests_pass_where_signals_arrive_ignored() -> None:
+    command = [sys.executable, "-m", "pytest", "-n", "0", __file__, "-k", "SIGHUP or child_of_a_test"]
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    shell = ["sh", "-c", "trap '' INT HUP; exec \"$@\"", "sh"]
+    ran = subprocess.run([*shell, *command], cwd=ROOT, env=env, capture_output=True, text=True)
+    assert "2 passed" in ran.stdout, ran.stdout
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,7 @@ def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
     assert "continuing at step 10 of 24" in gone_on(bear_folder, uninterrupted)
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_before_the_optimization_is_kept_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
