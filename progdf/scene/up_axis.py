@@ -57,7 +57,7 @@ class UpAxis:
         axis = int(self.direction.abs().argmax())
         if float(self.direction.abs()[axis]) > 0.99999:
             return ("-" if float(self.direction[axis]) < 0 else "+") + "xyz"[axis]
-        return " ".join(f"{float(x):.3g}" for x in self.direction)
+        return " ".join(f"{round(float(x), 3) + 0.0:g}" for x in self.direction)  # + 0.0: not -0
 
     def to_json(self) -> dict[str, object]:
         """As JSON values, for reports and .gdf files."""

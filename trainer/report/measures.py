@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -21,7 +20,7 @@ from trainer.optimize.losses import Perceptual
 from trainer.report.curves import ErrorCurve, against_editor, error_curves
 from trainer.views.view import View
 
-from .clip import CLIP_MODEL, Clip, Texts, direction, load_clip
+from .clip import CLIP_MODEL, Clip, Texts, direction, load_clip, same_features
 
 COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
@@ -144,7 +143,7 @@ def clip_curve(evaluator: Evaluator, views: Sequence[View], field: BakedField, t
     except ProgdfError as error:
         return Direction(reason=str(error))
     before, after = clip.texts([texts.before, texts.after])
-    if torch.equal(before, after):
+    if bool(same_features(before, after)):
         return Direction(reason="--text-before and --text-after say the same to CLIP")
     original = clip.pictures([view.image for view in views])
     course = [

@@ -16,9 +16,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 @pytest.mark.parametrize("crop", [(0, 0, 90, 61), (13, 7, 14, 8), (31, 8, 65, 40), (64, 33, 90, 61)])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_crop_is_the_slice_of_the_whole_picture_bit_for_bit(
-    engine: str, crop: tuple[int, int, int, int]
-) -> None:
+def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, int, int, int]) -> None:
     camera = orbit_camera(90, 61)
     camera = replace(camera, K=camera.K + torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, -5.0], [0.0, 0.0, 0.0]]))
     scene = concatenate(
@@ -26,8 +24,10 @@ def test_a_crop_is_the_slice_of_the_whole_picture_bit_for_bit(
     )
     whole, part = draw(scene, camera, engine), draw(scene, camera, engine, crop=crop)
     x0, y0, x1, y1 = crop
-    assert torch.equal(part.image, whole.image[y0:y1, x0:x1])
-    assert torch.equal(part.transmittance, whole.transmittance[y0:y1, x0:x1])
+    # bit for bit, but for the reference: BLAS may add 151 products in another order, each rounded by 1.1e-16
+    rounding = 2e-14 if engine == "reference" else 0.0
+    for found, expected in ((part.image, whole.image), (part.transmittance, whole.transmittance)):
+        torch.testing.assert_close(found, expected[y0:y1, x0:x1], atol=rounding, rtol=0.0)
 
 
 def test_the_order_of_the_list_does_not_matter_where_depths_differ() -> None:

@@ -52,6 +52,9 @@ def test_a_picture_or_a_text_that_does_not_change_has_no_direction() -> None:
     a, b = _unit(1.0, 2.0, 3.0), _unit(3.0, 1.0, 0.0)
     assert direction(a[None], a[None], a, b) == [None]
     assert direction(a[None], b[None], a, a) == [None]
+    rounded = a * (1.0 + 2e-7)
+    assert direction(a[None], rounded[None], a, b) == [None]
+    assert direction(a[None], b[None], a, rounded) == [None]
 
 
 def test_a_model_read_from_disk_gives_features_of_unit_length_that_tell_things_apart(saved: Path) -> None:
