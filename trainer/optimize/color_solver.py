@@ -22,6 +22,7 @@ from progdf.gaussians import attribute_slices, unpack
 from progdf.rasterize.color_maps import ColorMap, color_map
 from progdf.rasterize.cpu.parallel import threads
 from progdf.sh import basis
+from progdf.torch_threads import one_thread
 from trainer.views.crops import CropScene
 
 from .losses import l1
@@ -174,6 +175,7 @@ class Solver:
         held[:, 1:] = BANDS_HELD * self.weights[:, :1]
         return held
 
+    @one_thread()  # products of members are added in an order that depends on the number of threads
     def _predicted_bands(self, offsets: Tensor) -> Tensor:
         """DC as it is; the higher bands turned and stretched as DC is: the linear part of the affine map from
         old DC to new, fitted to all members by what they weigh. [M,B,3]"""
@@ -270,7 +272,7 @@ def color_columns(channels: int, bands: int) -> Tensor:
 
 
 def _map_threads(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
-    """`work` of every item, on as many threads as the rasterizer has; the result depends on none of them."""
+    """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
     if threads() == 1 or len(items) == 1:
         return [work(item) for item in items]
     with ThreadPoolExecutor(threads()) as pool:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, pack
-from progdf.rasterize import activate, render
+from progdf.rasterize import activate, render, set_threads
 from progdf.rasterize.color_maps import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
@@ -156,6 +156,23 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
     list(solve(original, solver, stages, again, lambda step, left: None))
     assert torch.equal(again.moved, whole.moved)
     assert again.step == whole.step == 10
+
+
+def test_one_thread_and_two_solve_to_the_same_bits(one_thread: None) -> None:
+    scene = dense_ball(40_000, bands=3)
+    cameras = orbit(2, 48)
+    crops, original = prepared(scene, cameras)
+    targets = render_all(crops, pack(replace(scene, sh0=-scene.sh0, shN=-scene.shN), with_shN=True))
+    ends = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        set_threads(threads)
+        solver, state = make_solver(crops, original, True), PgsState(original)
+        list(solve(original, solver, [TargetStage(1.0, targets, 3)], state, lambda step, left: None))
+        ends.append(state.moved.detach())
+    set_threads(None)
+    assert bool(ends[0].any())
+    assert torch.equal(*ends)
 
 
 def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
