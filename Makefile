@@ -10,7 +10,7 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -
 
 EXTRAS := styles,diffusion,segment,clip,colmap,video,formats
 
-.PHONY: setup extras gl window demo test test-all lint bench pictures
+.PHONY: setup extras gl window demo test test-cpus test-all lint bench pictures
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -44,6 +44,14 @@ demo: setup
 
 test: setup extras window
 	$(PYTEST)
+
+# The same for other kinds of processors, as far as switches make this one into them: only last bits may differ.
+CPUS := MKL_ENABLE_INSTRUCTIONS=AVX2 ATEN_CPU_CAPABILITY=default NUMBA_CPU_NAME=generic
+
+test-cpus: setup extras window
+	@failed=; for cpu in $(CPUS); do \
+	  echo "with $$cpu"; env $$cpu $(PYTEST) $(TESTS) || failed="$$failed $$cpu"; done; \
+	test -z "$$failed" || { echo "failed with$$failed"; exit 1; }
 
 test-all: setup extras window
 	$(PYTEST) -m '' --hypothesis-profile=search

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import llvmlite.binding
 import msgspec
+import numba
 import torch
 
 from progdf.errors import ProgdfError
@@ -20,6 +23,10 @@ from trainer.editors.pictures import strengths_of
 from trainer.options import MOST_THREADS, TrainOptions
 from trainer.plan import Plan
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
+
+_SWITCHES = (
+    "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
+)  # fmt: skip
 
 REGION = "region"
 """Of the saved state: members and score."""
@@ -88,6 +95,9 @@ def decide_resume(
         notes = []
         if saved.torch != now.torch:
             notes.append(f"torch was {saved.torch} and is {now.torch}: the last bits may differ")
+        if saved.processor not in ("", now.processor):
+            change = f"the processor was {saved.processor} and is {now.processor}"
+            notes.append(f"{change}: the last bits may differ, the quality does not")
         if saved.threads != threads:
             notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
         return ResumeDecision("go on", saved.threads, tuple(notes))
@@ -155,6 +165,7 @@ class _Identity(msgspec.Struct):
     threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
     torch: str
     pictures: dict[str, str] = {}
+    processor: str = ""  # of runs before it was kept
 
 
 def _identity(plan: Plan, threads: int) -> _Identity:
@@ -166,7 +177,19 @@ def _identity(plan: Plan, threads: int) -> _Identity:
         threads,
         str(torch.__version__),
         picture_digests(plan),
+        processor_kind(),
     )
+
+
+def processor_kind() -> str:
+    """The kind of processor, as far as the last bits of a result depend on it.
+
+    What numba compiles for, and what torch and the libraries of linear algebra choose their kernels by: the
+    instructions, and the switches that are set.
+    """
+    switches = [f"{name}={os.environ[name]}" for name in _SWITCHES if os.environ.get(name)]
+    name = numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    return ", ".join([name, torch.backends.cpu.get_cpu_capability(), *switches])
 
 
 def picture_digests(plan: Plan) -> dict[str, str]:

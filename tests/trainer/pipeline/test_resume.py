@@ -20,7 +20,7 @@ from progdf.errors import ProgdfError
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import train
-from trainer.pipeline.resume import find_run
+from trainer.pipeline.resume import find_run, processor_kind
 from trainer.plan import make_plan
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -168,6 +168,32 @@ def test_an_edited_view_that_was_lost_is_edited_again(
     else:
         lost.write_bytes(lost.read_bytes()[:200])
     assert f"edited again: {lost} is " in gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_a_run_goes_on_on_another_kind_of_processor_and_says_so_in_one_line(
+    bear_folder: Path, uninterrupted: Path
+) -> None:
+    about = OUT / "state" / "run.json"
+    identity = json.loads(about.read_text(encoding="utf-8"))
+    assert identity["processor"] == processor_kind()
+    about.write_text(json.dumps({**identity, "processor": "znver4, AVX2"}), encoding="utf-8")
+    log = gone_on(bear_folder, uninterrupted)
+    assert log.count("the processor was znver4, AVX2 and is ") == 1
+    assert log.count("the last bits may differ, the quality does not") == 1
+
+
+def test_a_switch_that_changes_the_last_bits_makes_another_kind_of_processor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kinds = [processor_kind()]
+    monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "OTHER")
+    kinds.append(processor_kind())
+    monkeypatch.setattr("numba.config.CPU_NAME", "generic")
+    kinds.append(processor_kind())
+    monkeypatch.setenv("MKL_ENABLE_INSTRUCTIONS", "SSE4_2")
+    kinds.append(processor_kind())
+    assert len(set(kinds)) == 4
 
 
 def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
