@@ -82,13 +82,13 @@ def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     for part in parts:
         probes = sample(part, _PROBES)
         share = float(_is_shown(parts, part, probes).float().mean())
-        wishes.append(float((probes.spacing**2).sum()) * share * part.weight)
+        # five digits: what equal parts get must not hang on the last bits, which depend on the processor
+        wishes.append(float(f"{float((probes.spacing**2).sum()) * share * part.weight:.5g}"))
         shown.append(max(share, 1 / _PROBES))
     quotas = [max(1.0, size * wish / sum(wishes)) for wish in wishes]
     quotas = [quota * size / sum(quotas) for quota in quotas]
     counts = [math.floor(quota) for quota in quotas]
-    # quotas of equal parts differ in their last bits, by the processor: of these parts the later first
-    rest = sorted(range(len(parts)), key=lambda i: (round(counts[i] - quotas[i], 6), -i))
+    rest = sorted(range(len(parts)), key=lambda i: (counts[i] - quotas[i], -i))
     for i in rest[: size - sum(counts)]:
         counts[i] += 1
     return counts, shown

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -278,3 +279,16 @@ def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bea
 def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
     with pytest.raises(ProgdfError, match="between 0 and 1"):
         scenes.darken_edit().apply(bear.gaussians, torch.arange(3), strength)
+
+
+def test_which_of_parts_of_one_size_gets_the_gaussian_that_is_left_does_not_hang_on_rounding() -> None:
+    random, counts = np.random.default_rng(0), set()
+    for _ in range(6):
+        radii = 0.2 * (1.0 + 1e-7 * random.integers(-2, 3, 3))
+        balls = [
+            surface.Part("head", name, surface.ball(), torch.tensor([i, 0.0, 0.0]), r * torch.eye(3))
+            for i, (name, r) in enumerate(zip("abc", radii.tolist(), strict=True))
+        ]
+        _, labels = assemble(balls, ("a", "b", "c"), bear_paint.paint, 100, 0)
+        counts.add(tuple(labels.bincount().tolist()))
+    assert len(counts) == 1, counts
