@@ -21,7 +21,8 @@ SKY = (0.510, 0.639, 0.761)
 
 
 def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
-    """A teddy bear of exactly `size` Gaussians; the same seed gives the same bear, bit for bit.
+    """A teddy bear of exactly `size` Gaussians; the same seed gives the same bear, bit for bit
+    on the same kind of processor.
 
     Raises:
         ProgdfError: fewer than `SMALLEST` Gaussians.

@@ -25,7 +25,8 @@ _WINDOW = ((1.45, 0.72), (0.75, 0.62))  # middle and half size along y and along
 
 
 def room(size: int = 40_000, seed: int = 0) -> DemoScene:
-    """A room of exactly `size` Gaussians with cameras inside; the same seed gives the same room, bit for bit.
+    """A room of exactly `size` Gaussians with cameras inside; the same seed gives the same room, bit for bit
+    on the same kind of processor.
 
     Raises:
         ProgdfError: fewer than `SMALLEST_ROOM` Gaussians.
