@@ -124,7 +124,8 @@ def direction(before: Tensor, after: Tensor, text_before: Tensor, text_after: Te
 
 def same_features(a: Tensor, b: Tensor) -> Tensor:
     """Whether features are the same; rounding has a direction too. [...,D] twice -> [...] bool"""
-    return (a.double() - b.double()).norm(dim=-1) < ROUNDING
+    apart: Tensor = (a.double() - b.double()).norm(dim=-1)
+    return apart < ROUNDING
 
 
 def _features(found: Any) -> Tensor:
