@@ -36,6 +36,7 @@ def run(
     snapshots: tuple[SliderSnapshot, ...] = (),
     draw: str = "auto",
     edit_pass: str = "auto",
+    warning: str = "",
 ) -> int:
     """Open the window and stay until it is closed.
 
@@ -47,6 +48,7 @@ def run(
         session: the file it was opened from and is saved to
         snapshots: kept states
         draw, edit_pass: what draws and what edits, see `ViewEngine`
+        warning: what to say first
 
     Returns:
         The exit status, 0.
@@ -58,6 +60,8 @@ def run(
     try:
         app = App(window, document, state, pictures, session, draw=draw, edit_pass=edit_pass)
         app.main_view.restart(state, snapshots)
+        if warning:
+            app.main_view.show_message(warning, error=True)
         app.file_actions.offer_autosave()
         try:
             with interruptible():

@@ -120,6 +120,7 @@ class FileActions:
         path = session_file(path)
         if path != self.path and path.is_file() and kind_of(path) != "session":
             raise ProgdfError(f"{path} is not a session; choose another name")
+        self._claim_regions(path)
         self._write(path)
         for region in self._app.main_view.work.view.selection.regions:
             regions.region_file(region, len(self._app.document.scene))
@@ -184,11 +185,13 @@ class FileActions:
         self._app.main_view.recent = self._remember(path)
 
     def _open_session(self, path: Path) -> None:
-        opened = session.open_session(path)
+        opened = session.open_session(path, self._memory)
         self.session_autosave.drop()
         self._app.show(opened.document)
         main_view = self._app.main_view
         main_view.restart(opened.view, opened.snapshots)
+        if opened.warning:
+            main_view.show_message(opened.warning, error=True)
         saved = autosaves.session_of(path)
         if saved is None:
             self.path = path
@@ -256,6 +259,14 @@ class FileActions:
         view, total = self._app.main_view.work.view, len(self._app.document.scene)
         renamed = regions.rename(view.selection, int(index), name, total)
         self._app.main_view.change(replace(view, selection=renamed))
+
+    def _claim_regions(self, path: Path) -> None:
+        """Regions whose files a session there would not be given back get new ones beside it."""
+        main_view, scene = self._app.main_view, self._app.document.path
+        view = main_view.work.view
+        if scene is not None and view.selection.regions:
+            folders = regions.region_folders(path, scene, self._memory)
+            main_view.change(replace(view, selection=regions.claim(view.selection, folders)))
 
     def _write(self, path: Path) -> None:
         session.save(path, self._session())

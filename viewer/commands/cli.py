@@ -50,6 +50,7 @@ def view(argv: Sequence[str]) -> int:
         snapshots=found.snapshots,
         draw=options.engine,
         edit_pass=options.edit_pass,
+        warning=found.warning,
     )
 
 

@@ -35,6 +35,7 @@ class OpenStack:
         session: the file that holds all this; None for a scene
         snapshots: those of the session
         asked_up: an axis, or "auto"
+        warning: what of the session was not taken as it is
     """
 
     document: Document
@@ -42,6 +43,7 @@ class OpenStack:
     session: Path | None = None
     snapshots: tuple[SliderSnapshot, ...] = ()
     asked_up: str = "auto"
+    warning: str = ""
 
     @property
     def up(self) -> Vec3:
@@ -128,7 +130,9 @@ def _session(options: StackOptions) -> OpenStack:
                 f"{what} with the session {options.scene.name}, which already sets it; leave it out"
             )
     kept = session.open_session(options.scene)
-    found = OpenStack(kept.document, kept.view, options.scene, kept.snapshots, _up_option(options))
+    found = OpenStack(
+        kept.document, kept.view, options.scene, kept.snapshots, _up_option(options), kept.warning
+    )
     settings = [
         f"{found.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in options.set)
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,13 +21,16 @@ from progdf.io.session import (
     verify_files,
     write_session,
 )
+from progdf.terminal import escape_text
 from viewer.state import paint
 from viewer.state.selection import check as check_selection
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 
-from . import document, timeline_file
+from . import document, regions, timeline_file
 from .document import Document
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class WindowSession:
     document: Document
     view: ViewState
     snapshots: tuple[SliderSnapshot, ...] = ()
+    warning: str = ""  # what of the file was not taken as it is, in one line
 
 
 class _State(msgspec.Struct):
@@ -66,8 +71,12 @@ def save(path: Path, session: WindowSession) -> None:
     write_session(path, state)
 
 
-def open_session(path: Path) -> WindowSession:
-    """Read a session with its scene and edits.
+def open_session(path: Path, memory: Path | None = None) -> WindowSession:
+    """Read a session with its scene and edits; what is to be said about it is logged as a warning.
+
+    Args:
+        path: its file
+        memory: folder of the program's state; the user's own if None
 
     Raises:
         ProgdfError: it is no session, damaged or of a newer version; or a file it names is missing, broken or
@@ -78,10 +87,26 @@ def open_session(path: Path) -> WindowSession:
     scene, gdfs = verify_files(path, file)
     opened = document.load(scene, gdfs)
     check_selection(view.selection, len(opened.scene))
-    view = _with_region_paths(view, lambda region: Path(os.path.normpath(path.resolve().parent / region)))
+    named, folder = view.selection.regions, path.resolve().parent
+    view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for kept in snapshots for layer in kept.edit.layers)):
         paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
-    return WindowSession(opened, view, snapshots)
+    claimed = regions.claim(view.selection, regions.region_folders(path, scene, memory))
+    foreign = [
+        f"{old.name:.60} ({str(old.path)[:80]})"
+        for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)
+        if new.path != resolved.path
+    ]
+    view = replace(view, selection=claimed)
+    warning = ""
+    if foreign:
+        more = f" and {len(foreign) - 1} more" * (len(foreign) > 1)
+        warning = escape_text(
+            f"{path.name}: region {foreign[0]}{more} named no {regions.SUFFIX} file in the session's folder: "
+            "unsaved until the session is saved"
+        )
+        _log.warning(warning)
+    return WindowSession(opened, view, snapshots, warning)
 
 
 def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewState:

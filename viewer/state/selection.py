@@ -23,6 +23,8 @@ from progdf.scene.selection import Mask, combine
 SUFFIX = ".region.npy"
 """How the file of a region is called after its name."""
 LONGEST_NAME = 60
+MOST_REGIONS = 1000
+"""Of a scene: more names than a person tells apart, few enough to draw and to save at once."""
 
 NOBODY = b""
 """The packed mask without a member."""
@@ -76,7 +78,7 @@ class SelectionState:
     members: bytes = NOBODY
     count: Annotated[int, Meta(ge=0)] = 0
     hidden: bytes = NOBODY
-    regions: tuple[NamedRegion, ...] = ()
+    regions: Annotated[tuple[NamedRegion, ...], Meta(max_length=MOST_REGIONS)] = ()
 
 
 def pack(mask: Mask) -> bytes:
@@ -201,7 +203,13 @@ def free_name(
 
 
 def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
-    """With the selection kept as one more region; it stays selected."""
+    """With the selection kept as one more region; it stays selected.
+
+    Raises:
+        ProgdfError: there are `MOST_REGIONS`.
+    """
+    if len(state.regions) >= MOST_REGIONS:
+        raise ProgdfError(f"there are {MOST_REGIONS} regions, the most there can be; delete some first")
     color = COLORS[len(state.regions) % len(COLORS)]
     region = NamedRegion(name, path, state.members, state.count, color)
     return replace(state, regions=(*state.regions, region))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from progdf.scene.region_spec import parse_region
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
-from viewer.files import regions
+from viewer.files import regions, session
+from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.selection import SelectionState
 
@@ -58,6 +60,118 @@ def test_nothing_selected_and_no_folder_are_one_line(chosen: SelectionState, tmp
         regions.keep(SelectionState(), "jacket", tmp_path, TOTAL)
     with pytest.raises(ProgdfError, match="does not exist"):
         regions.keep(chosen, "jacket", tmp_path / "gone", TOTAL)
+
+
+def foreign_session(folder: Path, *paths: str) -> Path:
+    """A session of somebody else's whose regions claim these files as their own."""
+    state = selection.select(SelectionState(), MASK)
+    for i in range(len(paths)):
+        state = selection.add_region(state, f"r{i}", folder / f"r{i}.region.npy")
+    view = replace(first_view(bear()), selection=state)
+    session.save(folder / "work.session.json", WindowSession(opened_document(folder), view))
+    table = json.loads((folder / "work.session.json").read_text())
+    for region, path in zip(table["view"]["selection"]["regions"], paths, strict=True):
+        region["path"] = path
+    (folder / "work.session.json").write_text(json.dumps(table))
+    return folder / "work.session.json"
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """All below a folder, links as they are."""
+    return {
+        str(path.relative_to(folder)): None if path.is_symlink() or not path.is_file() else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+FOREIGN = (
+    "../victim.txt",
+    "../victim.region.npy",
+    "../new.region.npy",
+    "../new.txt",
+    "edits/../../victim.region.npy",
+    "out/victim.region.npy",  # a link to the folder above
+    "out/new.region.npy",
+    "link.region.npy",  # a link to the victim
+    "dangling.region.npy",
+    "bear.edits/x.region.npy",  # which is a link out, too
+    "folder.region.npy",
+    "gone/new.region.npy",
+    "notes.txt",
+    "",
+    "a\0.region.npy",
+    "n" * 300 + ".region.npy",
+    "/".join("n" * 200 for _ in range(30)) + ".region.npy",
+    "{outside}/victim.region.npy",
+    "{outside}/victim.txt",
+)
+
+
+def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folder(tmp_path: Path) -> None:
+    outside, folder = tmp_path / "outside", tmp_path / "outside" / "in"
+    folder.mkdir(parents=True)
+    bear_files(folder)
+    (folder / "folder.region.npy").mkdir()
+    for name in ("victim.txt", "victim.region.npy", "in/notes.txt"):
+        (outside / name).write_bytes(b"mine")
+    (folder / "out").symlink_to(outside)
+    (folder / "bear.edits").symlink_to(outside)
+    (folder / "link.region.npy").symlink_to(outside / "victim.region.npy")
+    (folder / "dangling.region.npy").symlink_to(outside / "new.region.npy")
+    paths = tuple(path.format(outside=outside) for path in FOREIGN)
+    file = foreign_session(folder, *paths)
+    before = contents(outside)
+    opened = session.open_session(file, tmp_path / "memory")
+    state = opened.view.selection
+    assert f"region r0 (../victim.txt) and {len(paths) - 1} more named no" in opened.warning
+    for i, region in enumerate(state.regions):
+        regions.region_file(region, TOTAL)
+        state = regions.rename(state, i, f"renamed {i}", TOTAL)
+    after = contents(outside)
+    made = {name: after.pop(name) for name in set(after) - set(before)}
+    assert after == before
+    assert all(name.startswith("in/renamed ") and name.endswith(".region.npy") for name in made)
+    assert len(made) == len(paths)
+
+
+def test_files_of_a_sessions_own_folders_stay_with_their_regions(tmp_path: Path) -> None:
+    bear_files(tmp_path)
+    (tmp_path / "bear.edits").mkdir()
+    (tmp_path / "below").mkdir()
+    names = ("a.region.npy", "bear.edits/b.region.npy", "below/c.region.npy")
+    opened = session.open_session(foreign_session(tmp_path, *names), tmp_path / "memory")
+    assert opened.warning == ""
+    assert [region.path for region in opened.view.selection.regions] == [tmp_path / name for name in names]
+
+
+def test_a_rename_leaves_a_file_that_holds_other_rows(chosen: SelectionState, tmp_path: Path) -> None:
+    kept = regions.keep(chosen, "jacket", tmp_path, TOTAL)
+    np.save(tmp_path / "jacket.region.npy", np.arange(3))
+    regions.rename(kept, 0, "coat", TOTAL)
+    assert np.load(tmp_path / "jacket.region.npy").tolist() == [0, 1, 2]
+
+
+@pytest.mark.gl
+def test_the_window_says_which_regions_it_did_not_take_and_saves_them_beside_the_session(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    bear_files(folder)
+    (tmp_path / "victim.txt").write_bytes(b"mine")
+    file = foreign_session(folder, "../victim.txt")
+    with null_app(opened_document(folder), first_view(bear()), tmp_path) as app:
+        app.file_actions.open(file)
+        said = app.main_view.work.message
+        assert said is not None
+        assert "region r0 (../victim.txt) named no .region.npy file in the session's folder" in said.text
+        app.file_actions.handle("save")
+        assert (folder / "r0.region.npy").exists()
+        (tmp_path / "elsewhere").mkdir()
+        app.file_actions.save(tmp_path / "elsewhere" / "moved")
+        assert (tmp_path / "elsewhere" / "r0.region.npy").exists(), "a session that is saved has its regions"
+        assert session.open_session(tmp_path / "elsewhere" / "moved.session.json").warning == ""
+    assert (tmp_path / "victim.txt").read_bytes() == b"mine"
 
 
 @pytest.mark.gl

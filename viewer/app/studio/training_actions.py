@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import atomic_write, make_folder
+from progdf.io.atomic import make_folder
 from progdf.scene.region_spec import check_region
 from viewer.app.application import Application, failure_line
+from viewer.files import regions
 from viewer.files.document import Document
 from viewer.jobs import run_files
 from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED, NewEdit
 from viewer.jobs.training_job import EditOrder, TrainingJob, duration
 from viewer.jobs.training_queue import TrainingQueue, spare_threads
-from viewer.state.selection import NOBODY, SUFFIX, add_region, free_name, unpack
+from viewer.state.selection import NOBODY, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog
 
@@ -150,11 +148,8 @@ class TrainingActions:
             raise ProgdfError(f"there is no region {form.region} any more; choose another one")
         members = selection.members if kept is None else kept.members
         make_folder(folder)
-        stored = io.BytesIO()
-        np.save(stored, np.flatnonzero(unpack(members, total)))
         path = folder / f"{name}{SUFFIX}"
-        with atomic_write(path) as temporary_file:
-            temporary_file.write_bytes(stored.getvalue())
+        regions.write(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
     def _try(self, act: Callable[[], None]) -> None:
