@@ -100,8 +100,11 @@ def log_of(order: EditOrder) -> Path:
 def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:
     """Runs of this scene that were stopped and can go on."""
     for path in sorted(folder.glob(f"*{ORDER}")):
-        out = path.with_name(path.name.removesuffix(ORDER))
-        if not is_begun(out):
+        name = path.name.removesuffix(ORDER)
+        if not name.strip("."):  # "..", whose run would be the scene's own folder
+            continue
+        out = path.with_name(name)
+        if out.is_symlink() or not is_begun(out):
             continue
         with contextlib.suppress(ProgdfError):
             kept = read_json(path, _Order)

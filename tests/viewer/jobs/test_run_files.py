@@ -121,6 +121,19 @@ def test_what_cannot_be_removed_is_whole_and_says_so(tmp_path: Path, monkeypatch
     assert (elsewhere / "run.json").is_file()
 
 
+@pytest.mark.parametrize("name", ["..", ".", "", "...", "link"])
+def test_no_order_of_a_stranger_makes_another_folder_a_run(name: str, tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    run_files.keep_order(asked)
+    edits, other = asked.out.parent, tmp_path / "other"
+    for folder in (tmp_path, edits, other):
+        (folder / "state").mkdir(parents=True)
+        (folder / "state" / "run.json").write_text("{}")
+    (edits / "link").symlink_to(other)
+    edits.joinpath("blue.train.json").rename(edits / f"{name}.train.json")
+    assert [*run_files.stopped_orders(edits, asked.scene)] == []
+
+
 def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
     asked = order(tmp_path)
     asked.out.mkdir(parents=True)
