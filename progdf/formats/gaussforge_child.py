@@ -17,7 +17,11 @@ from pathlib import Path
 
 
 def _bundle(meta: Path) -> bytes:
-    """An unpacked .sog as the archive that it would be: meta.json and the images that it names."""
+    """An unpacked .sog as the archive that it would be: meta.json and the images that it names.
+
+    Raises:
+        ValueError: an image is no regular file of the folder: a pipe is waited for, a link may lead out.
+    """
     table = json.loads(meta.read_bytes())
     named = [name for part in table.values() if isinstance(part, dict) for name in part.get("files", ())]
     archive = io.BytesIO()
@@ -26,7 +30,10 @@ def _bundle(meta: Path) -> bytes:
         for name in dict.fromkeys(map(str, named)):
             if Path(name).name != name:
                 raise ValueError("meta.json names images outside its folder")
-            out.writestr(name, (meta.parent / name).read_bytes())
+            image = meta.parent / name
+            if image.is_symlink() or not image.is_file():
+                raise ValueError(f"{name} is missing, a link or no regular file")
+            out.writestr(name, image.read_bytes())
     return archive.getvalue()
 
 

@@ -7,7 +7,6 @@ gaussforge, in a process of its own (see `gaussforge_child`), as its native code
 from __future__ import annotations
 
 import importlib.util
-import json
 import logging
 import os
 import signal
@@ -25,6 +24,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import read_file
+from progdf.io.json_values import decode_json
 from progdf.terminal import escape_text
 
 from . import gaussforge_child
@@ -43,7 +43,8 @@ FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
 SOG_META = "meta.json"
 """The file that represents an unpacked .sog: its folder's table of images."""
 
-_MOST_META = 64_000_000
+_MOST_META = 1 << 20
+"""Bytes of its table, which has some 20 kB; parsed, JSON takes thirty times as much."""
 _MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
 """What a reader of another's making gets: so much, and so much for each byte of its file."""
 
@@ -202,8 +203,11 @@ def _read_error(path: Path, kind: str, why: str) -> ProgdfError:
 
 def _size(path: Path) -> int:
     """Bytes of the scene: of an unpacked .sog those of its folder's files."""
-    files = path.parent.iterdir() if path.name.lower() == SOG_META else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+    if path.name.lower() != SOG_META:
+        return path.stat().st_size
+    return sum(
+        file.stat().st_size for file in path.parent.iterdir() if file.is_file() and not file.is_symlink()
+    )
 
 
 def _inflate(start: bytes) -> bytes:
@@ -225,15 +229,27 @@ def _spz_header(path: Path) -> tuple[int, bool]:
 
 
 def _sog_meta(path: Path) -> dict[str, object] | None:
-    """The table of an .sog, bundled or not; None: it is none."""
+    """The table of an .sog, bundled or not; None: it is none.
+
+    Raises:
+        ProgdfError: the table is larger than any.
+    """
     try:
         if path.name.lower() == SOG_META:
-            content = path.read_bytes() if path.stat().st_size <= _MOST_META else b""
+            content = read_file(path, _MOST_META + 1)
         else:
             with zipfile.ZipFile(path) as bundle:
-                content = bundle.read(SOG_META) if bundle.getinfo(SOG_META).file_size <= _MOST_META else b""
-        table = json.loads(content)
+                if bundle.getinfo(SOG_META).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    return None  # zipfile unpacks others whole, however little of them is read
+                with bundle.open(SOG_META) as file:
+                    content = file.read(_MOST_META + 1)
+        table = decode_json(content) if len(content) <= _MOST_META else None
     except (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error):
         return None
+    if len(content) > _MOST_META:
+        raise ProgdfError(
+            f"{path} holds a {SOG_META} of more than {_MOST_META >> 20} MB, an .sog's has some kB; "
+            "it is damaged: copy or export it again"
+        )
     known = isinstance(table, dict) and "means" in table and "quats" in table
     return table if known else None

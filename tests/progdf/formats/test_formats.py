@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -140,6 +142,44 @@ def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
     table["quats"]["files"] = ["../../secret.webp"]
     meta.write_text(json.dumps(table))
     assert "names images outside its folder" in refusal(load_scene, meta)
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder", "missing"])
+def test_an_image_of_a_sog_that_is_no_regular_file_is_refused_at_once(kind: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(write_scene(tmp_path / "scene.sog", scene_of())) as archive:
+        archive.extractall(tmp_path / "robot")
+    image = tmp_path / "robot" / "quats.webp"
+    image.rename(tmp_path / "outside.webp")
+    if kind == "link":
+        image.symlink_to(tmp_path / "outside.webp")
+    elif kind == "pipe":
+        os.mkfifo(image)
+    elif kind == "folder":
+        image.mkdir()
+    assert "quats.webp is missing, a link or no regular file" in refusal(load_scene, tmp_path / "robot")
+
+
+@pytest.mark.parametrize("packed", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, None])
+def test_the_table_of_a_sog_is_bounded_before_it_is_parsed(packed: int | None, tmp_path: Path) -> None:
+    """15 kB that unpack to 16 MB, also where the archive says that they are 2."""
+    content = b'{"means": {}, "quats": [' + b"0," * 7_999_900 + b"0]}"
+    path = tmp_path / ("meta.json" if packed is None else "a.sog")
+    if packed is None:
+        path.write_bytes(content)
+    else:
+        with zipfile.ZipFile(path, "w", packed) as archive:
+            archive.writestr("meta.json", content)
+        path.write_bytes(path.read_bytes().replace(len(content).to_bytes(4, "little"), b"\2\0\0\0"))
+    tracemalloc.start()
+    refusal(load_scene, path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 8 << 20
+
+
+def test_a_table_of_a_sog_that_is_too_large_is_told(tmp_path: Path) -> None:
+    (tmp_path / "meta.json").write_text('{"means": {}, "quats": "' + "a" * (1 << 20) + '"}')
+    assert "a meta.json of more than 1 MB" in refusal(load_scene, tmp_path / "meta.json")
 
 
 def test_saturated_opacities_are_clamped_and_counted(tmp_path: Path) -> None:
