@@ -169,12 +169,14 @@ def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
     try:
         with open(path, "rb") as file:
             return file.read(most)
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise open_error(path, error) from error
 
 
-def open_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
-    """The one line for a file that cannot be opened."""
+def open_error(path: str | os.PathLike[str], error: OSError | ValueError) -> ProgdfError:
+    """The one line for a file that cannot be opened; a ValueError is of a name with a NUL."""
+    if isinstance(error, ValueError):
+        return ProgdfError(f"{path} cannot be the name of a file; check the name")
     if isinstance(error, FileNotFoundError):
         return ProgdfError(f"{path} does not exist; check the name and the folder")
     if isinstance(error, IsADirectoryError) or Path(path).is_dir():

@@ -14,7 +14,6 @@ through the scene; '&front:CAMERA' leaves what is in front.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from functools import partial
@@ -47,6 +46,9 @@ takes the leather, and at .1 the hair too."""
 
 MOST_TIMES = 100
 
+LARGEST = 1e18
+"""Of numbers in a region, on either side of 0: the squares of a few of them still are float32."""
+
 Selecting = Callable[[Gaussians], Mask]
 """What a checked part does with a scene."""
 
@@ -72,9 +74,13 @@ def read_part(kind: str, rest: str) -> Selecting:
     where, _, text = rest.rpartition(":")
     camera, numbers = _camera(kind, where, f"CAMERA:{form}"), _numbers(kind, rest, text, f"CAMERA:{form}")
     if len(numbers) < least or len(numbers) % 2 != odd or (kind == "rectangle" and len(numbers) > least):
-        raise ProgdfError(f"region '{kind}:{rest}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}")
+        raise ProgdfError(
+            f"region '{kind}:{shorten(rest)}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}"
+        )
     if odd and numbers[0] <= 0:
-        raise ProgdfError(f"the radius in region '{kind}:{rest}' is {numbers[0]:g}; it must be positive")
+        raise ProgdfError(
+            f"the radius in region '{kind}:{shorten(rest)}' is {numbers[0]:g}; it must be positive"
+        )
     return partial(_inside, kind, camera, numbers)
 
 
@@ -86,8 +92,11 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
     """
     name, _, times = text.partition(":")
     count = int(times) if re.fullmatch(r"[0-9]{1,9}", times) else 1 if not times else 0
-    if not 1 <= count <= (1 if name == "largest" else MOST_TIMES):
-        raise ProgdfError(f"'{text}' is no step of a region; write grow, shrink or smooth:TIMES, or largest")
+    if name not in STEPS or not 1 <= count <= (1 if name == "largest" else MOST_TIMES):
+        raise ProgdfError(
+            f"'{shorten(text)}' is no step of a region; write grow, shrink or smooth:TIMES, "
+            f"at most {MOST_TIMES}, or largest"
+        )
 
     def step(neighborhood: Neighborhood, mask: Mask) -> Mask:
         for _ in range(count):
@@ -121,27 +130,43 @@ def _camera(kind: str, text: str, form: str) -> Camera:
 def _with_tolerance(kind: str, rest: str, count: int, form: str) -> tuple[list[str], float]:
     words = rest.split(",")
     if not count <= len(words) <= count + 1:
-        raise ProgdfError(f"region '{kind}:{rest}' cannot be read; write {kind}:{form}")
+        raise ProgdfError(f"region '{kind}:{shorten(rest)}' cannot be read; write {kind}:{form}")
     tolerance = _numbers(kind, rest, words[count], form)[0] if len(words) > count else TOLERANCE
     if not 0 < tolerance <= 1:
-        raise ProgdfError(f"the tolerance in region '{kind}:{rest}' is {tolerance:g}; write above 0, up to 1")
+        raise ProgdfError(
+            f"the tolerance in region '{kind}:{shorten(rest)}' is {tolerance:g}; write above 0, up to 1"
+        )
     return words[:count], tolerance
 
 
 def _numbers(kind: str, rest: str, text: str, form: str) -> list[float]:
+    numbers = read_numbers(text)
+    if not numbers:
+        raise ProgdfError(
+            f"region '{kind}:{shorten(rest)}' does not end in numbers up to {LARGEST:g}; write {kind}:{form}"
+        )
+    return numbers
+
+
+def read_numbers(text: str) -> list[float]:
+    """Numbers between commas, none beyond `LARGEST`; [] where it is anything else."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
-        numbers = [math.nan]
-    if not all(math.isfinite(number) for number in numbers):
-        raise ProgdfError(f"region '{kind}:{rest}' does not end in numbers; write {kind}:{form}")
-    return numbers
+        return []
+    return numbers if all(abs(number) <= LARGEST for number in numbers) else []
+
+
+def shorten(text: str) -> str:
+    """What somebody typed, as a message repeats it."""
+    return text if len(text) <= 80 else f"{text[:79]}…"
 
 
 def _oklab(rest: str, code: str) -> list[float]:
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", code.strip()):
         raise ProgdfError(
-            f"'{code}' in region 'color:{rest}' is not a color; write for example color:#903020"
+            f"'{shorten(code)}' in region 'color:{shorten(rest)}' is not a color; "
+            "write for example color:#903020"
         )
     rgb = torch.tensor(ImageColor.getrgb(code.strip())[:3]) / 255.0
     lab: list[float] = srgb_to_oklab(rgb).tolist()

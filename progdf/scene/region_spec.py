@@ -17,7 +17,7 @@ Numbers and file names hold '-' and '+' themselves, so a sign joins two parts on
 
 from __future__ import annotations
 
-import math
+import logging
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
 from progdf.io.npy import open_npy
 from progdf.region import (
@@ -44,13 +45,18 @@ from progdf.region import (
 )
 
 from .neighborhood import Neighborhood
-from .region_parts import PARTS, STEPS, read_part, read_step
+from .region_parts import LARGEST, PARTS, STEPS, read_numbers, read_part, read_step, shorten
 
 Kind = Callable[[str, Gaussians], Region]
 """Makes a region from the text after `KIND:`."""
 
 Check = Callable[[str], object]
 """Raises ProgdfError where the text after `KIND:` cannot be, whatever the scene."""
+
+_log = logging.getLogger(__name__)
+
+_FEW = 10
+"""Gaussians: fewer in a flood are a stray and its neighbors."""
 
 _SIGNS = {"+": union, "-": difference, "&": intersection}
 _NOTHING: Mapping[str, Kind] = {}
@@ -60,13 +66,20 @@ BARE = ("changed",)
 """Kinds that may stand without a colon and a text."""
 
 
-def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str, Kind] = _NOTHING) -> Region:
+def parse_region(
+    spec: str,
+    scene: Gaussians,
+    name: str = "",
+    kinds: Mapping[str, Kind] = _NOTHING,
+    say: Callable[[str], None] = _log.warning,
+) -> Region:
     """The region that `spec` describes in `scene`.
 
     Args:
         spec: see the head of this file
         name: the region's name; the spec itself if empty
         kinds: further kinds by name, e.g. {"masks": lift_from_folder}
+        say: hears in a line each which parts select nothing, or what is likely not meant
 
     Raises:
         ProgdfError: the spec cannot be read, a file does not fit the scene, or nothing is in the region.
@@ -80,19 +93,35 @@ def parse_region(spec: str, scene: Gaussians, name: str = "", kinds: Mapping[str
             neighborhood = neighborhood or Neighborhood(scene)
             mask = np.zeros(len(scene), bool)
             mask[region.members.numpy()] = True
-            region = from_mask("", torch.from_numpy(read_step(part)(neighborhood, mask)))
-            continue
-        kind, colon, rest = part.partition(":")
-        if part == "all":
-            found = whole_scene(scene)
-        elif kind in known and (colon or kind in BARE):
-            found = known[kind](rest, scene)
+            joined = from_mask("", torch.from_numpy(read_step(part)(neighborhood, mask)))
         else:
-            raise _unknown(part, known)
-        region = _SIGNS[sign](region, found)
+            kind, colon, rest = part.partition(":")
+            if part == "all":
+                found = whole_scene(scene)
+            elif kind in known and (colon or kind in BARE):
+                found = known[kind](rest, scene)
+            else:
+                raise _unknown(part, known)
+            if doubt := _doubt(kind, len(found), len(scene)):
+                say(f"{shorten(part)} {doubt}")
+            joined = _SIGNS[sign](region, found)
+        if len(region) and not len(joined):
+            say(f"nothing is left of the region after {sign}{shorten(part)}")
+        region = joined
     if not len(region):
-        raise ProgdfError(f"region '{spec}' holds no Gaussian; the scene reaches {_extent(scene)}")
+        raise ProgdfError(f"region '{shorten(spec)}' holds no Gaussian; the scene reaches {_extent(scene)}")
     return Region(name or spec.strip(), region.members, region.score)
+
+
+def _doubt(kind: str, count: int, total: int) -> str:
+    """Why a part that selects so many of a scene's Gaussians is hardly what was meant; "" where it may be."""
+    if not count:
+        return "selects no Gaussian"
+    if kind == "flood" and count < _FEW:
+        return f"selects {format_count(count)} alone; raise its tolerance, or name a point on a surface"
+    if kind == "color" and 2 * count > total:
+        return f"selects {100 * count / total:.0f} % of the scene; lower its tolerance, or add &box:…"
+    return ""
 
 
 def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
@@ -122,7 +151,7 @@ def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
 
 def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
     choice = ", ".join(["all", *(word if word in BARE else f"{word}:…" for word in known)])
-    return ProgdfError(f"unknown region '{part}'; write {choice}")
+    return ProgdfError(f"unknown region '{shorten(part)}'; write {choice}")
 
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
@@ -130,11 +159,13 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
     bare = "|".join(("all", *BARE))
     part, step = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])", rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
-    joint = re.compile(rf"\s*([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))\s*")
-    pieces = joint.split(spec.strip())
+    # no blanks before the sign: a pattern that begins with them goes through a run of them from each of them
+    pieces = [piece.strip() for piece in re.split(rf"([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))", spec)]
     if not all(pieces[0::2]):
-        raise ProgdfError(f"region '{spec}' is missing a part; write, for example, all-sphere:0,0,0,1")
-    return list(zip(["+", *pieces[1::2]], (piece.strip() for piece in pieces[0::2]), strict=True))
+        raise ProgdfError(
+            f"region '{shorten(spec)}' is missing a part; write, for example, all-sphere:0,0,0,1"
+        )
+    return list(zip(["+", *pieces[1::2]], pieces[0::2], strict=True))
 
 
 def _by_hand(kind: str, rest: str, scene: Gaussians) -> Region:
@@ -211,12 +242,13 @@ def _parse_labels(rest: str) -> tuple[str, list[int]]:
     """The file and the labels of FILE.npy:ID[,ID…]."""
     path, colon, ids = rest.rpartition(":")
     if not colon or not path:
-        raise ProgdfError(f"region 'labels:{rest}' has no label; write labels:FILE.npy:ID[,ID…]")
+        raise ProgdfError(f"region 'labels:{shorten(rest)}' has no label; write labels:FILE.npy:ID[,ID…]")
     try:
         return path, [int(word) for word in ids.split(",")]
     except ValueError:
         raise ProgdfError(
-            f"'{ids}' in region 'labels:{rest}' is not a list of integers; write labels:FILE.npy:ID[,ID…]"
+            f"'{shorten(ids)}' in region 'labels:{shorten(rest)}' is not a list of integers; "
+            "write labels:FILE.npy:ID[,ID…]"
         ) from None
 
 
@@ -224,7 +256,8 @@ def _labels(rest: str, scene: Gaussians) -> Region:
     path, wanted = _parse_labels(rest)
     labels = read_labels(path, len(scene))
     present = torch.unique(labels).tolist()
-    absent = [wanted_id for wanted_id in wanted if wanted_id not in present]
+    known = set(present)
+    absent = [wanted_id for wanted_id in wanted if wanted_id not in known]
     if absent:
         shown = ", ".join(str(label) for label in present[:12]) + (" …" if len(present) > 12 else "")
         raise ProgdfError(f"{path} has no Gaussian with label {absent[0]}; it has {shown}")
@@ -253,13 +286,11 @@ def _sphere(rest: str, scene: Gaussians) -> Region:
 
 
 def _numbers(kind: str, rest: str, form: str) -> list[float]:
-    words = rest.split(",")
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) != form.count(",") + 1 or not all(math.isfinite(number) for number in numbers):
-        raise ProgdfError(f"region '{kind}:{rest}' is not {form.count(',') + 1} numbers; write {kind}:{form}")
+    numbers, count = read_numbers(rest), form.count(",") + 1
+    if len(numbers) != count:
+        raise ProgdfError(
+            f"region '{kind}:{shorten(rest)}' is not {count} numbers up to {LARGEST:g}; write {kind}:{form}"
+        )
     return numbers
 
 

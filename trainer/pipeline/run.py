@@ -87,7 +87,7 @@ def train(plan: Plan, out: Path, threads: int = 0, resume: bool = False, quiet: 
     region, notes = load_region(out) if resume else None, list[str]()
     if region is None:
         kinds = region_kinds(region_settings(plan, out, quiet, notes.append))
-        region = parse_region(plan.region.region, scene, plan.name, kinds)
+        region = parse_region(plan.region.region, scene, plan.name, kinds, notes.append)
     folder = open_run_folder(out, plan.edit)
     with interrupt_on_signals(), lock_folder(folder), explain_stop(folder):
         session = decide_resume(folder, plan, region, wanted_threads(threads), resume)

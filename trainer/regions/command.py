@@ -61,7 +61,7 @@ def show(options: RegionOptions) -> str:
             options.cameras, 30, lambda: Path(folder), options.lift_rule, options.lift_threshold,
             up=options.up, scene=options.scene, say=said.append,
         )  # fmt: skip
-        region = parse_region(options.spec, scene, kinds=region_kinds(settings))
+        region = parse_region(options.spec, scene, kinds=region_kinds(settings), say=said.append)
     if suffix == ".npy":
         save_npy(options.out, region.members.numpy())
     else:

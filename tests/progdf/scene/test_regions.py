@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.region import Region, difference, from_mask, union
-from progdf.scene.region_spec import parse_region, split_spec
+from progdf.scene.region_spec import check_region, parse_region, split_spec
 from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
 from tests.helpers.scenes import orbit_camera, random_gaussians
 
@@ -197,10 +198,172 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("all|grow:1000", "no step of a region"),
         ("sphere:0,0,0,1|grow:-3", "'grow:-3' is no step of a region"),
         ("all|largest:2", "no step of a region"),
+        ("all|grow|GROW", "'grow|GROW' is no step of a region"),
+        ("all|largest||", "'largest||' is no step of a region"),
+        ("all|smooth+100", "'smooth+100' is no step of a region"),
+        ("flood:1e308,-1e308,0", "numbers up to 1e+18"),
+        ("box:0,0,0,1,1,1e19", "6 numbers up to 1e+18"),
     ],
 )
 def test_a_spec_that_cannot_be_meant_is_one_line(spec: str, said: str, scene: Gaussians) -> None:
     assert said in refusal(spec, scene)
+
+
+LONG = 1_000_000
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        f"all{' ' * LONG}",
+        f"all{' ' * LONG}-sphere:0,0,0,1{' ' * LONG}",
+        " " * LONG,
+        "all" + "-" * LONG,
+        "all" + "| " * (LONG // 2),
+        "- " * (LONG // 2),
+        "all" * (LONG // 3),
+        "all-" * (LONG // 4) + "all",
+        "all|grow" + "|grow" * (LONG // 5) + "|" + "grow:" * (LONG // 5),
+        "sphere:" + "1," * (LONG // 2),
+    ],
+    ids=lambda spec: spec[:12],
+)
+def test_a_spec_of_a_megabyte_is_read_at_once_and_repeated_in_short(spec: str) -> None:
+    """What goes through its input once for each of its characters would take hours."""
+    said = ""
+    try:
+        check_region(spec)
+    except ProgdfError as refused:
+        said = str(refused)
+    assert len(said) < 500
+
+
+# What the language is made of, wrong as often as right.
+SCRAPS = st.sampled_from(
+    [
+        *(
+            "all",
+            "changed",
+            "box:",
+            "sphere:",
+            "labels:",
+            "file:",
+            "color:",
+            "flood:",
+            "front:",
+            "rectangle:",
+        ),
+        *(
+            "lasso:",
+            "brush:",
+            "C:",
+            "l.npy:",
+            "m.npy",
+            "#808080",
+            "0,0,0,1",
+            "-1,-1,-1,1,1,1",
+            "0.1",
+            "5,5,40,40",
+        ),
+        *(
+            "5,5,40,40,60,10",
+            "1e18",
+            "-1e18",
+            "1e308",
+            "nan",
+            "1e-320",
+            "0",
+            ":1",
+            ",",
+            "+",
+            "-",
+            "&",
+            "|",
+            " ",
+        ),
+        *(
+            "|grow",
+            "|shrink:2",
+            "|smooth",
+            "|largest",
+            "|GROW",
+            ":100",
+            "\0",
+            "\x1b[2J",
+            "é",
+            "\ud800",
+            "~nobody",
+        ),
+    ]
+)
+WHOLE = st.sampled_from(
+    [
+        *("all", "box:-1,-1,-1,1,1,1", "sphere:0,0,0,1e18", "sphere:1e18,1e18,0,1", "labels:l.npy:1,2"),
+        *("file:m.npy", "color:#808080,1", "flood:0,0,0,1", "flood:1e18,-1e18,0", "front:C"),
+        *("rectangle:C:5,5,40,40", "lasso:C:5,5,40,40,60,10", "lasso:C:1e18,0,-1e18,1e-300,0,1e18"),
+        *("brush:C:9,30,30", "brush:C:1e18,-1e18,1e18"),
+    ]
+)
+SIGNS = st.sampled_from(["+", "-", " & ", "|grow+", "|smooth:2&", "|"])
+STEPS = st.sampled_from(["|grow", "|shrink:2", "| smooth", "|largest", "|grow:100"])
+KIND = st.sampled_from(["box:", "sphere:", "flood:", "lasso:C:", "brush:C:", "rectangle:C:", "labels:l.npy:"])
+NUMBERS = st.lists(
+    st.sampled_from(
+        ["0", "1", "-1", "0.1", "1e18", "-1e18", "1e308", "-1e308", "1e-320", "nan", "9" * 5000, ""]
+    ),
+    min_size=1,
+    max_size=7,
+).map(",".join)
+SPECS_OF_ALL_KINDS = st.one_of(
+    st.lists(st.one_of(WHOLE, SCRAPS), min_size=1, max_size=9).map("".join),
+    st.lists(st.tuples(WHOLE, SIGNS).map("".join), max_size=5).map(lambda parts: "".join([*parts, "all"])),
+    st.tuples(WHOLE, STEPS, SCRAPS, st.one_of(STEPS, SCRAPS)).map("".join),
+    st.tuples(KIND, NUMBERS).map("".join),
+)
+
+
+@pytest.fixture(scope="module")
+def folder_of_parts(scene: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("parts")
+    labels_file(folder / "l.npy")
+    np.save(folder / "m.npy", np.arange(0, COUNT, 3))
+    save_cameras(folder / "C", [orbit_camera(90, 60)])
+    return folder
+
+
+@given(spec=SPECS_OF_ALL_KINDS)
+def test_whatever_is_typed_is_a_region_or_one_line(
+    spec: str, scene: Gaussians, folder_of_parts: Path
+) -> None:
+    said: list[str] = []
+    refused = []
+    with contextlib.chdir(folder_of_parts):
+        for read in (lambda: check_region(spec), lambda: parse_region(spec, scene, say=said.append)):
+            try:
+                read()
+            except ProgdfError as error:
+                refused.append(str(error))
+    assert all(len(line.splitlines()) == 1 for line in (*refused, *said))
+    assert len(refused) != 1 or "holds no Gaussian" in refused[0] or "no Gaussian with label" in refused[0]
+
+
+def test_parts_that_are_hardly_meant_are_told(scene: Gaussians) -> None:
+    def said(spec: str) -> list[str]:
+        lines: list[str] = []
+        parse_region(spec, scene, say=lines.append)
+        return lines
+
+    x, y, z = scene.means[7].tolist()
+    assert said("all-box:0,0,0,9,9,9|grow") == []
+    assert said("color:#808080,0.1") == []
+    assert said("color:#808080,1") == [
+        "color:#808080,1 selects 100 % of the scene; lower its tolerance, or add &box:…"
+    ]
+    (few,) = said(f"flood:{x},{y},{z},1e-6")
+    assert few.endswith("selects 1 Gaussian alone; raise its tolerance, or name a point on a surface")
+    assert said("all+box:99,99,99,100,100,100") == ["box:99,99,99,100,100,100 selects no Gaussian"]
+    assert said("all - all + all") == ["nothing is left of the region after -all"]
+    assert said("sphere:0,0,0,0.5|shrink:9+all") == ["nothing is left of the region after |shrink:9"]
 
 
 def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp_path: Path) -> None:
