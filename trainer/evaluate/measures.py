@@ -74,9 +74,13 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: Texts) -> Eva
     paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}
     consistency = view_consistency(opened, perceptual)
     lpips = "LPIPS" if perceptual.name.startswith("lpips") else perceptual.name
-    views = "to the edited views" if opened.setup.held_out else "to the run's own pictures, trained on,"
+    views = (
+        "to the run's own pictures, trained on,",
+        "to the one edited view held out,",
+        "to the edited views",
+    )
     rows = (
-        *_edited_rows(curves, lpips, views),
+        *_edited_rows(curves, lpips, views[min(len(opened.setup.held_out), 2)]),
         *_path_rows(paths, lpips),
         *_consistency_rows(consistency, lpips),
         Row("outside", "outside the region, mean change, of 255", _scaled(outside_change(opened), 255)),

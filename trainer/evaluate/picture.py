@@ -15,6 +15,7 @@ from trainer.report.report import (
     column_heading,
     columns_of,
     editor_strip,
+    shown_view,
     stack_plots,
     thumbnail,
 )
@@ -43,7 +44,7 @@ def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
             list(strips),
             [column_heading(*column) for column in columns],
             f"{opened.gdf.name}: {opened.run.record.plan.editor.editor}",
-            f"held-out view {evaluator.names[best]}",
+            shown_view(evaluator, len(opened.setup.held_out)),
         )
     ]
     if pairs := evaluation.consistency.pairs:

@@ -14,7 +14,7 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.remap import identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
-from progdf.formats.load_report import file_size
+from progdf.formats.load_report import file_size, format_count
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
@@ -122,7 +122,8 @@ def finish_run(
         f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian without the header, "
         f"worst {fitted.chosen.worst:.1f} dB, "
-        f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings"
+        f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings "
+        f"in {format_count(len(reporting.names), 'view')}"
     )
     if not fitted.met:
         if budget is not None and network is None:
@@ -140,7 +141,7 @@ def finish_run(
         gdf = Gdf(plan.name, region, field, fingerprint(scene), editor, told)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{plan.name}: {editor}"
-        picture = report_picture(evaluator, measured, record.losses, title, bool(setup.held_out))
+        picture = report_picture(evaluator, measured, record.losses, title, len(setup.held_out))
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -185,9 +186,8 @@ def finish_run(
     write_json(folder.report, report)
     write_image(folder.picture, picture)
     edit = report["edit"]
-    judged = "held-out views" if setup.held_out else "the views trained on"
     log.say(
-        f"{judged}: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
+        f"{setup.judged_on}: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
         + "".join(
             f"; s={float(s):.3g} {e['psnr']} dB (2 keyframes {e['keyframes2']})"
             for s, e in report["between"].items()

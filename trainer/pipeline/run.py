@@ -209,7 +209,7 @@ def _agreement(
         return None
     count = len(setup.train)
     found = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
-    log.say(found.line(plan.editor.family))
+    log.say(found.line(plan.editor.family, setup.judged_on))
     return found
 
 

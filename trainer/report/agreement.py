@@ -53,14 +53,20 @@ class Agreement:
         """Whether that is what edits that are the same from everywhere leave."""
         return self.unexplained <= _MOST_UNEXPLAINED or self.psnr >= _HARMLESS_DB
 
-    def line(self, editor: str) -> str:
-        """One line for the log, with advice where the views disagree. `editor`: its kind."""
+    def line(self, editor: str, judged_on: str) -> str:
+        """One line for the log, with advice where the views disagree.
+
+        Args:
+            editor: its kind
+            judged_on: the views that the figures are of, in words
+        """
         share = f"{100 * self.unexplained:.0f} % of the change"
         if self.agree:
-            return f"the edited views agree: the best colors reach {self.psnr:.1f} dB and miss {share}"
+            best = f"the best colors reach {self.psnr:.1f} dB and miss {share}"
+            return f"the edited views agree: on {judged_on} {best}"
         return (
             f"the edited views disagree: no 3D scene shows all of them, best possible {self.psnr:.1f} dB on "
-            f"held-out views, which misses {share}; {_REMEDIES.get(editor, 'mend them')}"
+            f"{judged_on}, which misses {share}; {_REMEDIES.get(editor, 'mend them')}"
         )
 
     def figures(self) -> dict[str, float | bool]:

@@ -31,7 +31,7 @@ _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
 
 def report_picture(
-    evaluator: Evaluator, measured: Measured, losses: Losses, title: str, held_out: bool = True
+    evaluator: Evaluator, measured: Measured, losses: Losses, title: str, held_out: int
 ) -> Tensor:
     """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
 
@@ -40,7 +40,7 @@ def report_picture(
         measured: see `Measured`
         losses: mean of every loss term per recording
         title: one line
-        held_out: whether training did not see these views
+        held_out: how many of these views training did not see
     """
     chosen, linear = measured.shown, measured.fitted.baselines[COMPARED].field
     columns = columns_of(measured.asked)
@@ -54,7 +54,7 @@ def report_picture(
             ["slider", "the editor", "2 keyframes"],
             [column_heading(*column) for column in columns],
             title,
-            f"{'held-out view' if held_out else 'view trained on,'} {evaluator.names[best_view(evaluator)]}"
+            shown_view(evaluator, held_out)
             + ("; gray: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
@@ -63,6 +63,17 @@ def report_picture(
         rows.append(_against_editor(measured))
     rows.append(_uniformity_plots(measured, losses))
     return stack_plots(sheet, rows)
+
+
+def shown_view(evaluator: Evaluator, held_out: int) -> str:
+    """Which view is shown, in words: the best one, and whether all figures are of it alone.
+
+    Args:
+        evaluator: the views that judge
+        held_out: how many of them training did not see
+    """
+    kind = ("view trained on,", "all figures are of one held-out view,", "held-out view")[min(held_out, 2)]
+    return f"{kind} {evaluator.names[best_view(evaluator)]}"
 
 
 def best_view(evaluator: Evaluator) -> int:

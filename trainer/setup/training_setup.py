@@ -76,6 +76,13 @@ class TrainingSetup:
         """What the edit is measured on: where nothing is held out, the views that it was trained on."""
         return self.held_out or self.train
 
+    @property
+    def judged_on(self) -> str:
+        """The views of `judging` in words, for what stands beside a figure: one view alone says little."""
+        if not self.held_out:
+            return "the views trained on"
+        return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
+
 
 def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, train
 from trainer import cli
+from trainer.evaluate.command import evaluate_folder
+from trainer.evaluate.options import EvaluateOptions
 from trainer.option_checks import check_options
 from trainer.options import FitOptions
 from trainer.pipeline.fit_and_report import load_evaluator
@@ -60,6 +63,18 @@ def test_the_slider_is_nearer_to_the_editor_than_two_keyframes(done: RunResult) 
     assert len(done.report["between"]) == 3
     for s, between in done.report["between"].items():
         assert between["psnr"] > between["keyframes2"] + 4.0, s
+
+
+def test_a_figure_from_one_held_out_view_says_that_it_is_one(
+    folder: Path, done: RunResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = quick_options(folder, out=folder / "few", views=4, image_size=48, steps=16, stages=1)
+    log = train(few, quiet=True).folder.log.read_text()
+    assert re.search(r"worst .* dB against \d+ recordings in 1 view\n", log)
+    assert "one held-out view alone: " in log
+    evaluate_folder(EvaluateOptions(few.out))
+    assert "to the one edited view held out, at 1, PSNR" in capsys.readouterr().out
+    assert re.search(r"\d+ held-out views: .* dB, ", done.folder.log.read_text())
 
 
 def test_equal_steps_of_the_slider_look_equally_large(done: RunResult) -> None:

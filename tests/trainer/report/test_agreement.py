@@ -102,11 +102,14 @@ def test_colors_that_the_members_can_have_are_found() -> None:
 
 
 def test_the_line_tells_decibels_share_and_remedy() -> None:
-    line = Agreement(psnr=12.34, unexplained=0.61).line("style")
+    alone = "one held-out view alone"
+    line = Agreement(psnr=12.34, unexplained=0.61).line("style", alone)
     assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
+    assert f"dB on {alone}" in line
     assert "61 % of the change; use a calmer style" in line
     assert "\n" not in line
-    assert Agreement(psnr=25.0, unexplained=0.1).line("style").startswith("the edited views agree")
+    agreed = Agreement(psnr=25.0, unexplained=0.1).line("style", alone)
+    assert agreed.startswith(f"the edited views agree: on {alone} the best colors reach 25.0 dB")
 
 
 def test_measuring_twice_gives_the_same_figures() -> None:
