@@ -156,11 +156,9 @@ def _image_size(where: str, frame: _Frame, path: Path) -> tuple[float, float]:
         picture = path.parent / (str(frame.file_path) + suffix)
         if os.path.isfile(picture):  # pathlib's raises where a name is too long
             try:
-                return picture_size(picture)
-            except ProgdfError:
-                raise ProgdfError(
-                    f"{picture}, which {where} names, is not an image; repair or replace it"
-                ) from None
+                return picture_size(picture, calibrated=True)
+            except ProgdfError as error:
+                raise ProgdfError(f"{where} has no image size, and {error}") from None
     raise ProgdfError(f"{where} has no image size; expected w and h")
 
 

@@ -77,7 +77,8 @@ class FolderEditor:
     def _read_undistorted(self, where: Path, view: View) -> tuple[Tensor, Tensor]:
         """A picture at its view's size, straight, and which of its pixels were taken. [H,W,3], [H,W] bool"""
         camera = view.camera
-        picture = read_picture(_picture(where, camera.name, self.bent), size=(camera.width, camera.height))
+        path, size = _picture(where, camera.name, self.bent), (camera.width, camera.height)
+        picture = read_picture(path, size, calibrated=self.bent)
         if not self.bent or camera.lens is None:
             return picture, torch.ones_like(picture[..., 0], dtype=torch.bool)
         return undistort(picture, camera.K, camera.lens)

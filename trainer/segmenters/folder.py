@@ -54,7 +54,7 @@ def _file(folder: Path, camera: Camera) -> Path | None:
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
     size = (camera.width, camera.height)
-    gray = flatten_onto(open_picture(path, size), "black").convert("L")
+    gray = flatten_onto(open_picture(path, size, calibrated=bent), "black").convert("L")
     if gray.size != size:
         gray = gray.resize(size, Image.Resampling.BOX)
     mask = torch.from_numpy(np.asarray(gray, dtype=np.float32) / 255.0)

@@ -27,10 +27,10 @@ def test_a_picture_without_a_size_that_can_be_read_is_one_line(
     picture = tmp_path / content["frames"][0]["file_path"]
     picture.write_text("no picture")
     path = written(tmp_path / "t.json", content)
-    assert f"{picture}, which frame 0" in refusal(load_cameras, path)
+    assert f"has no image size, and {picture} cannot be read as a picture" in refusal(load_cameras, path)
     Image.new("RGB", (320, 200)).save(picture)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
-    assert f"{picture}, which frame 0" in refusal(load_cameras, path)
+    assert f"has no image size, and {picture} cannot be read as a picture" in refusal(load_cameras, path)
 
 
 def test_distortion_of_a_kind_that_programs_read_differently_is_refused(tmp_path: Path) -> None:

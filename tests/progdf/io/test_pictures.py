@@ -10,11 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.images import contact_sheet, flatten_onto, open_picture, picture_size, write_image
+from progdf.io.images import (
+    _TURNS,
+    contact_sheet,
+    flatten_onto,
+    open_picture,
+    picture_size,
+    read_picture,
+    write_image,
+)
 from tests.helpers.refused import refusal
 
 
@@ -75,14 +83,13 @@ def test_an_image_for_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> Non
         write_image(tmp_path / "taken" / "a.png", torch.zeros(1, 1, 3))
 
 
+def chunk(kind: bytes, content: bytes) -> bytes:
+    """A part of a .png."""
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
 def bomb(path: Path, width: int, height: int) -> Path:
     """A PNG of a few kilobytes that claims many pixels."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
-
     header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
     rows = chunk(b"IDAT", zlib.compress(b"\0" * 2_000_000, 9))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + rows + chunk(b"IEND", b""))
@@ -119,3 +126,135 @@ def test_transparency_counts_as_the_paper(tmp_path: Path) -> None:
     assert flatten_onto(open_picture(tmp_path / "a.png"), "white").getpixel((0, 0)) == (255, 255, 255)
     assert flatten_onto(open_picture(tmp_path / "a.png"), "black", (8, 4)).getpixel((0, 0)) == (0, 0, 0)
     assert flatten_onto(open_picture(tmp_path / "b.png"), "white").getpixel((0, 0)) == (7, 7, 7)
+
+
+RAMP = np.linspace(0.0, 1.0, 64)[None, :].repeat(16, axis=0)
+"""From black on the left to white on the right. [16,64]"""
+
+
+def write_png(path: Path, ramp: np.ndarray, color: int, *extra: tuple[bytes, bytes]) -> Path:
+    """A .png of 16 bits a channel: `color` 0 gray, 2 RGB, 4 and 6 the same with alpha; more chunks last."""
+    gray = np.round(ramp * 65535).astype(np.uint16)[..., None]
+    channels = [gray] * (1 if color in (0, 4) else 3) + [np.full_like(gray, 65535)] * (color >= 4)
+    pixels = np.concatenate(channels, axis=2).astype(">u2")
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", *ramp.shape[::-1], 16, color, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows)), *extra, (b"IEND", b"")]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*parts) for parts in chunks))
+    return path
+
+
+def write_tiff(
+    path: Path, pixels: bytes, bits: int, kind: int = 1, interpretation: int = 1, order: str = "<"
+) -> Path:
+    """A .tiff of one gray strip as large as `RAMP`; `kind` 1 without, 2 with a sign, 3 floating-point."""
+    height, width = RAMP.shape
+    tags = {256: width, 257: height, 258: bits, 259: 1, 262: interpretation, 273: 8, 277: 1, 278: height}
+    tags |= {279: len(pixels), 339: kind}
+    entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in sorted(tags.items()))
+    start = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", 8 + len(pixels))
+    path.write_bytes(start + pixels + struct.pack(f"{order}H", len(tags)) + entries + b"\0\0\0\0")
+    return path
+
+
+def twelve_bits(ramp: np.ndarray) -> bytes:
+    """Two numbers in three bytes."""
+    a, b = np.round(ramp * 4095).astype(np.uint16).reshape(-1, 2).T
+    return np.stack([a >> 4, (a & 15) << 4 | b >> 8, b & 255], axis=1).astype(np.uint8).tobytes()
+
+
+def whole_numbers(ramp: np.ndarray, form: str) -> bytes:
+    return np.round(ramp * 65535).astype(form).tobytes()
+
+
+RAMPS = {
+    "8-bit gray .png": lambda p: Image.fromarray(np.round(RAMP * 255).astype(np.uint8)).save(p / "a.png"),
+    "16-bit gray .png": lambda p: write_png(p / "a.png", RAMP, 0),
+    "16-bit RGB .png": lambda p: write_png(p / "a.png", RAMP, 2),
+    "16-bit gray .png with alpha": lambda p: write_png(p / "a.png", RAMP, 4),
+    "16-bit RGB .png with alpha": lambda p: write_png(p / "a.png", RAMP, 6),
+    "8-bit palette .gif": lambda p: Image.fromarray(np.round(RAMP * 255).astype(np.uint8)).save(p / "a.gif"),
+    "8-bit CMYK .jpg": lambda p: (
+        Image.fromarray(np.round(RAMP * 255).astype(np.uint8)).convert("CMYK").save(p / "a.jpg", quality=100)
+    ),
+    "12-bit .tiff": lambda p: write_tiff(p / "a.tiff", twelve_bits(RAMP), 12),
+    "16-bit .tiff": lambda p: write_tiff(p / "a.tiff", whole_numbers(RAMP, "<u2"), 16),
+    "16-bit .tiff, big-endian": lambda p: write_tiff(p / "a.tiff", whole_numbers(RAMP, ">u2"), 16, order=">"),
+    "16-bit .tiff, white is zero": lambda p: write_tiff(
+        p / "a.tiff", whole_numbers(1 - RAMP, "<u2"), 16, interpretation=0
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", RAMPS)
+def test_a_ramp_of_any_depth_is_a_ramp(kind: str, tmp_path: Path) -> None:
+    RAMPS[kind](tmp_path)
+    found = read_picture(next(tmp_path.iterdir())).numpy()
+    np.testing.assert_allclose(found, RAMP[..., None].repeat(3, axis=2), atol=1.01 / 255)
+
+
+@pytest.mark.parametrize("form", ["<u4", "<i4", "<f4", "<i2"])
+def test_numbers_without_a_white_are_refused(form: str, tmp_path: Path) -> None:
+    kind = {"u": 1, "i": 2, "f": 3}[form[1]]
+    path = write_tiff(tmp_path / "a.tiff", (RAMP * 1000).astype(form).tobytes(), 8 * int(form[2]), kind)
+    assert "which have no white; save it in gray or RGB with 8 or 16 bits" in refusal(open_picture, path)
+    Image.new("LAB", (4, 4)).save(tmp_path / "lab.tiff")
+    assert "holds LAB colors; save it in gray or RGB" in refusal(open_picture, tmp_path / "lab.tiff")
+
+
+def test_the_transparent_gray_of_16_bits_is_transparent(tmp_path: Path) -> None:
+    path = write_png(tmp_path / "a.png", RAMP, 0)
+    content = path.read_bytes()
+    at = content.index(b"IDAT") - 4
+    path.write_bytes(content[:at] + chunk(b"tRNS", b"\0\0") + content[at:])
+    found = read_picture(path)
+    assert found[:, 0].min() == 1.0, "white paper"
+    assert found[:, 1].max() < 0.1
+
+
+# A turned picture's corners: its upper left is red, its upper right green.
+CORNERS = np.zeros((32, 64, 3), np.uint8)
+CORNERS[:16, :32], CORNERS[:16, 32:] = (255, 0, 0), (0, 255, 0)
+INVERSE = {**{i: i for i in range(1, 8)}, 6: 8, 8: 6}
+"""The turn that takes a turn back."""
+
+
+def stored_turned(path: Path, orientation: int) -> Path:
+    """`CORNERS` stored as a camera that was held so would, with the tag that says it."""
+    turn = _TURNS.get(INVERSE[orientation])
+    picture = Image.fromarray(CORNERS)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    turned = picture.transpose(turn) if turn is not None else picture
+    turned.save(path, exif=exif, **({"quality": 95} if path.suffix == ".jpg" else {}))
+    with Image.open(path) as again:
+        assert ImageOps.exif_transpose(again).getpixel((8, 8))[0] > 200, "as Pillow turns it, too"
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tiff"])
+def test_a_picture_that_is_stored_turned_is_read_upright(
+    orientation: int, suffix: str, tmp_path: Path
+) -> None:
+    path = stored_turned(tmp_path / f"a{suffix}", orientation)
+    assert picture_size(path) == (64, 32)
+    found = read_picture(path, (64, 32)).numpy()
+    assert np.abs(found[4:12, 4:28] - CORNERS[8, 8] / 255).max() < 0.1
+    assert np.abs(found[4:12, 36:60] - CORNERS[8, 40] / 255).max() < 0.1
+    if orientation == 1:
+        assert open_picture(path, calibrated=True).size == (64, 32)
+    else:
+        said = refusal(lambda p: open_picture(p, calibrated=True), path)
+        assert f"EXIF orientation {orientation}), and nothing says whether its camera was calibrated" in said
+
+
+def test_a_png_that_says_behind_its_pixels_how_it_is_stored_is_read_upright(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    path = write_png(tmp_path / "a.png", RAMP[:, ::-1], 0, (b"eXIf", exif.tobytes()[6:]))
+    assert torch.equal(read_picture(path), read_picture(write_png(tmp_path / "b.png", RAMP, 0)))
+    assert "EXIF orientation 3" in refusal(lambda p: open_picture(p, calibrated=True), path)
+    exif[ExifTags.Base.Orientation] = 6
+    write_png(path, RAMP, 0, (b"eXIf", exif.tobytes()[6:]))
+    assert "16x64 pixels, its view 64x16" in refusal(lambda p: open_picture(p, (64, 16)), path)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from progdf.camera import Camera
@@ -26,10 +26,12 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear
 from trainer import segmenters
+from trainer.editors.folder import FolderEditor
 from trainer.regions.from_pictures import RegionSettings, region_kinds
 from trainer.segmenters import SEGMENTERS, SegmenterSettings
 from trainer.segmenters.folder import read_masks
 from trainer.segmenters.grounded_sam import normalize_prompt
+from trainer.views.view import View
 
 SIZE, VIEWS = 96, 6
 DEMO = bear(1500)
@@ -122,6 +124,27 @@ def test_masks_of_photographs_are_straightened(tmp_path: Path) -> None:
     # barrel distortion drew the picture together: straightened, its edges show less of the ramp
     assert float(unbent[SIZE // 2, -1]) < float(straight[SIZE // 2, -1]) - 0.02
     assert float(unbent[SIZE // 2, SIZE // 2]) == pytest.approx(0.5, abs=0.02)
+
+
+def test_pictures_that_are_stored_turned_are_turned_and_photographs_of_known_cameras_refused(
+    tmp_path: Path,
+) -> None:
+    camera = six_cameras()[0]
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    ramp = np.linspace(255, 0, SIZE).astype(np.uint8)[None].repeat(SIZE, axis=0)
+    Image.fromarray(ramp).save(tmp_path / f"{camera.name}.png", exif=exif)
+    mask = read_masks(tmp_path, [camera])[0]
+    assert mask is not None
+    assert mask[0, 0] < 0.1 < 0.9 < mask[-1, -1]
+    with pytest.raises(ProgdfError, match=r"stored turned \(EXIF orientation 3\)"):
+        read_masks(tmp_path, [camera], bent=True)
+    black = torch.zeros(SIZE, SIZE, 3)
+    view = View(camera, black, mask, black, (0, 0, SIZE, SIZE))
+    turned = FolderEditor({1.0: tmp_path}, (1.0,)).edit(view, 1.0)
+    assert torch.equal(turned[..., 0], mask)
+    with pytest.raises(ProgdfError, match=r"stored turned \(EXIF orientation 3\)"):
+        FolderEditor({1.0: tmp_path}, (1.0,), bent=True).edit(view, 1.0)
 
 
 def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None:
