@@ -227,13 +227,14 @@ def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     check_regular(path)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is lower
-            opened = Image.open(path, formats=FORMATS)
-        with opened:
-            width, height = opened.size
-            if width * height > MOST_PIXELS:
-                raise ProgdfError(f"{path} has {width}x{height} pixels, too many; scale it down")
-            yield opened
+            # the limit here is lower than Pillow's; what is damaged is read or refused, not both
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", UserWarning)
+            with Image.open(path, formats=FORMATS) as opened:
+                width, height = opened.size
+                if width * height > MOST_PIXELS:
+                    raise ProgdfError(f"{path} has {width}x{height} pixels, too many; scale it down")
+                yield opened
     except ProgdfError:
         raise
     except Exception as error:  # every format's reader raises its own when a file is damaged

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from progdf.cli.info import describe
 from progdf.errors import ProgdfError
@@ -28,7 +28,8 @@ from progdf.field.trajectory import load_trajectory, save_trajectory
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.io.images import open_picture
+from progdf.io.images import read_picture
+from progdf.io.json_values import plain
 from progdf.io.npy import open_npy
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_gdf, changed_json, changed_parts
@@ -39,7 +40,8 @@ from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.sessions import bear_files, saved_session
 from tests.helpers.stacks import recording_of
 from trainer.store.state import StateFolder
-from viewer.files import session, timeline_file
+from viewer.files import regions, session, timeline_file
+from viewer.state.selection import SelectionState, add_region, select
 
 SECONDS, BYTES = 10, 1 << 30
 """What one input may take, at most."""
@@ -56,6 +58,22 @@ def read_gdf(path: Path) -> None:
     gdf = load_gdf(path)
     for s in (0.0, 0.5, 1.0):
         assert bool(gdf.field.offsets(s).isfinite().all())
+
+
+def use_session(path: Path) -> None:
+    """Rename and save the regions of a session, which touches nothing but region files of its folder."""
+
+    def others() -> dict[Path, int]:
+        files = (file for file in path.parents[1].rglob("*") if file.is_file())
+        return {file: file.stat().st_mtime_ns for file in files if not file.match("s/*.region.npy")}
+
+    before = others()
+    opened = session.open_session(path, path.parents[1] / "memory")
+    state, total = opened.view.selection, len(opened.document.scene)
+    for i, region in enumerate(state.regions):
+        regions.region_file(region, total)
+        state = regions.rename(state, i, f"{region.name} {i}", total)
+    assert others() == before
 
 
 def read_state(path: Path) -> None:
@@ -93,7 +111,15 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
         "keys": [{"frame": 0, "strengths": {}, "camera": {"pivot": [0, 1, 0], "distance": 4}}, {"frame": 9}],
     }  # fmt: skip
     np.save(folder / "a.npy", np.arange(40, dtype=np.float32))
-    Image.fromarray(np.random.default_rng(1).integers(0, 255, (20, 30, 3), np.uint8)).save(folder / "a.png")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    noise = np.random.default_rng(1).integers(0, 255, (20, 30, 3), np.uint8)
+    pictures = [folder / f"a.{suffix}" for suffix in ("png", "jpg", "webp", "tiff", "gif")]
+    for path in pictures:
+        Image.fromarray(noise).save(path, **({} if path.suffix == ".gif" else {"exif": exif}))
+    for path in (folder / "deep.png", folder / "deep.tiff"):
+        Image.fromarray(noise[..., 0].astype(np.uint16) * 257).save(path)
+        pictures.append(path)
     save_trajectory(
         folder / "t.safetensors",
         recording_of(edit),
@@ -105,6 +131,11 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
     state.save("part", {"a": torch.arange(4.0)}, {"pgs": {"step": 3}, "list": [1, 2.5]})
     (folder / "s").mkdir()
     saved = saved_session(bear_files(folder / "s"))
+    opened, table = session.open_session(saved), json.loads(saved.read_text())
+    mask = np.arange(len(opened.document.scene)) % 3 == 0
+    kept = add_region(select(SelectionState(), mask), "third", folder / "s" / "third.region.npy")
+    table["view"]["selection"] = plain(replace(kept, hidden=kept.members))
+    saved.write_text(json.dumps(table))
     read: Callable[[Path], bytes] = Path.read_bytes
 
     def both(content: bytes) -> list[Change]:
@@ -116,11 +147,11 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
         **more_inputs(folder, reader),
         "ply": ("x.ply", load_ply, plys),
         "gdf": ("x.gdf", read_gdf, [changed_gdf(gdf), changed_gdf(gdf), changed_bytes(gdf)]),
-        "session": ("s/x.session.json", session.open_session, both(read(saved))),
+        "session": ("s/x.session.json", use_session, both(read(saved))),
         "timeline": ("x.json", lambda p: timeline_file.load(p, ()), both(json.dumps(timeline).encode())),
         "cameras": ("x.json", load_cameras, [c for content in camera_files for c in both(content)]),
         "npy": ("x.npy", open_npy, [changed_bytes(read(folder / "a.npy"))]),
-        "png": ("x.png", open_picture, [changed_bytes(read(folder / "a.png"))]),
+        "pictures": ("x.png", read_picture, [changed_bytes(read(path)) for path in pictures]),
         "trajectory": (
             "x.safetensors",
             load_trajectory,
@@ -153,7 +184,7 @@ READERS = (
     "timeline",
     "cameras",
     "npy",
-    "png",
+    "pictures",
     "trajectory",
     "state",
     "run.json",

@@ -38,6 +38,12 @@ VALUES: list[Any] = [
         "/",
     ),
     *("\x1b[2J\n", "ä" * 300, "9" * 5000, [], {}, [[]], [0] * 5000, {"a": {"b": []}}, "../../../etc/passwd"),
+    *(
+        "../victim.region.npy",
+        "../../victim.region.npy",
+        "/tmp/../victim.region.npy",
+        "n" * 300 + ".region.npy",
+    ),
 ]
 """In place of what a file holds."""
 
