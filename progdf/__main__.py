@@ -62,7 +62,8 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
     if logging.lastResort is not None:  # prints warnings where no program has said otherwise
         logging.lastResort.setFormatter(PrintableFormatter())
     try:
-        with _raise_on_signals(list(arguments[:1]) != ["view"]):
+        _check_current_folder()
+        with _raise_on_signals():
             status = run(arguments)
             if sys.stdout is not None:
                 sys.stdout.flush()  # here, where a full disk or a closed pipe can still be reported
@@ -127,16 +128,20 @@ def _save_traceback() -> str:
     return f"please report it; no file could be written with the details: {details}"
 
 
-@contextmanager
-def _raise_on_signals(wanted: bool) -> Iterator[None]:
-    """SIGTERM and a closed terminal end a command as Ctrl-C does, with its files removed and a hint.
+def _check_current_folder() -> None:
+    """ProgdfError where it was removed: torch's libraries would end the process with a line of their own."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise ProgdfError("the current folder was removed; change to one that exists") from None
 
-    Args:
-        wanted: false for the window, whose loop has its own way
-    """
+
+@contextmanager
+def _raise_on_signals() -> Iterator[None]:
+    """SIGTERM and a closed terminal end a command as Ctrl-C does, with its files removed and a hint."""
     names = ("SIGTERM", "SIGHUP")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    if not wanted or threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
+from progdf.terminal import print_line
 from trainer.evaluate.options import EvaluateOptions
 from trainer.regions.options import RegionOptions, ViewsOptions
 
@@ -53,7 +54,8 @@ def region(argv: Sequence[str]) -> int:
     options = parse_options(RegionOptions, argv, "progdf region")
     from trainer.regions.command import show
 
-    print(show(options))
+    for line in show(options):
+        print_line(line)
     return 0
 
 
@@ -62,5 +64,5 @@ def views(argv: Sequence[str]) -> int:
     options = parse_options(ViewsOptions, argv, "progdf views")
     from trainer.regions.originals import write
 
-    print(write(options))
+    print_line(write(options))
     return 0

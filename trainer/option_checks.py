@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 
 from progdf.errors import ProgdfError
+from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
 from trainer.options import (
     LARGEST_SEED,
@@ -88,6 +89,11 @@ def check_name(name: str) -> str:
     if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
         raise ProgdfError(
             f"'{name}' is not a valid layer name; choose one with --name, for example --name shirt"
+        )
+    if not is_portable(name):
+        raise ProgdfError(
+            f"'{name}' is not a valid layer name, as Windows cannot have a file of that name; "
+            "choose one with --name, for example --name shirt"
         )
     if len(f"{name}.gdf".encode()) > LONGEST_NAME:
         raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")

@@ -22,6 +22,7 @@ from progdf.field.baked import AttributeBases, BakedField
 from progdf.formats.scene_file import load_scene, rotate_about_x, scene_name
 from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
+from progdf.io.atomic import check_not_an_input
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import print_line
@@ -78,6 +79,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse_options(RebindOptions, argv, "progdf rebind")
     if options.out.suffix.lower() != ".gdf":
         raise ProgdfError(f"{options.out} is not a .gdf file; give the edit a name that ends in .gdf")
+    check_not_an_input(options.out, [options.edit, options.source, options.target])
     a, b = load_scene(options.source), load_scene(options.target)
     gdf = load_gdf(options.edit, a, scene_name(options.source))
     match = match_scenes(a, b)

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -23,6 +23,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _TEMPORARY = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9})-\w{8}(\..*)?", re.DOTALL)
 _A_DAY = 86400.0
+_DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.I | re.S)
 
 
 @contextmanager
@@ -52,7 +53,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise ProgdfError(f"the folder {target.parent} does not exist; create it first")
     remove_abandoned(target.parent)
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
-    temporary_file = target.parent / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}"
+    temporary_file = target.parent / f"{_temporary_name()}{target.suffix}"
     try:
         _create(temporary_file, target.stat().st_mode & 0o777 if target.exists() else None)
     except OSError as error:
@@ -67,6 +68,24 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise write_error(target, full) from full
     finally:
         temporary_file.unlink(missing_ok=True)
+
+
+def temporary_subfolder(folder: Path) -> Path:
+    """A new empty folder in `folder`, for what is moved out of it when it is whole; the caller removes it.
+
+    What processes that were killed have left there goes.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    remove_abandoned(folder)
+    made = folder / _temporary_name()
+    made.mkdir()
+    return made
+
+
+def _temporary_name() -> str:
+    return f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _create(path: Path, mode: int | None) -> None:
@@ -92,24 +111,32 @@ def _copy_into(target: Path) -> Iterator[Path]:
             shutil.copyfileobj(source, sink)
 
 
+def is_portable(name: str) -> bool:
+    """Whether every system can have a file of this name, also with an ending: Windows is the strictest."""
+    return not (_DEVICE.fullmatch(name) or set('<>:"/\\|?*') & set(name) or name.endswith((".", " ")))
+
+
 def is_temporary(name: str) -> bool:
-    """Whether a file's name is one that `atomic_write` gives while it writes."""
+    """Whether a name is one that `atomic_write` or `temporary_subfolder` gives while something is written."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove the temporary files in a folder whose process was killed; of other machines, those a day old."""
+    """Remove what processes that were killed left in a folder while they wrote; of other machines, what is a
+    day old."""
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             found = _TEMPORARY.fullmatch(entry.name)
-            if found is None or not entry.is_file(follow_symlinks=False):
+            if found is None or entry.is_symlink():
                 continue
             with suppress(OSError):
                 if found["host"] == _HOST and sys.platform != "win32":
                     abandoned = not _is_running(int(found["process"]))
                 else:
                     abandoned = time.time() - entry.stat(follow_symlinks=False).st_mtime > _A_DAY
-                if abandoned:
+                if abandoned and entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                elif abandoned and entry.is_file(follow_symlinks=False):
                     os.unlink(entry.path)
 
 
@@ -121,6 +148,13 @@ def _is_running(process: int) -> bool:
     except (PermissionError, OverflowError):
         pass
     return True
+
+
+def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
+    """Raises ProgdfError where the result would take the place of what it is made from."""
+    for path in inputs:
+        if out.exists() and path.exists() and os.path.samefile(out, path):
+            raise ProgdfError(f"{out} is one of the files to read; choose another name for the result")
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:

@@ -29,6 +29,7 @@ from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet, read_picture, to_picture, write_image
 from progdf.io.picture_camera import camera_chunk
 from progdf.rasterize import render
+from progdf.terminal import print_line
 from trainer.option_checks import check_ranges
 from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions
 from trainer.plan import Plan, make_plan
@@ -157,17 +158,16 @@ def main(argv: Sequence[str]) -> int:
     show = SHOWS[options.scene]
     scene = show.make(show.size if options.size is None else options.size, options.seed)
     write_scene(options.out, scene)
-    print(f"{options.scene}: {len(scene.gaussians)} Gaussians in {options.out / 'scene.ply'}")
+    print_line(f"{options.scene}: {len(scene.gaussians)} Gaussians in {options.out / 'scene.ply'}")
     gdfs = {name: load_gdf(path, scene.gaussians) for name, path in _train(options, show, scene).items()}
     print()
     for picture in write_pictures(options.out, scene, gdfs, show.view):
-        print(f"look at {picture}")
+        print_line(f"look at {picture}")
     command = ["view", str(options.out / "scene.ply"), *(str(_gdf(options.out, edit)) for edit in show.edits)]
     command += ["--background", _hex(scene.background)]
-    print(
-        f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:\n  progdf {shlex.join(command)}",
-        flush=True,
-    )
+    print(f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:")
+    print_line(f"  progdf {shlex.join(command)}")
+    sys.stdout.flush()
     if options.window and _has_display():
         return _open_window(command)
     return 0

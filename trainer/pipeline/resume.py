@@ -54,11 +54,14 @@ def load_region(out: Path) -> Region | None:
     if saved is None:
         return None
     with state.restore_part(REGION):
-        return Region(saved.values["name"], saved.tensors["members"], saved.tensors["score"])
+        score = saved.tensors["score"]
+        if score.dtype != torch.float32 or score.ndim != 1 or not bool(((score >= 0) & (score <= 1)).all()):
+            raise ValueError("the score is none")
+        return Region(saved.values["name"], saved.tensors["members"], score)
 
 
 def decide_resume(
-    folder: RunFolder, plan: Plan, region: Region, threads: int, resume: bool
+    folder: RunFolder, plan: Plan, region: Region, count: int, threads: int, resume: bool
 ) -> ResumeDecision:
     """Find out what is to be done, and make the folder ready for it.
 
@@ -66,6 +69,7 @@ def decide_resume(
         folder: opened and locked
         plan: of the run that is asked for
         region: what may change
+        count: Gaussians in the scene
         threads: that are asked for
         resume: go on with what was stopped
 
@@ -92,6 +96,9 @@ def decide_resume(
                 )
         remedy = "restore it and continue with --resume, or train again in another folder"
         _check_pictures(folder, saved.pictures, now.pictures, remedy)
+        with folder.state.restore_part(REGION):
+            if len(region.score) != count:
+                raise ValueError("the region is another scene's")
         notes = []
         if saved.torch != now.torch:
             notes.append(f"torch was {saved.torch} and is {now.torch}: the last bits may differ")

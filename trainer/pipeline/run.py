@@ -90,7 +90,7 @@ def train(plan: Plan, out: Path, threads: int = 0, resume: bool = False, quiet: 
         region = parse_region(plan.region.region, scene, plan.name, kinds, notes.append)
     folder = open_run_folder(out, plan.edit)
     with interrupt_on_signals(), lock_folder(folder), explain_stop(folder):
-        session = decide_resume(folder, plan, region, wanted_threads(threads), resume)
+        session = decide_resume(folder, plan, region, len(scene), wanted_threads(threads), resume)
         log = RunLog(folder.log, quiet, progress=folder.progress)
         try:
             for note in (*session.notes, *notes):

@@ -39,8 +39,8 @@ _FOV, _FILLED = math.radians(45.0), 0.9
 _SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
 
 
-def show(options: RegionOptions) -> str:
-    """Write what the options ask for; a line with the region's count, and where it lies.
+def show(options: RegionOptions) -> list[str]:
+    """Write what the options ask for; lines on what was found, the last with the region's count.
 
     Raises:
         ProgdfError: scene, region or camera that do not work, or an output that is neither .png nor .npy.
@@ -73,7 +73,7 @@ def show(options: RegionOptions) -> str:
     said.append(
         f"wrote {options.out}: {format_count(len(region))} of {group_digits(len(scene))} ({share:.3g} %)"
     )
-    return "\n".join(said)
+    return said
 
 
 def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:

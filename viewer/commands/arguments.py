@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Protocol
 
 from progdf.camera import Camera
@@ -159,13 +157,6 @@ def parse_comparison(split: str | None, amplify: str | None) -> Comparison:
             raise ProgdfError(f"--difference must be between 1 and {MOST_AMPLIFIED:g}, got {amplify}")
         return Comparison("difference", amplify=float(amplify))
     return Comparison()
-
-
-def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
-    """Raises ProgdfError where the result would take the place of what it is made from."""
-    for path in inputs:
-        if out.exists() and path.exists() and os.path.samefile(out, path):
-            raise ProgdfError(f"{out} is one of the files to read; choose another name for the result")
 
 
 def join_arguments(argv: Sequence[str]) -> list[str]:

@@ -14,7 +14,7 @@ from progdf.formats.load_report import format_count
 from progdf.formats.ply import load_ply, save_ply
 from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.terminal import print_line
 from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
@@ -62,7 +62,7 @@ def export(argv: Sequence[str]) -> int:
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the edited scene a name that ends in .ply")
     found = opening.open_stack(options, unset=1.0)
-    arguments.check_not_an_input(options.out, found.files)
+    check_not_an_input(options.out, found.files)
     gdfs, states = found.document.gdfs, visible_layers(found.view)
     layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
     edited = compose_layers(found.document.scene, layers, found.view.blend)

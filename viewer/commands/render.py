@@ -17,7 +17,7 @@ from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.picture_camera import camera_chunk
 from progdf.terminal import print_line
 from progdf.torch_threads import one_thread
@@ -52,7 +52,7 @@ def render(argv: Sequence[str]) -> int:
     size = None if options.size is None else arguments.parse_size(options.size)
     one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
     found = opening.open_stack(options, unset=0.0 if one_moves else 1.0)
-    arguments.check_not_an_input(options.out, found.files)
+    check_not_an_input(options.out, found.files)
     scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
     view = replace(view, compare=_comparison(options, view.compare))
     if options.alpha and (view.compare.mode != "off" or one_moves or options.timeline is not None):

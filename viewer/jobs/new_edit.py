@@ -12,6 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+from progdf.io.atomic import is_portable
+
 Setting = Literal["color", "amount", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
 
@@ -129,7 +131,8 @@ class NewEdit:
     def layer_name(self) -> str:
         """The name that the layer and its file will have."""
         words = self.name.strip() or self.suggested_name
-        return re.sub(r"[/\\\x00-\x1f]", "-", words).lstrip(".")[:80] or "edit"
+        name = re.sub(r"[<>:\"/\\|?*\x00-\x1f]", "-", words).lstrip(".")[:80].rstrip(" .") or "edit"
+        return name if is_portable(name) else f"edit {name}"
 
     @property
     def suggested_name(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from PIL import Image
 
 from progdf.errors import ProgdfError
 from progdf.io import images as pictures
-from progdf.io.atomic import write_error
+from progdf.io.atomic import is_temporary, temporary_subfolder, write_error
 from viewer.state.view_state import ViewState
 
 Pixels = NDArray[np.uint8]
@@ -110,7 +109,7 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
     there = folder.is_dir()
     try:  # within a folder that is there, which may be a link, a mounted disk or where one stands
         home = folder if there else folder.absolute().parent
-        drawn = Path(tempfile.mkdtemp(dir=home, prefix=f".{folder.name}."))
+        drawn = temporary_subfolder(home)
     except OSError as error:
         raise write_error(folder, error) from None
     try:
@@ -120,7 +119,6 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
             for path in sorted(drawn.iterdir()):
                 path.rename(folder / path.name)
         else:
-            drawn.chmod(0o755)
             drawn.rename(folder)
     except OSError as error:
         raise write_error(folder, error) from error
@@ -131,7 +129,9 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
 def check_sequence(folder: Path) -> None:
     """Raises ProgdfError where no folder of frames can be made: its place is taken, or its parent missing."""
     try:
-        taken = os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir()))
+        taken = os.path.lexists(folder) and (
+            not folder.is_dir() or not all(is_temporary(path.name) for path in folder.iterdir())
+        )
     except OSError as error:
         raise write_error(folder, error) from None
     if taken:

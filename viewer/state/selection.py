@@ -17,6 +17,7 @@ import numpy as np
 from msgspec import Meta
 
 from progdf.errors import ProgdfError
+from progdf.io.atomic import is_portable
 from progdf.scene.neighborhood import Neighborhood
 from progdf.scene.selection import Mask, combine
 
@@ -195,7 +196,8 @@ def free_name(
 ) -> str:
     """A name on one line, for a file too, with a number where a region has it already, or it is taken."""
     kept = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(wanted.split()))
-    name = kept.strip(" .")[:LONGEST_NAME] or "region"
+    name = kept.strip(" .")[:LONGEST_NAME].rstrip(" .") or "region"
+    name = name if is_portable(name) else f"region {name}"
     taken, free, number = {region.name.lower() for region in state.regions}, name, 2
     while free.lower() in taken or is_taken(free):
         free, number = f"{name}-{number}", number + 1

@@ -20,13 +20,22 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numba
 from filelock import FileLock
-from numba import config
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.user_folders import cache_folder, is_private, temporary_folder
+
+try:
+    import numba
+    from numba import config
+except Exception as error:  # it reads its settings on import, and raises whatever is wrong with them
+    raise ProgdfError(
+        f"numba cannot be loaded ({type(error).__name__}: {error}); check the variables NUMBA_…, and "
+        ".numba_config.yaml in the current folder"
+    ) from error
+if config.DISABLE_JIT:
+    raise ProgdfError("without numba's compiler no kernel works; unset NUMBA_DISABLE_JIT")
 
 log = logging.getLogger("progdf")
 

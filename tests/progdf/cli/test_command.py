@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -13,10 +14,13 @@ import pytest
 
 import progdf
 from progdf.__main__ import COMMANDS, main
+from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.io.atomic import atomic_write
+from progdf.rasterize.cpu import jit
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import random_gaussians
+from trainer.regions.options import RegionOptions, ViewsOptions
 
 
 def stderr_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -196,9 +200,14 @@ def test_too_little_memory_is_one_line(
 
 
 @pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("command", ["check", "view"])
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
 def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
-    number: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str,
+    number: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def writing(argv: object) -> None:
         with atomic_write(tmp_path / "a.txt") as temporary_file:
@@ -206,10 +215,52 @@ def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
             os.kill(os.getpid(), getattr(signal, number))
 
     monkeypatch.setattr("progdf.cli.check.main", writing)
-    assert main(["check", "scene.ply"]) == 130
+    monkeypatch.setattr("viewer.commands.cli.view", writing)
+    assert main([command, "scene.ply"]) == 130
     assert capsys.readouterr().err == "progdf: interrupted\n"
     assert not list(tmp_path.iterdir())
     assert signal.getsignal(getattr(signal, number)) == signal.SIG_DFL
+
+
+def test_a_current_folder_that_was_removed_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert stderr_of(capsys, "info", "/scene.ply") == (
+        "progdf: the current folder was removed; change to one that exists\n"
+    )
+
+
+def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    words, settings = [sys.executable, "-c", "import progdf.rasterize.cpu.jit"], {"NUMBA_NUM_THREADS": "0"}
+    ran = subprocess.run(words, capture_output=True, text=True, env=os.environ | settings, cwd=ROOT)
+    assert ran.stderr.splitlines()[-1].startswith(
+        "progdf.errors.ProgdfError: numba cannot be loaded (ValueError"
+    )
+    monkeypatch.setattr(jit.config, "DISABLE_JIT", 1)
+    with pytest.raises(ProgdfError, match="unset NUMBA_DISABLE_JIT"):
+        runpy.run_path(str(jit.__file__))
+
+
+@pytest.mark.parametrize(
+    ("words", "writer"),
+    [
+        (["views", "scene.ply", "--out"], "trainer.regions.originals.write"),
+        (["region", "scene.ply", "all", "-o"], "trainer.regions.command.show"),
+    ],
+)
+def test_control_characters_of_own_arguments_are_escaped(
+    words: list[str], writer: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def wrote(options: ViewsOptions | RegionOptions) -> str | list[str]:
+        said = f"wrote {options.out}"
+        return said if isinstance(options, ViewsOptions) else [said]
+
+    monkeypatch.setattr(writer, wrote)
+    assert main([*words, "a\x1b[2J\n.png"]) == 0
+    assert capsys.readouterr().out == "wrote a\\x1b[2J\\n.png\n"
 
 
 def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +287,11 @@ def test_tests_pass_where_signals_arrive_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["a\x1b[2J", "a\nb", "a\\b", "a/b", ".a", "n" * 252, "\N{CJK UNIFIED IDEOGRAPH-4E16}" * 90]
+    "name",
+    [
+        *("a\x1b[2J", "a\nb", "a\\b", "a/b", ".a", "n" * 252, "\N{CJK UNIFIED IDEOGRAPH-4E16}" * 90),
+        *("CON", "nul.x", "a:b", "com1 .y", "a.", "a ", "what?"),
+    ],
 )
 def test_a_name_that_cannot_be_a_file_is_told_before_a_folder_is_made(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path

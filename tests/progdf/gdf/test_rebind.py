@@ -120,3 +120,15 @@ def test_another_scene_is_refused_and_a_turned_one_is_named(
         assert main(["rebind", str(edit), *words]) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "new.gdf").exists()
+
+
+def test_a_rebound_edit_takes_the_place_of_none_of_its_inputs(
+    stack: Stack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, edit, *_ = stack.save(tmp_path)
+    (tmp_path / "link.gdf").symlink_to(edit)
+    before = edit.read_bytes()
+    for out in (edit, tmp_path / "link.gdf", edit.parent / "." / edit.name):
+        assert main(["rebind", str(edit), "--from", str(a), "--to", str(a), "-o", str(out)]) == 2
+        assert "is one of the files to read; choose another name" in capsys.readouterr().err
+    assert edit.read_bytes() == before

@@ -199,11 +199,15 @@ def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_
             temporary_file.write_text("whole")
         assert running.exists(), "a process that runs keeps what it writes"
         running.write_text("whole")
+    folder = tmp_path / f"{left[0].name.rpartition('-')[0]}-abcdefgh"  # as `temporary_subfolder` makes
+    folder.mkdir()
+    (folder / "frame_0000.png").touch()
     os.utime(elsewhere, (0, 0))
-    assert sorted(tmp_path.iterdir()) == sorted([*own, elsewhere, path, tmp_path / "a.txt"])
+    assert sorted(tmp_path.iterdir()) == sorted([*own, elsewhere, folder, path, tmp_path / "a.txt"])
     with atomic_write(path) as temporary_file:
         temporary_file.write_text("whole")
     assert not elsewhere.exists(), "it has not been written to for a day"
+    assert not folder.exists(), "its process was killed"
 
 
 def test_a_name_as_long_as_names_can_be_is_written(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_st
 from tests.helpers.trained import train
 from trainer.pipeline.resume import find_run, processor_kind
 from trainer.plan import make_plan
+from trainer.store.state import StateFolder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -155,6 +156,24 @@ def test_the_region_is_not_looked_for_again(
 
     monkeypatch.setattr(trainer.pipeline.run, "parse_region", parse_region)
     gone_on(bear_folder, uninterrupted)
+
+
+@pytest.mark.parametrize("change", ["half the rows", "above 1", "whole numbers"])
+@pytest.mark.usefixtures("stopped")
+def test_a_saved_region_that_is_not_of_the_scene_is_one_line(bear_folder: Path, change: str) -> None:
+    state = StateFolder(OUT / "state")
+    saved = state.load("region")
+    assert saved is not None
+    members, score = saved.tensors["members"], saved.tensors["score"]
+    half = len(score) // 2
+    changed = {
+        "half the rows": (members[members < half], score[:half]),
+        "above 1": (members, 2 * score),
+        "whole numbers": (members, score.long()),
+    }[change]
+    state.save("region", dict(zip(("members", "score"), changed, strict=True)), saved.values)
+    with pytest.raises(ProgdfError, match=r"region\.safetensors is damaged \(ValueError\); delete "):
+        train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
 @pytest.mark.parametrize("broken", ["gone", "truncated"])
