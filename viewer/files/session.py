@@ -23,6 +23,7 @@ from progdf.io.session import (
 )
 from progdf.terminal import escape_text
 from viewer.state import paint
+from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import check as check_selection
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
@@ -102,7 +103,7 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
     if foreign:
         more = f" and {len(foreign) - 1} more" * (len(foreign) > 1)
         warning = escape_text(
-            f"{path.name}: region {foreign[0]}{more} named no {regions.SUFFIX} file in the session's folder: "
+            f"{path.name}: region {foreign[0]}{more} named no {REGION_SUFFIX} file in the session's folder: "
             "unsaved until the session is saved"
         )
         _log.warning(warning)
