@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +16,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.io.atomic import temporary_subfolder
 from tests.helpers.full_disk import files_up_to
 from tests.helpers.ui_rig import STEP_S, Rig, bear, first_view, rig
 from viewer.files import timeline_file
@@ -273,6 +277,18 @@ def test_an_empty_folder_is_filled_where_it_is(tmp_path: Path, monkeypatch: pyte
         names = sorted(path.name for path in (tmp_path / filled).iterdir())
         assert names == ["frame_0000.png", "frame_0001.png"]
     assert (tmp_path / "link").is_symlink()
+
+
+def test_frames_of_an_export_that_was_killed_are_in_nobodys_way(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    mine = temporary_subfolder(folder)
+    left = mine.rename(mine.with_name(mine.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-")))
+    (left / "frame_0000.png").touch()
+    film.write_sequence(folder, [np.zeros((4, 4, 3), np.uint8)])
+    assert [path.name for path in folder.iterdir()] == ["frame_0000.png"]
 
 
 @pytest.mark.parametrize("there", [False, True])
