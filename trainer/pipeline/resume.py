@@ -54,10 +54,12 @@ def load_region(out: Path) -> Region | None:
     if saved is None:
         return None
     with state.restore_part(REGION):
-        score = saved.tensors["score"]
+        name, score = saved.values["name"], saved.tensors["score"]
         if score.dtype != torch.float32 or score.ndim != 1 or not bool(((score >= 0) & (score <= 1)).all()):
             raise ValueError("the score is none")
-        return Region(saved.values["name"], saved.tensors["members"], score)
+        if not isinstance(name, str):
+            raise TypeError("the name is none")
+        return Region(name, saved.tensors["members"], score)
 
 
 def decide_resume(
