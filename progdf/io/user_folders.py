@@ -8,7 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from platformdirs import user_cache_path, user_state_path
+from platformdirs import user_cache_path, user_pictures_path, user_state_path
 
 
 def cache_folder() -> Path:
@@ -19,6 +19,11 @@ def cache_folder() -> Path:
 def state_folder() -> Path:
     """For what is remembered from one time to the next: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
     return _folder(user_state_path("progdf", appauthor=False))
+
+
+def pictures_folder() -> Path:
+    """The user's own pictures, as the desktop calls the folder."""
+    return _folder(user_pictures_path())
 
 
 def temporary_folder() -> Path:

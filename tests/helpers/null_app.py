@@ -16,7 +16,7 @@ from viewer.state.view_state import ViewState
 
 @contextmanager
 def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]:
-    """The application on `document`, after its first frame; pictures and memory go to `folder`."""
+    """The application on `document`, after its first frame; what it remembers goes to `folder`."""
     from viewer.ui.window import Window, glfw
 
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
@@ -27,7 +27,7 @@ def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]
         window = Window("test", (900, 640))
     finally:
         glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
-    app = App(window, document, view, folder, memory=folder / "memory")
+    app = App(window, document, view, memory=folder / "memory")
     app.draw()
     yield app
     app.close()

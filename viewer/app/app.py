@@ -9,6 +9,7 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from progdf.gdf.file import Gdf
+from viewer.files import exports
 from viewer.files.document import Document
 from viewer.render.engine import ViewEngine
 from viewer.state import workspace
@@ -30,7 +31,6 @@ SIZE = (1280, 800)
 def run(
     document: Document,
     state: ViewState,
-    pictures: Path = Path(),
     size: tuple[int, int] = SIZE,
     session: Path | None = None,
     snapshots: tuple[SliderSnapshot, ...] = (),
@@ -43,7 +43,6 @@ def run(
     Args:
         document: the scene and its edits
         state: what to show first
-        pictures: folder for saved pictures
         size: of the window, at 1×
         session: the file it was opened from and is saved to
         snapshots: kept states
@@ -58,7 +57,7 @@ def run(
     """
     window = Window(_window_title(document.title), size)
     try:
-        app = App(window, document, state, pictures, session, draw=draw, edit_pass=edit_pass)
+        app = App(window, document, state, session, draw=draw, edit_pass=edit_pass)
         app.main_view.restart(state, snapshots)
         if warning:
             app.main_view.show_message(warning, error=True)
@@ -81,7 +80,6 @@ class App:
         window: Window,
         document: Document,
         state: ViewState,
-        pictures: Path,
         session: Path | None = None,
         memory: Path | None = None,
         draw: str = "auto",
@@ -92,7 +90,12 @@ class App:
         self._draw, self._edit_pass = draw, edit_pass
         self.engine = self._engine(document)
         self.main_view = MainView(
-            self.context, self.engine, document.facts(), state, window.ui_scale, pictures
+            self.context,
+            self.engine,
+            document.facts(),
+            state,
+            window.ui_scale,
+            exports.folder_of(document.path),
         )
         self.file_actions = FileActions(self, session, memory)
         self.training = TrainingActions(self, memory)
@@ -195,19 +198,34 @@ class App:
     def show(
         self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
     ) -> None:
-        """Draw another document from now on; the state is the caller's to change.
+        """Draw the same scene with other edits from now on; the state is the caller's to change.
 
         Args:
             live: what is being trained of its edits
             layers: that show them on top
         """
         facts = self.main_view.facts if document is self.document else document.facts()
-        if document.path != self.document.path:
-            self._keep_picture()
         engine = self._engine(document, live)
         self.engine.release()
         self.document, self.engine = document, engine
         self.main_view.set_engine(engine, facts, layers)
+
+    def open_document(
+        self, document: Document, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()
+    ) -> None:
+        """Another scene takes the place of the open one, and what belonged to that one goes with it.
+
+        What is trained or written for it goes on in the background. Where anything fails, all is as it was.
+        """
+        facts, engine = document.facts(), self._engine(document)
+        self._keep_picture()
+        self.engine.release()
+        self.document, self.engine = document, engine
+        self.main_view.set_engine(engine, facts)
+        self.main_view.restart(view, snapshots)
+        self.main_view.pictures = exports.folder_of(document.path)
+        for part in (self.training, self.preview, self.up):
+            part.leave_scene()
 
     def _keep_picture(self) -> None:
         """For the start page, of what is on screen."""

@@ -7,6 +7,8 @@ from typing import Protocol
 
 from progdf.errors import ProgdfError
 from viewer.files.document import Document
+from viewer.state.snapshots import SliderSnapshot
+from viewer.state.view_state import ViewState
 
 from .main_view import MainView
 
@@ -18,7 +20,12 @@ class Application(Protocol):
     main_view: MainView
 
     def show(self, document: Document) -> None:
-        """Draw another document from now on."""
+        """Draw the same scene with other edits from now on."""
+
+    def open_document(
+        self, document: Document, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()
+    ) -> None:
+        """Another scene takes the place of the open one."""
 
     def leave(self) -> None:
         """Close the window, without a question."""

@@ -173,9 +173,8 @@ def _content(
         kind = dialog.kind.removeprefix("render_")
         text, options = deliver_fields.draw(kind, dialog.text, dialog.options, ui)
         dialog = replace(dialog, text=text, options=options)
-    if dialog.kind in ("open", "replace"):
-        fitting = [path for path in recent if dialog.kind == "open" or path.suffix == ".gdf"]
-        chosen = _recent(fitting, bottom, ui)
+    if dialog.kind == "open":
+        chosen = _recent(recent, bottom, ui)
         if chosen is not None:
             return _submit(dialog, str(chosen))
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))

@@ -19,7 +19,7 @@ from viewer.files.autosave import SessionAutosave
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path, session_file
 from viewer.state import workspace
-from viewer.state.view_state import Timeline
+from viewer.state.view_state import on_another_scene
 from viewer.state.workspace import Dialog
 from viewer.ui import native_dialogs as native
 
@@ -44,8 +44,7 @@ class FileActions:
         self._browser = native.Browser()
         self._edits = EditActions(app)
         opened = app.document
-        files = (*opened.gdf_paths, *((opened.path,) if opened.path else ()), *((path,) if path else ()))
-        app.main_view.recent = self._remember(*files)
+        app.main_view.recent = self._remember(*(file for file in (opened.path, path) if file is not None))
 
     def handle(self, request: str) -> None:
         """One request of `workspace.REQUESTS` that is about files, or "quit"."""
@@ -75,7 +74,7 @@ class FileActions:
             self._app.main_view.ask(Dialog("replace", then=argument))
         elif name == "replace_by":
             index, _, path = argument.partition(":")
-            self._report_errors(lambda: self._replace_edit(index, parse_path(path)))
+            self._report_errors(lambda: self._edits.replace(self._edits.layer(index), parse_path(path)))
         elif name == "save_region":
             self._report_errors(lambda: self._keep_region(argument))
         elif name == "rename_region":
@@ -143,14 +142,12 @@ class FileActions:
         if not self.has_unsaved:
             self.session_autosave.stop()
             return None
-        kept, before = workspace.worth_saving(self._app.main_view.work), self.session_autosave.path
+        kept = workspace.worth_saving(self._app.main_view.work)
         try:
             wait = self.session_autosave.wait(now, kept, self._autosave_base, self._write)
         except (ProgdfError, OSError) as error:
             self._app.main_view.show_message(f"Autosave failed: {error}", error=True)
             return None
-        if self.session_autosave.path is not None and self.session_autosave.path != before:
-            self._app.main_view.recent = self._remember(self.session_autosave.path)
         return wait or None
 
     def on_close(self) -> None:
@@ -185,11 +182,9 @@ class FileActions:
         self._app.main_view.recent = self._remember(path)
 
     def _open_session(self, path: Path) -> None:
-        opened = session.open_session(path, self._memory)
+        opened, main_view = session.open_session(path, self._memory), self._app.main_view
+        self._app.open_document(opened.document, opened.view, opened.snapshots)
         self.session_autosave.drop()
-        self._app.show(opened.document)
-        main_view = self._app.main_view
-        main_view.restart(opened.view, opened.snapshots)
         if opened.warning:
             main_view.show_message(opened.warning, error=True)
         saved = autosaves.session_of(path)
@@ -213,35 +208,25 @@ class FileActions:
         left = [path for path in found if path != self.session_autosave.path and path not in self._put_off]
         if left:
             self._put_off.add(left[0])  # if it is not decided now
-            self._app.main_view.recent = self._remember(*reversed(left))
             self._app.main_view.ask(Dialog("restore", str(left[0])))
 
     def _discard(self) -> None:
         """Unsaved work is given up; its autosave stays under another name."""
         self._app.main_view.work = workspace.mark_saved(self._app.main_view.work)
-        aside = self.session_autosave.discard()
-        if aside is not None:
-            self._app.main_view.recent = self._remember(aside)
+        self.session_autosave.discard()
 
     def _discard_autosave(self, path: Path) -> None:
         aside = autosaves.put_aside(path)
-        self._app.main_view.recent = self._remember(aside)
         self._app.main_view.show_message(f"Discarded; a copy is kept in {aside.name}")
         self.offer_autosave()
 
     def _open_scene(self, path: Path) -> None:
         opened = documents.load(path)
-        self.session_autosave.drop()
-        self._app.show(opened)
-        self.path = None
-        main_view = self._app.main_view
         camera = first_camera(opened.scene, up=known_ups.up_of(opened, self._memory))
-        main_view.restart(replace(main_view.work.view, camera=camera, layers=(), timeline=Timeline()))
+        self._app.open_document(opened, on_another_scene(self._app.main_view.work.view, camera))
+        self.session_autosave.drop()
+        self.path = None
         self.offer_autosave()
-
-    def _replace_edit(self, index: str, path: Path) -> None:
-        self._edits.replace(self._edits.layer(index), path)
-        self._app.main_view.recent = self._remember(path)
 
     def _keep_region(self, name: str) -> None:
         main_view, opened = self._app.main_view, self._app.document

@@ -121,8 +121,10 @@ class MainView:
         self.wake()
 
     def restart(self, view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> None:
-        """A new state and snapshots, with nothing to undo."""
+        """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
         self.work = workspace.new_workspace(view, kept)
+        self._tool, self._taps = MouseTool(), Taps()
+        self.cover, self.up_strip, self.preview_said = None, None, ("", False)
         self.wake()
 
     def next_frame_delay(self) -> float | None:

@@ -17,6 +17,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.io.session import SUFFIX
+from progdf.io.user_folders import pictures_folder
+from viewer.jobs.run_files import takes_files
 from viewer.state.view_state import ViewState
 
 from . import timeline_file
@@ -25,6 +27,12 @@ CAMERAS = ".cameras.json"
 
 REQUESTS = ("picture", "take_view", "window_picture", "timeline_file")
 """Those of `workspace.REQUESTS` that end here."""
+
+
+def folder_of(scene: Path | None) -> Path:
+    """Where files made of a scene go: beside it, or where that is read-only to the user's pictures."""
+    beside = scene.resolve().parent if scene is not None else None
+    return beside if beside is not None and takes_files(beside) else pictures_folder()
 
 
 def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> str:
@@ -78,6 +86,7 @@ def camera(place: Path, seen: Camera) -> tuple[Path, int]:
 
 def _try_save(what: str, folder: Path, save: Callable[[], str]) -> str:
     try:
+        folder.mkdir(parents=True, exist_ok=True)  # a user may have had no pictures so far
         return save()
     except OSError as error:
         raise ProgdfError(f"no {what} was saved in {folder.resolve()}: {error.strerror}") from None

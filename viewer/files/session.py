@@ -98,7 +98,13 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
         for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)
         if new.path != resolved.path
     ]
-    view = replace(view, selection=claimed)
+    # no tool is in the hand when a scene is opened
+    view = replace(
+        view,
+        selection=claimed,
+        brush=replace(view.brush, active=False),
+        select=replace(view.select, tool=""),
+    )
     warning = ""
     if foreign:
         more = f" and {len(foreign) - 1} more" * (len(foreign) > 1)
@@ -107,6 +113,7 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
             "unsaved until the session is saved"
         )
         _log.warning(warning)
+    return WindowSession(opened, view, snapshots, warning)
     return WindowSession(opened, view, snapshots, warning)
 
 

@@ -59,6 +59,8 @@ class Delivery:
         seconds: that it has run, whole ones
         error: the one line of a failure
         starved: other programs keep the processor
+        scene: the file that it is made from
+        elsewhere: the name of that where another scene is open, else ""
     """
 
     number: int
@@ -71,6 +73,8 @@ class Delivery:
     seconds: int = 0
     error: str = ""
     starved: bool = False
+    scene: Path | None = None
+    elsewhere: str = ""
 
     @property
     def seconds_left(self) -> float | None:
@@ -95,8 +99,8 @@ class Deliveries:
         """For files that commands read."""
         return Path(self._folder.name)
 
-    def start(self, title: str, out: Path, arguments: Sequence[str]) -> None:
-        """Run a command that writes `out`.
+    def start(self, title: str, out: Path, arguments: Sequence[str], scene: Path | None) -> None:
+        """Run a command that writes `out` from a scene.
 
         Raises:
             OSError: it cannot be started.
@@ -104,7 +108,7 @@ class Deliveries:
         number = next(self._numbers)
         self._children[number] = Child(arguments, self.folder / f"{number}.log")
         self._began[number] = time.monotonic()
-        self.shown = (*self.shown, Delivery(number, title, out))
+        self.shown = (*self.shown, Delivery(number, title, out, scene=scene))
 
     def stop(self, number: int) -> None:
         """Stop one, or take one that failed off the list."""

@@ -110,6 +110,7 @@ class TrainingJob:
         resumes: whether it goes on with what was stopped
         began_at: share that was done when this session of it began
         starved: other programs keep the processor
+        elsewhere: the name of its scene where another one is open, else ""
     """
 
     number: int
@@ -121,6 +122,7 @@ class TrainingJob:
     resumes: bool = False
     began_at: float = 0.0
     starved: bool = False
+    elsewhere: str = ""
 
     @property
     def seconds_left(self) -> float | None:

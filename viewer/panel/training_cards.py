@@ -41,6 +41,7 @@ def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
         )
         said += [f"{duration(left)} left"] if left is not None else []
         said = [STARVED] if delivery.starved else said
+        said = [f"For {delivery.elsewhere}", *said] if delivery.elsewhere else said
         failed = delivery.status == "failed"
         line = (
             delivery.error if failed else "Stopping" if delivery.status == "stopping" else "  ·  ".join(said)
@@ -72,7 +73,7 @@ class _Row:
 def _job_row(job: TrainingJob) -> _Row:
     order, failed = job.order, job.status == "failed"
     about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
-    said = job.error if failed else _said(job)
+    said = job.error if failed else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
     row = _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))

@@ -173,9 +173,11 @@ def _resize(workspace: Workspace, times: str) -> Workspace:
 
 
 def _step_back(workspace: Workspace, _: str) -> Workspace:
-    """The list of bindings goes, or the tool that selects, or the other selected layers, or the focus."""
+    """The list of bindings goes, or the tool in the hand, or the other selected layers, or the focus."""
     if workspace.help:
         return replace(workspace, help=False)
+    if workspace.view.brush.active:
+        return _change_brush(workspace, active=False)
     if tool := workspace.view.select.tool:
         return _take_tool(workspace, tool)
     if len(layer_selection.selected_layers(workspace)) > 1:

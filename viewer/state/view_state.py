@@ -232,6 +232,23 @@ class ViewState:
     cards: Annotated[str, one_of(CARD_MODES)] = "auto"
 
 
+def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
+    """The window's own settings, with another scene seen by `camera`.
+
+    All else belongs to the scene and goes with it, also what is added to `ViewState` some day.
+    """
+    return ViewState(
+        camera,
+        background=view.background,
+        overlay=view.overlay,
+        panel=view.panel,
+        dynamic_resolution=view.dynamic_resolution,
+        grid=view.grid,
+        axes=view.axes,
+        cards=view.cards,
+    )
+
+
 def cards_shown(view: ViewState, fit: bool) -> str:
     """ "full" or "compact": how the panel shows layers, where whole cards `fit` or do not."""
     return view.cards if view.cards != "auto" else "full" if fit else "compact"

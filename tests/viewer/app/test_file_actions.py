@@ -18,7 +18,7 @@ from tests.helpers.sessions import bear_files, full_view, opened_document, saved
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
-from viewer.files import autosave, recent, session
+from viewer.files import autosave, exports, recent, session
 from viewer.state import workspace
 from viewer.state.workspace import Dialog
 
@@ -49,8 +49,23 @@ def question(app: application.App) -> Dialog:
     return app.main_view.work.dialog
 
 
+def test_the_recent_files_are_scenes_and_sessions_the_last_twelve(tmp_path: Path) -> None:
+    files = [tmp_path / f"{i}.{kind}" for i, kind in enumerate(["ply", "session.json", "spz"] * 5)]
+    others = [tmp_path / name for name in ("e.gdf", "1.autosave.session.json", "1.discarded-2.session.json")]
+    for file in (*files, *others):
+        file.touch()
+    (tmp_path / "memory").mkdir()
+    (tmp_path / "memory" / "recent.txt").write_text(
+        "".join(f"{file}\n" for file in others)
+    )  # of an older version
+    assert recent.read(tmp_path / "memory") == ()
+    for file in (*files, *others):
+        recent.remember([file], tmp_path / "memory")
+    assert recent.read(tmp_path / "memory") == tuple(files[:-13:-1])
+
+
 def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in ("a.ply", "b.gdf", "c.ply")]
+    files = [tmp_path / name for name in ("a.ply", "b.session.json", "c.ply")]
     for file in files:
         file.touch()
     recent.remember(files[:2], tmp_path / "memory")
@@ -175,7 +190,7 @@ def test_a_new_sessions_autosave_never_takes_the_place_of_one_that_was_left(
     kept = beside.read_bytes()
     window.file_actions.offer_autosave()
     assert question(window).kind == "restore"
-    assert beside in window.main_view.recent
+    assert beside not in window.main_view.recent
     press(window, "Escape", "Shift+Left")
     window.file_actions.autosave(100.0)
     window.file_actions.autosave(100.0 + autosave.AUTOSAVE_S)
@@ -208,7 +223,6 @@ def test_discarded_work_stays_under_another_name_the_last_three(
     assert len(kept) == autosave.MOST_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
     assert sorted(found) == sorted(strengths[-autosave.MOST_DISCARDED :])
-    assert kept[-1] in window.main_view.recent
     window.file_actions.handle("discard")
     window.open(kept[-1])
     assert window.file_actions.path is None, "saving it asks where"
@@ -457,3 +471,26 @@ def test_f4_overwrites_no_file_of_cameras_that_it_did_not_make(window: applicati
     press(window, "F4")
     assert theirs.read_text() == "[]"
     assert "was not made with F4" in message(window)
+
+
+@pytest.mark.gl
+def test_pictures_lie_beside_the_scene_or_among_the_users_and_never_in_the_current_folder(
+    window: application.App,
+    folder: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    here, own = tmp_path_factory.mktemp("here"), tmp_path_factory.mktemp("own") / "Pictures"
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(exports, "pictures_folder", lambda: own)
+    press(window, "F2", "Ctrl+F2", "Shift+F2")
+    assert len([*folder.glob("bear_*.png")]) == 3
+    locked = tmp_path_factory.mktemp("locked")
+    save_ply(locked / "half.ply", bear().scene[:700])
+    locked.chmod(0o555)
+    window.open(locked / "half.ply")
+    press(window, "F2", "Ctrl+F2", "Ctrl+E")
+    assert sorted(path.name for path in own.iterdir()) == ["half_001.png", "half_002.png"]
+    assert question(window).text == str(own / "half_edited.ply")
+    assert [*here.iterdir()] == []
+    locked.chmod(0o755)

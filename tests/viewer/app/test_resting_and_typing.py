@@ -111,6 +111,17 @@ def test_escape_closes_the_list_of_keys_first(hand: Rig) -> None:
     assert hand.main_view.work.focus is None
 
 
+def test_escape_puts_the_tool_down_before_anything_is_unfocused(hand: Rig) -> None:
+    for key, held in (("B", lambda view: view.brush.active), ("R", lambda view: view.select.tool)):
+        hand.key(key)
+        assert held(hand.main_view.work.view)
+        hand.key("Escape")
+        assert not held(hand.main_view.work.view)
+        assert hand.main_view.work.focus is not None
+    hand.key("Escape")
+    assert hand.main_view.work.focus is None
+
+
 def test_the_chosen_segment_keeps_its_color_under_the_mouse(hand: Rig) -> None:
     y = 334.0  # Orbit of Orbit | Fly
     hand.move(200.0, 300.0)

@@ -30,12 +30,12 @@ def windows(name: str) -> list[imgui.internal.Window]:
 
 @pytest.mark.parametrize("points", [SMALLEST, (800, 600), (1280, 800)])
 @pytest.mark.parametrize("kind", ["open", "save", "leave", "overwrite", "restore", "replace"])
-def test_every_question_lies_within_the_window_with_eight_recent_files(
+def test_every_question_lies_within_the_window_with_many_recent_files(
     points: tuple[int, int], kind: str
 ) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
-        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.gdf") for i in range(recent.MOST))
+        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(recent.MOST))
         hand.main_view.ask(
             Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
         )

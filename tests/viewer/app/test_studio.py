@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from progdf.formats.ply import save_ply
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
@@ -263,3 +264,26 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
     assert small_pictures.load(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
+
+
+def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
+    window: application.App, tmp_path: Path
+) -> None:
+    save_ply(tmp_path / "half.ply", bear().scene[:700])
+    request(window, "train")
+    press(window, "Ctrl+E", "Enter")
+    window.open(tmp_path / "half.ply")
+    turn(window)
+    (job,), (delivery,) = window.main_view.work.jobs, window.main_view.work.deliveries
+    assert (job.status, job.elsewhere, delivery.elsewhere) == ("running", "bear.ply", "bear.ply")
+    Trainer.ended, Trainer.line = 2, "the disk is full"
+    turn(window)
+    turn(window)
+    assert (window.main_view.work.jobs, window.main_view.work.deliveries) == ((), ()), (
+        "what failed is the scene's"
+    )
+    window.open(tmp_path / "bear.ply")
+    turn(window)
+    (job,), (delivery,) = window.main_view.work.jobs, window.main_view.work.deliveries
+    assert (job.status, job.elsewhere) == ("failed", "")
+    assert (delivery.status, delivery.elsewhere) == ("failed", "")

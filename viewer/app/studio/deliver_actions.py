@@ -10,11 +10,10 @@ from pathlib import Path
 from progdf import __version__
 from progdf.errors import ProgdfError
 from viewer.app.application import Application, failure_line
-from viewer.files import session
+from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path
 from viewer.jobs.delivery import Deliveries, DeliverOptions
-from viewer.jobs.run_files import takes_files
 from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
 from viewer.state.workspace import Dialog
 
@@ -95,10 +94,10 @@ class DeliverActions:
             options = self._asked.get(name, DeliverOptions(width=1280, height=720))
             fps = view.timeline.fps if keys else options.fps
             options = replace(options, moves=chosen, can_move=moving, fps=fps)
-        beside = document.path.resolve().parent
-        folder = beside if takes_files(beside) else Path.cwd()
         suffix = options.format if name == "render_film" else ASKS[name]
-        path = _free(folder / f"{document.path.stem}_edited{suffix}", self._written())
+        path = _free(
+            exports.folder_of(document.path) / f"{document.path.stem}_edited{suffix}", self._written()
+        )
         main_view.ask(Dialog(name, str(path), options=options))
 
     def _deliver(self, kind: str) -> None:
@@ -134,7 +133,7 @@ class DeliverActions:
             "render_picture": ["render", stack, f"--out={out}", size, *["--alpha"] * options.alpha],
             "render_film": ["render", stack, f"--out={out}", size, f"--timeline={stack}"],
         }
-        self.deliveries.start(f"{_TITLES[kind]} {out.name}", out, words[kind])
+        self.deliveries.start(f"{_TITLES[kind]} {out.name}", out, words[kind], self._app.document.path)
         self._asked[kind] = options
 
     def _written(self) -> set[Path]:
@@ -152,9 +151,15 @@ class DeliverActions:
             self._app.main_view.show_message(error, error=True)
 
     def _publish(self) -> None:
-        main_view = self._app.main_view
-        if self.deliveries.shown != main_view.work.deliveries:
-            main_view.work = replace(main_view.work, deliveries=self.deliveries.shown)
+        """The panel shows what is made from this scene, and from others what goes on."""
+        main_view, scene = self._app.main_view, self._app.document.path
+        deliveries = tuple(
+            replace(shown, elsewhere=shown.scene.name if shown.scene and shown.scene != scene else "")
+            for shown in self.deliveries.shown
+            if shown.scene in (None, scene) or shown.status != "failed"
+        )
+        if deliveries != main_view.work.deliveries:
+            main_view.work = replace(main_view.work, deliveries=deliveries)
             main_view.wake()
 
 

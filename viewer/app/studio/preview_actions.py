@@ -56,8 +56,6 @@ class PreviewActions:
         """Ask for what is wanted and show what has come; seconds until the next look, None for ever."""
         now = time.monotonic()
         scene = self._app.document.path
-        if self._child is not None and scene != self._child.scene:
-            self._end()
         wanted = self._wanted()
         if wanted is None or scene is None:
             self._show("", None)
@@ -84,6 +82,11 @@ class PreviewActions:
         if wanted != self._asked and now - self._seen_at >= REST_S:
             self._ask(wanted)
         return POLL_S if self._outstanding or wanted != self._asked else None
+
+    def leave_scene(self) -> None:
+        """The child is for a scene that is not open any more."""
+        self._end()
+        self._broken = False
 
     def close(self) -> None:
         """End the child."""

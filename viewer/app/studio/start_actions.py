@@ -18,7 +18,7 @@ from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
 from viewer.state.view_state import Comparison, ViewState
 
-from .start_page import RecentFile, shown_files
+from .start_page import RecentFile
 from .training_actions import StudioApplication
 
 POLL_S = 0.5
@@ -104,7 +104,7 @@ class StartActions:
         self._demo, self._added = folder, set()
         words = ["demo", "--quick", "--no-window", f"--out={folder}"]
         try:
-            self._deliveries.start("Demo: four edits", folder, words)
+            self._deliveries.start("Demo: four edits", folder, words, folder / "scene.ply")
         except OSError as error:
             raise ProgdfError(f"the demo cannot start: {error.strerror or error}") from error
         self._app.main_view.show_message("Making the demo's scene …")
@@ -114,8 +114,7 @@ class StartActions:
         main_view = self._app.main_view
         if not main_view.at_start:
             return
-        files = shown_files(main_view.recent)
-        shown = tuple(RecentFile(path, self._texture(path)) for path in files)
+        shown = tuple(RecentFile(path, self._texture(path)) for path in main_view.recent)
         if shown != main_view.recent_files:
             main_view.recent_files = shown
             main_view.wake()

@@ -53,11 +53,6 @@ def draw(recent: Sequence[RecentFile], ui: UiContext) -> list[str]:
     return actions
 
 
-def shown_files(recent: Sequence[Path]) -> list[Path]:
-    """Of the files that were open those that the page shows: scenes and sessions."""
-    return [path for path in recent if path.suffix != ".gdf"]
-
-
 def _head(ui: UiContext) -> list[str]:
     scale, actions = ui.scale, []
     imgui.push_font(ui.fonts.bold, 26.0)

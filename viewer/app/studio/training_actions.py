@@ -55,6 +55,7 @@ class TrainingActions:
     def __init__(self, app: StudioApplication, memory: Path | None = None) -> None:
         self._app, self._memory = app, memory
         self.queue = TrainingQueue()
+        self._looked = False  # for what was stopped of the scene
         self._scene: Path | None = None
         self._live: Path | None = None  # the recording on screen
         self._live_due = 0.0
@@ -186,14 +187,17 @@ class TrainingActions:
         else:
             main_view.show_message(f"{job.order.name} is trained: {job.order.gdf}")
 
+    def leave_scene(self) -> None:
+        """There is another scene; what is trained for this one goes on, and its card says for which."""
+        self._looked, self._live = False, None
+
     def _follow_document(self) -> None:
-        """Another scene: runs of it that were stopped another day come back."""
-        path = self._app.document.path
-        scene = path.resolve() if path is not None else None
-        if scene == self._scene:
+        """Runs of the scene that were stopped another day come back."""
+        if self._looked:
             return
-        self._scene, self._live = scene, None
-        if scene is not None:
+        path = self._app.document.path
+        self._looked, self._scene = True, path.resolve() if path is not None else None
+        if (scene := self._scene) is not None:
             for order in run_files.stopped_orders(run_files.edits_folder(scene, self._memory), scene):
                 self.queue.add_stopped(order)
 
@@ -236,9 +240,13 @@ class TrainingActions:
         self._app.main_view.show_message("Saving what is trained so far …")
 
     def _publish(self) -> None:
-        """The panel shows the runs of this scene."""
+        """The panel shows the runs of this scene, and of others those that go on."""
         main_view = self._app.main_view
-        jobs = tuple(job for job in self.queue.jobs if job.order.scene == self._scene)
+        jobs = tuple(
+            job if job.order.scene == self._scene else replace(job, elsewhere=job.order.scene.name)
+            for job in self.queue.jobs
+            if job.order.scene == self._scene or job.status in ("queued", "running", "stopping")
+        )
         if jobs != main_view.work.jobs:
             main_view.work = replace(main_view.work, jobs=jobs)
             main_view.wake()

@@ -33,7 +33,8 @@ class UpActions:
     def __init__(self, app: StudioApplication, context: moderngl.Context, memory: Path | None = None) -> None:
         self._app, self._context, self._memory = app, context, memory
         self._textures: list[moderngl.Texture] = []
-        self._path: Path | None = None  # the scene at the last look
+        self._looked = False  # at the scene
+        self._path: Path | None = None  # its file
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
@@ -59,9 +60,8 @@ class UpActions:
             engine: draws the pictures
         """
         main_view, document = self._app.main_view, self._app.document
-        if document.path != self._path:
-            self.close()
-            self._path = document.path
+        if not self._looked:
+            self._looked, self._path = True, document.path
             if document.path is None or session is not None or known_ups.find(document.path, self._memory):
                 return None
             found = document.found_up
@@ -88,6 +88,11 @@ class UpActions:
             known_ups.remember(self._path, up, self._memory)
         self.close()
         self._app.main_view.wake()
+
+    def leave_scene(self) -> None:
+        """There is another scene to ask about."""
+        self.close()
+        self._looked = False
 
     def close(self) -> None:
         """No question any more."""
