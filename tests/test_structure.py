@@ -40,7 +40,7 @@ ORDER = {
 }
 
 MOST_FILES = 14
-MOST_LINES = 400
+MOST_LINES = 600
 
 Graph = dict[str, set[str]]
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from imgui_bundle import imgui
@@ -15,8 +17,10 @@ from viewer.render.engine import ViewEngine
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
+from viewer.state.workspace import Message
 from viewer.ui.window import Window, interruptible
 
+from .application import error_details, error_line, log_error
 from .file_actions import FileActions
 from .main_view import MainView
 from .studio.deliver_actions import DeliverActions
@@ -26,6 +30,8 @@ from .studio.training_actions import TrainingActions
 from .studio.up_actions import UpActions
 
 SIZE = (1280, 800)
+RETRY_S = 1.0
+"""Until the next look at what raised at the last one."""
 
 
 def run(
@@ -107,23 +113,51 @@ class App:
         )
         self.is_closed = False
         self._title = ""
+        self._memory = memory
+        self._logged: set[str] = set()  # where mistakes of ours were made that are in the log
+        self._said: tuple[Message | None, str] | None = None  # the last failure, and where it was
+        self.main_view.report = self.report
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
         self.last = time.perf_counter()
         window.listen(self.main_view.wake, self._queue_dropped, self._redraw)
 
     def close(self) -> None:
-        self._keep_picture()
-        self.deliver.close()
-        self.start.close()
-        self.preview.close()
-        self.up.close()
-        self.training.close()
-        self.file_actions.release()
-        self.main_view.ui.make_current()
-        imgui.backends.glfw_shutdown()
-        self.main_view.close()
-        self.engine.release()
+        with ExitStack() as parts:  # each is closed, whatever another one raises
+            for close in (self.engine.release, self.main_view.close, imgui.backends.glfw_shutdown):
+                parts.callback(close)
+            parts.callback(self.main_view.ui.make_current)
+            parts.callback(self.file_actions.release)
+            for part in (self.training, self.up, self.preview, self.start, self.deliver):
+                parts.callback(part.close)
+            self._keep_picture()
+
+    def report(self, error: Exception) -> None:
+        """What a part of the loop raised becomes a message; a mistake of ours is logged too, and what is
+        unsaved into its recovery file at once."""
+        where = repr(
+            (type(error), [(at.filename, at.lineno) for at in traceback.extract_tb(error.__traceback__)])
+        )
+        message = self.main_view.work.message
+        if message is not None and (message, where) == self._said:
+            return  # what fails in each frame asks for no further one
+        line, details = error_line(error), ""
+        if not line:
+            details = error_details(error)
+            if where not in self._logged:
+                self._logged.add(where)
+                log_error(details, self._memory)
+            what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            line = f"Internal error ({what[:200]}); {self.file_actions.keep_work()}"
+        self.main_view.show_message(line, True, details)
+        self._said = self.main_view.work.message, where
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self.report(error)
 
     def loop(self) -> None:
         """Draw while something changes, sleep while nothing does."""
@@ -132,18 +166,22 @@ class App:
         self.window.present()
         while not self.is_closed:
             waits = [wait for wait in self._wait_times() if wait is not None]
-            if not self.main_view.opening:  # else events wait in the window system, so that no letter is lost
-                self.window.wait(min(waits, default=None))
+            with self._guarded():
+                if not self.main_view.opening:  # else events wait in the window system, and no letter is lost
+                    self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
             for path in self.take_dropped():
-                self.open(path)
+                with self._guarded():
+                    self.open(path)
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
                 self.main_view.request("quit")
-            if self.main_view.is_due():
-                self.draw()
-        self.file_actions.on_close()
+            with self._guarded():
+                if self.main_view.is_due():
+                    self.draw()
+        with self._guarded():
+            self.file_actions.on_close()
 
     def draw(self) -> None:
         """One frame of the latest state; nothing while the window is minimized."""
@@ -160,26 +198,36 @@ class App:
         self.window.present()
         self._rename()
         for request in self.main_view.take_requests():
-            if request == "full_screen":
-                self.window.toggle_full_screen()
-            elif not any(part.handle(request) for part in (self.training, self.deliver, self.start, self.up)):
-                self.file_actions.handle(request)
+            with self._guarded():
+                self._handle(request)
+
+    def _handle(self, request: str) -> None:
+        if request == "full_screen":
+            self.window.toggle_full_screen()
+        elif not any(part.handle(request) for part in (self.training, self.deliver, self.start, self.up)):
+            self.file_actions.handle(request)
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
         # first: what was chosen, or trained, wakes the main view
-        looks = [part.poll() for part in (self.training, self.preview, self.deliver, self.start)]
+        looks = [self._look(part.poll) for part in (self.training, self.preview, self.deliver, self.start)]
         return (
-            self.file_actions.poll_dialog(),
+            self._look(self.file_actions.poll_dialog),
             *looks,
-            self.up.poll(self.file_actions.path, self.engine),
-            self.main_view.next_frame_delay(),
-            self.file_actions.autosave(time.perf_counter()),
+            self._look(lambda: self.up.poll(self.file_actions.path, self.engine)),
+            self._look(self.main_view.next_frame_delay),
+            self._look(lambda: self.file_actions.autosave(time.perf_counter())),
         )
+
+    def _look(self, poll: Callable[[], float | None]) -> float | None:
+        with self._guarded():
+            return poll()
+        return RETRY_S
 
     def _redraw(self) -> None:
         try:
-            self.draw()
+            with self._guarded():
+                self.draw()
         except BaseException as failure:  # glfw would only print it
             self.failure = failure
 

@@ -1,16 +1,26 @@
-"""What actions on files need of the application, and how their failures are put."""
+"""What actions on files need of the application, and how failures are put: as a message, and in the log."""
 
 from __future__ import annotations
 
+import logging
+import platform
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
 from typing import Protocol
 
+from progdf import __version__
 from progdf.errors import ProgdfError
+from progdf.io.user_folders import state_folder
 from viewer.files.document import Document
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 
 from .main_view import MainView
+
+LOG = "window.log"
 
 
 class Application(Protocol):
@@ -32,11 +42,37 @@ class Application(Protocol):
 
 
 def failure_line(act: Callable[[], None]) -> str:
-    """Do it; what went wrong, in one line, "" for nothing."""
+    """Do it; what went wrong, in one line, "" for nothing. Mistakes of ours go on."""
     try:
         act()
-    except ProgdfError as error:
-        return " ".join(str(error).split())
-    except OSError as error:
-        return f"{error.filename or 'the file'} cannot be read or written: {error.strerror}"
+    except (ProgdfError, OSError) as error:
+        return error_line(error)
     return ""
+
+
+def error_line(error: Exception) -> str:
+    """An error that the person can mend, in one line; "" for a mistake of ours."""
+    if isinstance(error, ProgdfError):
+        return " ".join(str(error).split())
+    if isinstance(error, OSError):
+        return f"{error.filename or 'the file'} cannot be read or written: {error.strerror or error}"
+    return ""
+
+
+def error_details(error: Exception) -> str:
+    """A mistake of ours with all that a report of it needs."""
+    system = f"progdf {__version__}, Python {platform.python_version()}, {platform.platform()}"
+    return f"{system}\n\n{''.join(traceback.format_exception(error))}"
+
+
+def log_error(details: str, folder: Path | None = None) -> None:
+    """Add it to window.log in the folder of the program's state, which keeps the last 1-2 MB."""
+    folder = folder or state_folder()
+    with suppress(OSError):  # where no log can be written, the message still has the details
+        folder.mkdir(parents=True, exist_ok=True)
+        file = RotatingFileHandler(
+            folder / LOG, maxBytes=1 << 20, backupCount=1, encoding="utf-8", errors="backslashreplace"
+        )
+        file.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+        file.emit(logging.makeLogRecord({"msg": details}))
+        file.close()

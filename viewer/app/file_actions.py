@@ -5,6 +5,7 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from viewer.state.workspace import Dialog
 from viewer.ui import native_dialogs as native
 
 from . import view_actions
-from .application import Application, failure_line
+from .application import Application, error_details, failure_line, log_error
 from .edit_actions import EditActions
 
 
@@ -149,6 +150,19 @@ class FileActions:
             self._app.main_view.show_message(f"Autosave failed: {error}", error=True)
             return None
         return wait or None
+
+    def keep_work(self) -> str:
+        """Write unsaved work beside the session at once; a line that tells what became of it."""
+        try:
+            if not self.has_unsaved:
+                return "nothing was unsaved"
+            self.session_autosave.wait(
+                math.inf, workspace.worth_saving(self._app.main_view.work), self._autosave_base, self._write
+            )
+            return f"unsaved work is kept in {self.session_autosave.path}"
+        except Exception as error:  # what is wrong may be the work itself
+            log_error(error_details(error), self._memory)
+            return f"unsaved work could not be kept ({error}); save it under another name"
 
     def on_close(self) -> None:
         """The window closes, and nothing is lost: the autosave has done its work."""

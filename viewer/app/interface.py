@@ -124,18 +124,23 @@ def over_picture(
         compare_overlay.draw(view, said, area, mouse.grips_divider(held, view, pointer), ui)
     if view.overlay:
         overlay.table(figures, ui)
-    closed, free = False, imgui.get_io().display_size
+    free = imgui.get_io().display_size
     bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)
     if strip is not None and work.dialog is None:
         work = replace(work, requests=(*work.requests, *up_strip.draw(strip, above, ui)))
         above = replace(above, height=above.height - up_strip.height(strip, area, ui))
     if work.message is not None:
-        closed, top = overlay.message(work.message, above, ui)
-        closed, free = closed or pointer.now >= work.message.until, imgui.ImVec2(free.x, top)
+        clicked, top = overlay.message(work.message, above, ui)
+        free = imgui.ImVec2(free.x, top)
+        if clicked == "copy":
+            imgui.set_clipboard_text(work.message.details)
+            work = workspace.with_message(work, "Copied; paste it into a report of what you did", pointer.now)
+        elif clicked == "close" or pointer.now >= work.message.until:
+            work = replace(work, message=None)
     if work.help:
         bindings.draw(free, ui)
-    return replace(work, message=None) if closed else work
+    return work
 
 
 def draw_dialog(

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +74,7 @@ class MainView:
         self.cover: Cover | None = None  # what lies over the picture
         self.preview_said = ("", False)  # of the picture of a new edit, and whether it failed
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
+        self.report: Callable[[Exception], None] = self._report  # told of what a part of a frame raises
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -147,9 +150,9 @@ class MainView:
         where the processor draws the window too, that takes the time from it."""
         return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
 
-    def show_message(self, text: str, error: bool = False) -> None:
+    def show_message(self, text: str, error: bool = False, details: str = "") -> None:
         """Show one line at the bottom of the picture for a while."""
-        self.work = workspace.with_message(self.work, text, self._clock, error)
+        self.work = workspace.with_message(self.work, text, self._clock, error, details)
         self.wake()
 
     def draw_splash(self, screen: moderngl.Framebuffer) -> None:
@@ -187,10 +190,37 @@ class MainView:
         self._clock += max(seconds, 0.0)
         self._pace.step(seconds)
         self._resting = False
-        self.work = workspace.advance(self.work, seconds)
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
+        with self._guarded():
+            self._update(keys, seconds)
+        with self._guarded():
+            self._draw_picture(screen)
+        with self._guarded():
+            self._draw_overlays()
+        imgui.render()
+        screen.use()
+        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
+        self.frames += 1
+        if [l.strength for l in self.work.view.layers] != [l.strength for l in before.view.layers]:
+            self.context.finish()
+            self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
+        self._save_files(screen, size)
+
+    def _guarded(self) -> AbstractContextManager[None]:
+        return self.ui.guarded(self.report)
+
+    def _report(self, error: Exception) -> None:
+        """Without an application: what the person can mend is a message, mistakes of ours go on."""
+        if not isinstance(error, ProgdfError):
+            raise error
+        self.show_message(str(error), error=True)
+
+    def _update(self, keys: Keys, seconds: float) -> None:
+        """The workspace after what the person did and what goes on by itself."""
+        self.work = workspace.advance(self.work, seconds)
+        before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
         if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.is_repeating(keys):
@@ -201,21 +231,14 @@ class MainView:
             view = comparison.end_at_edit(before.view, self.work.view)
             self.work = replace(self.work, view=view)
             self.wake()
+
+    def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
         shown, area = self._shown_view(), self._pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, shown)
         asked = (self.work.overlap, self.work.pointed) if shown.panel else (None, None)
         self.canvas.draw(shown, screen, area, self._is_held(), self._clock, self.work.focus, *asked)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
-        self._draw_overlays()
-        imgui.render()
-        screen.use()
-        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
-        self.frames += 1
-        if [l.strength for l in self.work.view.layers] != [l.strength for l in before.view.layers]:
-            self.context.finish()
-            self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
-        self._save_files(screen, size)
 
     @property
     def at_start(self) -> bool:
@@ -265,15 +288,18 @@ class MainView:
         if self.work.view.panel:
             several = len(layer_selection.selected_layers(self.work)) > 1
             reveal = self._revealed != (self.work.focus, several)
-            cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
-            if missing:
-                self.wake()
-            self.work = interface.panels(
-                self.work, self._pointer(), cards, reveal, self.preview_said, self.recent
-            )
+            with self._guarded():
+                cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
+                if missing:
+                    self.wake()
+                self.work = interface.panels(
+                    self.work, self._pointer(), cards, reveal, self.preview_said, self.recent
+                )
             self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for
-            self._tool, self.work = mouse.handle_mouse(self._tool, self.work, self._pointer())
+            tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
+            with self._guarded():
+                self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
 
     def _cancel_drag(self) -> None:
         """What is dragged goes back to where it was, and nothing is held any more."""
@@ -282,7 +308,8 @@ class MainView:
         self._keys = replace(self._keys, pressed=())
 
     def _perform(self, action: str) -> None:
-        self.work = interface.perform_actions(self.work, [action], self._pointer())
+        with self._guarded():
+            self.work = interface.perform_actions(self.work, [action], self._pointer())
 
     def _pointer(self) -> PointerContext:
         """What lies under the mouse."""
@@ -316,10 +343,12 @@ class MainView:
         """What is drawn over the picture; where some of it goes away, another frame follows."""
         pointer, before = self._pointer(), self.work
         pressed = [press.chord for press in self._keys.pressed]
-        self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
+        with self._guarded():
+            self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
         original = self._shows_original
-        if self.cover is not None and not original:
-            cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
+        with self._guarded():
+            if self.cover is not None and not original:
+                cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         said = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(
@@ -363,10 +392,8 @@ class MainView:
         left = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=left)
         for request in served:
-            try:
+            with self._guarded():
                 self.show_message(self._save(request, screen, size))
-            except ProgdfError as error:
-                self.show_message(str(error), error=True)
 
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
         title, view = self.facts.title, self._shown_view()

@@ -51,10 +51,11 @@ class SessionAutosave:
             self._due = now + AUTOSAVE_S
         if now < self._due:
             return self._due - now
-        self._due, self._kept = None, kept
+        self._due = None
         if self.path is None:
             self.path = next(path for path in _numbered_paths(beside(), "autosave") if not path.exists())
         save(self.path)
+        self._kept = kept  # now: what could not be saved is tried again
         return 0.0
 
     def stop(self) -> None:

@@ -27,7 +27,7 @@ from .selection import SelectionState
 from .snapshots import SliderSnapshot
 from .view_state import Comparison, ViewState
 
-MESSAGE_S, ERROR_S = 6.0, 15.0  # how long a line stays
+MESSAGE_S, ERROR_S, DETAILS_S = 6.0, 15.0, 120.0  # how long a line stays, and one with details to copy
 UNSAVED = "• "
 """Before the scene's name where there are unsaved changes."""
 REQUESTS = (
@@ -83,6 +83,7 @@ class Message:
     text: str
     until: float
     error: bool = False
+    details: str = ""  # of a mistake of ours, to be copied into a report
 
 
 @dataclass(frozen=True)
@@ -201,10 +202,12 @@ def original(view: ViewState) -> ViewState:
     return replace(view, layers=layers, compare=Comparison())
 
 
-def with_message(workspace: Workspace, text: str, now: float, error: bool = False) -> Workspace:
+def with_message(
+    workspace: Workspace, text: str, now: float, error: bool = False, details: str = ""
+) -> Workspace:
     """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
-    until = now + (ERROR_S if error else MESSAGE_S)
-    return replace(workspace, message=Message(escape_text(" ".join(text.split())), until, error))
+    until = now + (DETAILS_S if details else ERROR_S if error else MESSAGE_S)
+    return replace(workspace, message=Message(escape_text(" ".join(text.split())), until, error, details))
 
 
 def record_undo(workspace: Workspace) -> Workspace:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,6 +117,23 @@ class UiContext:
         if scale != self.scale:
             self.scale = scale
             _apply_style(scale)
+
+    @contextmanager
+    def guarded(self, report: Callable[[Exception], None]) -> Iterator[None]:
+        """A part of a frame: what it raises ends it alone, with imgui's stacks as before it."""
+        begun = imgui.internal.ErrorRecoveryState()
+        drawing = imgui.get_current_context().within_frame_scope
+        if drawing:
+            imgui.internal.error_recovery_store_state(begun)
+        try:
+            yield
+        except Exception as error:
+            io = imgui.get_io()
+            io.config_error_recovery_enable_assert = io.config_error_recovery_enable_debug_log = False
+            if drawing:
+                imgui.internal.error_recovery_try_to_recover_state(begun)
+            io.config_error_recovery_enable_assert = io.config_error_recovery_enable_debug_log = True
+            report(error)
 
     def close(self) -> None:
         imgui.destroy_context(self.context)

@@ -92,11 +92,11 @@ def banner(text: str, area: Area, ui: UiContext, row: int = 0) -> None:
     _text(x, y, text, size, PALETTE.text, ui)
 
 
-def message(shown: Message, area: Area, ui: UiContext) -> tuple[bool, float]:
+def message(shown: Message, area: Area, ui: UiContext) -> tuple[str, float]:
     """One line at the bottom left, wrapped where the window is narrow.
 
     Returns:
-        Whether its cross was clicked; its upper edge in window pixels.
+        What was clicked: "close", "copy" for its details, or ""; its upper edge in window pixels.
     """
     pad = 12.0 * ui.scale
     widest = min(area.width - 2 * pad, 640.0 * ui.scale)
@@ -105,20 +105,24 @@ def message(shown: Message, area: Area, ui: UiContext) -> tuple[bool, float]:
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 5.0 * ui.scale)
     imgui.begin("message", None, _FLOATING)
-    cross = imgui.calc_text_size("×").x + 2 * imgui.get_style().frame_padding.x
-    room = widest - cross - 2 * pad - imgui.get_style().item_spacing.x
+    buttons = {"Copy details": "copy", "×": "close"} if shown.details else {"×": "close"}
+    around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
+    room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)
     wrap = imgui.calc_text_size(shown.text).x > room
     imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
     imgui.align_text_to_frame_padding()
     color = PALETTE.error if shown.error else PALETTE.text
     imgui.text_colored(imgui.ImVec4(*color), shown.text)
     imgui.pop_text_wrap_pos()
-    imgui.same_line()
-    closed, top = bool(imgui.small_button("×")), imgui.get_window_pos().y
+    clicked = ""
+    for text, name in buttons.items():
+        imgui.same_line()
+        clicked = name if imgui.small_button(text) else clicked
+    top = imgui.get_window_pos().y
     imgui.end()
     imgui.pop_style_var()
     imgui.pop_style_color()
-    return closed, top
+    return clicked, top
 
 
 _FLOATING = (

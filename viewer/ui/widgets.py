@@ -69,12 +69,10 @@ def card(name: str, color: Rgba, ui: UiContext) -> Iterator[None]:
     child = imgui.ChildFlags_
     flags = child.auto_resize_y.value | child.always_use_window_padding.value
     imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
-    try:
-        yield
-    finally:
-        imgui.end_child()
-        imgui.pop_style_var()
-        imgui.pop_style_color()
+    yield  # where this raises, the frame ends what is open
+    imgui.end_child()
+    imgui.pop_style_var()
+    imgui.pop_style_color()
 
 
 def accent_button(text: str, size: imgui.ImVec2) -> bool:
@@ -126,13 +124,11 @@ def menu(name: str, ui: UiContext) -> Iterator[bool]:
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(8.0 * ui.scale, 8.0 * ui.scale))
     is_open = imgui.begin_popup(name)
     imgui.pop_style_var()
-    try:
-        yield bool(is_open)
-    finally:
-        if is_open:
-            if imgui.is_key_pressed(imgui.Key.escape):
-                imgui.close_current_popup()
-            imgui.end_popup()
+    yield bool(is_open)  # where this raises, the frame ends what is open
+    if is_open:
+        if imgui.is_key_pressed(imgui.Key.escape):
+            imgui.close_current_popup()
+        imgui.end_popup()
 
 
 def is_released() -> bool:

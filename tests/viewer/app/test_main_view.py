@@ -121,6 +121,7 @@ def test_the_view_taken_to_be_changed_shows_no_edit_and_all_that_is_hidden(tmp_p
 
 
 def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "gone").touch()
     with rig(pictures=tmp_path / "gone") as hand:
         hand.key("F2")
         message = hand.main_view.work.message

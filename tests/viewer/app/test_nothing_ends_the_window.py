@@ -1,0 +1,203 @@
+"""Whatever a part of the window raises, the window goes on, says so, and keeps the unsaved work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from imgui_bundle import imgui
+
+from progdf.errors import ProgdfError
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app import app as application
+from viewer.app import bindings, interface, mouse
+from viewer.app.application import LOG
+from viewer.files import session
+from viewer.panel import layer_card, layer_cards, selection_section, snapshot_cards, timeline_bar
+from viewer.state import actions, selection
+from viewer.state.workspace import REQUESTS, Message
+from viewer.ui import axis_gizmo
+
+pytestmark = pytest.mark.gl
+
+ACTIONS = (
+    *actions.ACTIONS,
+    *selection.CHANGES,
+    "frame",
+    "home",
+    "paint_fill",
+    "blend_snapshots",
+    "next_slider",
+)
+DRAWN = {
+    "a card": (layer_cards, "draw_card"),
+    "the head of a card": (layer_card, "_number"),
+    "the tools": (selection_section, "_lit_button"),
+    "the snapshots": (snapshot_cards, "draw"),
+    "the timeline": (timeline_bar, "draw"),
+    "the mouse": (mouse, "_drag"),
+    "the axes": (axis_gizmo, "draw"),
+    "the keys": (bindings, "_column"),
+}
+"""Parts of a frame, each by what is replaced with something that raises."""
+
+
+class BrokenError(Exception):
+    """A mistake of ours."""
+
+
+def raises(error: Exception) -> Callable[..., Any]:
+    def act(*_: object, **__: object) -> Any:
+        raise error.with_traceback(None)
+
+    return act
+
+
+@pytest.fixture
+def window(tmp_path: Path) -> Iterator[application.App]:
+    folder = bear_files(tmp_path)
+    with null_app(opened_document(folder), first_view(bear(), 0.5, 0.5), folder) as app:
+        yield app
+
+
+def turns(app: application.App, count: int = 3) -> list[float | None]:
+    """So many turns of the window's loop, in each of which something comes in; what it would have waited."""
+    waits: list[float | None] = []
+
+    def wait(seconds: float | None) -> None:
+        waits.append(seconds)
+        app.is_closed = len(waits) >= count
+        app.main_view.wake()
+
+    app.window.wait = wait  # type: ignore[method-assign]
+    app.is_closed = False
+    app.loop()
+    app.is_closed = False
+    return waits
+
+
+def message(app: application.App) -> Message:
+    assert app.main_view.work.message is not None, "nothing is said"
+    return app.main_view.work.message
+
+
+def log(folder: Path) -> str:
+    return (folder / "memory" / LOG).read_text()
+
+
+def test_no_action_ends_the_window(
+    window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ACTIONS:
+        before = window.main_view.work.view
+        with monkeypatch.context() as broken:
+            broken.setattr(interface, "perform", raises(BrokenError(f"in {name}")))
+            window.main_view.work = replace(window.main_view.work, message=None)
+            window.main_view._perform(name)
+        assert message(window).text.startswith(f"Internal error (BrokenError: in {name});")
+        assert window.main_view.work.view == before
+    assert log(tmp_path).count("Traceback") == 1, "all at the same place"
+
+
+def test_no_request_ends_the_window(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
+    for part in (window.training, window.deliver, window.start, window.up, window.file_actions):
+        monkeypatch.setattr(part, "handle", raises(BrokenError("in a request")))
+    monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
+    monkeypatch.setattr(window.window, "toggle_full_screen", raises(BrokenError("in a request")))
+    for request in REQUESTS:
+        window.main_view.work = replace(window.main_view.work, message=None)
+        window.main_view.request(request)
+        turns(window, 2)
+        assert "BrokenError: in a request" in message(window).text, request
+
+
+@pytest.mark.parametrize("part", DRAWN)
+def test_a_part_of_a_frame_that_fails_each_time_leaves_the_others_as_they_are(
+    window: application.App, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    press(window, "F3", "K", "F1", "Shift+Left")
+    monkeypatch.setattr(*DRAWN[part], raises(BrokenError(part)))
+    imgui.get_io().add_mouse_pos_event(200.0, 200.0)
+    turns(window)
+    assert f"BrokenError: {part}" in message(window).text
+    assert message(window).details.count(part) >= 1
+    assert log(tmp_path).count("Traceback") == 1, "once, however often it fails"
+    drawn = window.main_view.frames
+    while (wait := window.main_view.next_frame_delay()) == 0.0:
+        window.draw()
+        assert window.main_view.frames - drawn < 50, f"a window at rest rests: {wait}"
+    strength = window.main_view.work.view.layers[-1].strength
+    press(window, "Left")
+    assert window.main_view.work.view.layers[-1].strength < strength, "keys do what they did"
+    monkeypatch.undo()
+    window.main_view.work = replace(window.main_view.work, message=None)
+    turns(window)
+    assert window.main_view.work.message is None, "imgui is as it was"
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_panel_and_undo(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    press(window, "Shift+Left")
+    monkeypatch.setattr(window.main_view.canvas, "draw", raises(BrokenError("no picture")))
+    monkeypatch.setattr(window.main_view.canvas, "awaits_picture", raises(BrokenError("no picture")))
+    turns(window)
+    assert "BrokenError: no picture" in message(window).text
+    press(window, "Ctrl+Z")
+    assert window.main_view.work.view.layers[-1].strength == 0.5
+
+
+@pytest.mark.parametrize("part", ["training", "preview", "deliver", "start", "up"])
+def test_no_job_ends_the_window_and_it_is_looked_at_again(
+    window: application.App, part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(getattr(window, part), "poll", raises(BrokenError("a job")))
+    waits = turns(window)
+    assert "BrokenError: a job" in message(window).text
+    assert all(wait is not None and wait <= application.RETRY_S for wait in waits)
+
+
+def test_what_the_person_can_mend_is_one_line_without_a_log(
+    window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for error, line in (
+        (ProgdfError("bear.ply is gone;\nopen it again"), "bear.ply is gone; open it again"),
+        (
+            OSError(28, "No space left on device", "a.ply"),
+            "a.ply cannot be read or written: No space left on device",
+        ),
+    ):
+        monkeypatch.setattr(window.training, "poll", raises(error))
+        turns(window)
+        assert (message(window).text, message(window).details) == (line, "")
+    assert not (tmp_path / "memory" / LOG).exists()
+
+
+def test_unsaved_work_is_kept_at_once_and_the_details_are_copied(
+    window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    press(window, "Shift+Left")
+    window.report(BrokenError("at last"))
+    kept = tmp_path / "bear.autosave.session.json"
+    assert session.open_session(kept).view.layers == window.main_view.work.view.layers
+    assert message(window).text == f"Internal error (BrokenError: at last); unsaved work is kept in {kept}"
+    copied: list[str] = []
+    monkeypatch.setattr(imgui, "set_clipboard_text", copied.append)
+    monkeypatch.setattr(interface.overlay, "message", lambda *_: ("copy", 600.0))
+    details = message(window).details
+    window.draw()
+    assert copied == [details]
+    assert "BrokenError: at last" in details
+    assert message(window).text.startswith("Copied")
+
+
+def test_work_that_cannot_be_kept_is_told(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
+    press(window, "Shift+Left")
+    monkeypatch.setattr(session, "save", raises(OSError(28, "No space left on device")))
+    window.report(BrokenError("at last"))
+    assert "unsaved work could not be kept" in message(window).text
