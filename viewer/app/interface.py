@@ -13,7 +13,7 @@ from viewer.panel.new_edit_form import FormInput
 from viewer.panel.snapshot_cards import SnapshotCard, SnapshotSlider
 from viewer.pictures.compare_labels import Labels
 from viewer.select import outline
-from viewer.state import snapshots, workspace
+from viewer.state import history, snapshots, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
@@ -48,8 +48,8 @@ def panels(
         facts.count,
         facts.rows,
         work.focus,
-        len(past.past),
-        len(past.future),
+        history.next_undo(past),
+        history.next_redo(past),
         reveal,
         work.active_slider,
         work.renaming,
@@ -70,7 +70,9 @@ def panels(
     work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
     form = result.form or work.form
     work = replace(work, overlap=result.overlap, pointed=result.pointed, form=form)
-    work = replace(work, search=result.search, searching=False, cards_fit=result.cards_fit)
+    work = replace(
+        work, search=result.search, searching=False, cards_fit=result.cards_fit, form_opening=False
+    )
     work = perform_actions(work, result.actions, pointer)
     if work.player.shown:
         asked = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
@@ -90,7 +92,7 @@ def _form_input(work: Workspace, count: int, preview: tuple[str, bool]) -> FormI
     """What the form of a new edit offers."""
     selection = work.view.selection
     regions = tuple((region.name, region.count) for region in selection.regions)
-    return FormInput(count, selection.count, regions, *preview)
+    return FormInput(count, selection.count, regions, *preview, work.form_opening)
 
 
 def over_picture(
@@ -159,10 +161,20 @@ def draw_dialog(
 
 
 def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
-    """What keys and buttons ask for; see `perform`."""
+    """What keys and buttons ask for, see `perform`; an undo says what it took back."""
     for action in actions:
-        before = work.view.camera
+        before = work
         work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
         if action.partition(":")[0] in GLIDES:
-            work = workspace.glide_from(work, before)
+            work = workspace.glide_from(work, before.view.camera)
+        elif action in _UNDOES and work.past is not before.past:
+            did, describe = _UNDOES[action]
+            work = workspace.with_message(
+                work, f"{did}: {describe(before.past)}", pointer.now, seconds=UNDO_S
+            )
     return work
+
+
+UNDO_S = 2.0
+"""How long it is said what an undo took back."""
+_UNDOES = {"undo": ("Undid", history.next_undo), "redo": ("Redid", history.next_redo)}

@@ -20,7 +20,7 @@ from viewer.camera import inputs
 from viewer.camera.inputs import NO_KEYS, Keys, Taps
 from viewer.files import exports as saved_files
 from viewer.gl.present import read_rgb
-from viewer.panel import panel
+from viewer.panel import new_edit_form, panel
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.surfaces import Surfaces
 from viewer.select import hand
@@ -85,6 +85,7 @@ class MainView:
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
         self._taps = Taps()
+        self._listed = False  # whether a list or menu was open in the last frame
         self._half = 0  # of two pictures side by side, the one that the mouse is in
         self._clock = 0.0
         self._pending = PendingKeys()
@@ -190,6 +191,8 @@ class MainView:
         self._clock += max(seconds, 0.0)
         self._pace.step(seconds)
         self._resting = False
+        with self._guarded():
+            self.work = workspace.advance(self.work, seconds)
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
@@ -218,8 +221,7 @@ class MainView:
         self.show_message(str(error), error=True)
 
     def _update(self, keys: Keys, seconds: float) -> None:
-        """The workspace after what the person did and what goes on by itself."""
-        self.work = workspace.advance(self.work, seconds)
+        """The workspace after what the person did."""
         before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
@@ -260,23 +262,26 @@ class MainView:
         off = inputs.cancels_drag(self._keys, self._tool.drag)
         if off:
             self._cancel_drag()
-        gesture, self.work, self._keys = hand.take_keys(
-            self._tool.gesture, self.work, self._pointer(), self._keys
-        )
-        self._tool = replace(self._tool, gesture=gesture)
-        asks = self.work.dialog is not None or imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
-        if self.up_strip is not None and not asks and any(p.chord == "Escape" for p in self._keys.pressed):
+        view, asks = self.work.view, self._takes_keys()
+        if not asks:
+            gesture, self.work, self._keys = hand.take_keys(
+                self._tool.gesture, self.work, self._pointer(), self._keys
+            )
+            self._tool = replace(self._tool, gesture=gesture)
+        free = not (asks or imgui.get_io().want_text_input or view.brush.active or view.select.tool)
+        if self.up_strip is not None and free and any(p.chord == "Escape" for p in self._keys.pressed):
             self._keys = replace(self._keys, pressed=())
             self.request("keep_up")
-        flies = self.work.view.camera.mode == "fly"
+        flies = view.camera.mode == "fly"
         self._taps, tapped = inputs.tapped_actions(self._taps, self._keys, self._clock, flies)
-        if asks:  # the letters are its own
+        if asks:  # no key is a shortcut or flies
             self._taps, tapped = Taps(), []
+            self._keys = Keys(self._keys.pressed)
         self._keys = self._taps.without(self._keys)
         for action in (*inputs.requested_actions(self._keys), *tapped):
             if self.at_start and action not in start_page.KEYS:
                 continue
-            if not asks or action in ("picture", "take_view", "window_picture"):
+            if not asks or action == "window_picture":  # which shows what is open, and changes nothing
                 self._perform(action)
         if self.at_start:
             for action in start_page.draw(self.recent_files, self.ui):
@@ -300,6 +305,12 @@ class MainView:
             tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
             with self._guarded():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
+
+    def _takes_keys(self) -> bool:
+        """Whether a question, a list, a menu or the form takes all keys, or Escape has just closed one."""
+        listed, self._listed = self._listed, imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+        form = self.work.form_open and new_edit_form.has_keyboard()
+        return self.work.dialog is not None or listed or self._listed or form
 
     def _cancel_drag(self) -> None:
         """What is dragged goes back to where it was, and nothing is held any more."""

@@ -290,7 +290,17 @@ KEYS = (
 )
 
 
-OPENS_TEXT = ("rename", "search", "save", "save_as", "open", "export", "render_picture", "render_film")
+OPENS_TEXT = (
+    "rename",
+    "search",
+    "new_edit",
+    "save",
+    "save_as",
+    "open",
+    "export",
+    "render_picture",
+    "render_film",
+)
 """Actions after which one types."""
 
 

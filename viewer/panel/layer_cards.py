@@ -20,6 +20,7 @@ from viewer.state.view_state import OVERSHOOT, LayerGroup, ViewState
 from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.widgets import (
+    drop_down,
     right_edge,
     section,
     small,
@@ -89,15 +90,12 @@ def heading(state: ViewState, form_open: bool, ui: UiContext) -> tuple[ViewState
         return state, action
     imgui.same_line(right - combo)
     imgui.set_next_item_width(combo)
-    if imgui.begin_combo("##blend", state.blend.capitalize()):
-        for blend in BLENDS:
-            if imgui.selectable(blend.capitalize(), blend == state.blend)[0]:
-                state = replace(state, blend=blend)
-            tip(BLEND_HELP[blend])
-        imgui.end_combo()
-    else:
-        tip("Where edits overlap (M): " + BLEND_HELP[state.blend])
-    return state, action
+    titles, now = [blend.capitalize() for blend in BLENDS], BLENDS.index(state.blend)
+    help_ = "Where edits overlap (M): " + BLEND_HELP[state.blend]
+    pressed = drop_down(
+        "##blend", titles[now], titles, now, ui, help_, [BLEND_HELP[blend] for blend in BLENDS]
+    )
+    return state if pressed is None else replace(state, blend=BLENDS[pressed]), action
 
 
 def _new_button(form_open: bool) -> str:

@@ -24,6 +24,7 @@ from viewer.ui.widgets import (
     accent_button,
     card,
     choice,
+    drop_down,
     elide,
     group_digits,
     icon_button,
@@ -48,6 +49,7 @@ class FormInput:
         regions: names and sizes of the regions that were kept
         picture: what the editor's picture is at: "", a word such as "drawing", or why there is none
         failed: `picture` says why there is none
+        opening: the form was just opened, and takes the keyboard
     """
 
     count: int = 0
@@ -55,12 +57,37 @@ class FormInput:
     regions: Sequence[tuple[str, int]] = ()
     picture: str = ""
     failed: bool = False
+    opening: bool = False
 
 
 def draw(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
-    """The form as the hand leaves it, and what was asked for: "train", "new_edit" to close it, or ""."""
-    with card("new edit", PALETTE.card_focused, ui):
-        return _content(form, shown, ui)
+    """The form as the hand leaves it, and what was asked for: "train", "new_edit" to close it, or "".
+
+    Tab goes through it, Enter trains, Escape closes it.
+    """
+    with card(_NAME, PALETTE.card_focused, ui, nav=True):
+        storage, listed = imgui.get_state_storage(), imgui.get_id("a list is open")
+        mine = imgui.is_window_focused() and not storage.get_bool(
+            listed
+        )  # else Enter and Escape are the list's
+        closes = mine and imgui.is_key_pressed(imgui.Key.escape, False)
+        trains = mine and any(imgui.is_key_pressed(key, False) for key in _ENTER)
+        if mine and not imgui.get_io().want_text_input:
+            for key in _ENTER:  # presses no button and opens no list
+                imgui.internal.set_key_owner(key, listed)
+        if not closes:  # a field would take back what was typed
+            form, action = _content(form, shown, ui)
+        storage.set_bool(listed, imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value))
+    return form, "new_edit" if closes else "train" if trains else action
+
+
+_NAME, _ENTER = "new edit", (imgui.Key.enter, imgui.Key.keypad_enter)
+
+
+def has_keyboard() -> bool:
+    """Whether keys are the form's: it was opened, or clicked, last."""
+    window = imgui.get_current_context().nav_window
+    return window is not None and window.was_active and f"/{_NAME}_" in window.name
 
 
 def _content(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
@@ -74,11 +101,13 @@ def _content(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, s
         action = "new_edit"
     tip("Close (Ctrl+N). What is being trained goes on")
     column = COLUMN_PX * ui.scale
-    form = _region(form, shown, column)
-    form = _editor(form, column)
+    form = _region(form, shown, column, ui)
+    form = _editor(form, column, ui)
     form = _settings(form, column, ui)
     label("Name", column)
     imgui.set_next_item_width(-1.0)
+    if shown.opening:
+        imgui.set_keyboard_focus_here()
     form = replace(form, name=_text("##name", form.suggested_name, form.name))
     tip("Name of the layer and of its file")
     label("Quality", column)
@@ -112,19 +141,17 @@ def region_title(region: str, shown: FormInput) -> str:
     return f"{region}  ·  {group_digits(sizes.get(region, 0))}"
 
 
-def _region(form: NewEdit, shown: FormInput, column: float) -> NewEdit:
+def _region(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> NewEdit:
     label("Region", column)
     imgui.set_next_item_width(-1.0)
     room = imgui.get_content_region_avail().x - 2 * imgui.get_frame_height()
-    if imgui.begin_combo("##region", elide(region_title(form.region, shown), room)):
-        offered = [SELECTION] * bool(shown.selected) + [name for name, _ in shown.regions] + [ALL, TYPED]
-        offered = [CHANGED] * (form.choice.kind == "pictures") + offered
-        for region in offered:
-            if imgui.selectable(f"{region_title(region, shown)}##{region}", region == form.region)[0]:
-                form = replace(form, region=region, error="")
-        imgui.end_combo()
-    else:
-        tip("What may change")
+    offered = [SELECTION] * bool(shown.selected) + [name for name, _ in shown.regions] + [ALL, TYPED]
+    offered = [CHANGED] * (form.choice.kind == "pictures") + offered
+    titles = [region_title(region, shown) for region in offered]
+    now = offered.index(form.region) if form.region in offered else None
+    title = elide(region_title(form.region, shown), room)
+    pressed = drop_down("##region", title, titles, now, ui, "What may change")
+    form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
         imgui.dummy(imgui.ImVec2(0.0, 0.0))
         imgui.same_line(column)
@@ -134,23 +161,15 @@ def _region(form: NewEdit, shown: FormInput, column: float) -> NewEdit:
     return form
 
 
-def _editor(form: NewEdit, column: float) -> NewEdit:
+def _editor(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
     label("Editor", column)
     imgui.set_next_item_width(-1.0)
-    if imgui.begin_combo("##editor", form.choice.title):
-        for i, editor in enumerate(EDITORS):
-            missing = missing_package(editor)
-            imgui.push_style_color(
-                imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if missing else PALETTE.text))
-            )
-            if imgui.selectable(editor.title, i == form.editor)[0]:
-                form = with_editor(form, i)
-            imgui.pop_style_color()
-            tip(missing or editor.help)
-        imgui.end_combo()
-    else:
-        tip(form.choice.help)
-    return form
+    titles, missing = [editor.title for editor in EDITORS], [missing_package(editor) for editor in EDITORS]
+    tips = [reason or editor.help for reason, editor in zip(missing, EDITORS, strict=True)]
+    faint = [i for i, reason in enumerate(missing) if reason]
+    help_ = form.choice.help
+    pressed = drop_down("##editor", form.choice.title, titles, form.editor, ui, help_, tips, faint)
+    return form if pressed is None else with_editor(form, pressed)
 
 
 def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
@@ -200,13 +219,10 @@ def _style(form: NewEdit, ui: UiContext) -> NewEdit:
         at -= 1
     imgui.same_line(0.0, gap)
     imgui.set_next_item_width(imgui.get_content_region_avail().x - side - gap)
-    if imgui.begin_combo("##number", f"Painting {form.style}", imgui.ComboFlags_.no_arrow_button.value):
-        for i, number in enumerate(order):
-            if imgui.selectable(f"Painting {number}", i == at)[0]:
-                at = i
-        imgui.end_combo()
-    else:
-        tip("Which painting; the first six look most alike from all sides")
+    titles, flags = [f"Painting {number}" for number in order], imgui.ComboFlags_.no_arrow_button.value
+    help_ = "Which painting; the first six look most alike from all sides"
+    pressed = drop_down("##number", titles[at], titles, at, ui, help_, flags=flags)
+    at = at if pressed is None else pressed
     imgui.same_line(0.0, gap)
     if imgui.button("›##style", imgui.ImVec2(side, 0.0)):
         at += 1

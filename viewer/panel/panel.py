@@ -64,7 +64,7 @@ class PanelInput:
         count: Gaussians in the scene
         rows: one per .gdf, indexed by `LayerState.gdf`
         focus: the focused layer, an index into `state.layers`, or None
-        undos, redos: how many entries there are either way
+        undo, redo: what they would take and bring back, "" for nothing
         reveal: scroll to the focused layer
         snapshots: the original and what was kept
         active_slider: which of `layers.SLIDERS` of the focused layer the arrow keys move
@@ -84,8 +84,8 @@ class PanelInput:
     count: int
     rows: Sequence[LayerRow]
     focus: int | None = None
-    undos: int = 0
-    redos: int = 0
+    undo: str = ""
+    redo: str = ""
     reveal: bool = False
     active_slider: str = "strength"
     renaming: int | None = None
@@ -319,15 +319,15 @@ _LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
 def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
     right = right_edge()
-    for action, icon, help_, usable in (
-        ("undo", Icon.UNDO, f"Undo (Ctrl+Z), {shown.undos} available", shown.undos > 0),
-        ("redo", Icon.REDO, f"Redo (Ctrl+Shift+Z), {shown.redos} available", shown.redos > 0),
+    for action, icon, key, change in (
+        ("undo", Icon.UNDO, "Ctrl+Z", shown.undo),
+        ("redo", Icon.REDO, "Ctrl+Shift+Z", shown.redo),
     ):
-        imgui.begin_disabled(not usable)
+        imgui.begin_disabled(not change)
         if icon_button(action, icon, ui):
             actions.append(action)
         imgui.end_disabled()
-        tip(help_)
+        tip(f"{action.capitalize()}{change and ': '}{change} ({key})")
         imgui.same_line()
     if state.layers and brush.toggle(state, ui):
         actions.append("brush")

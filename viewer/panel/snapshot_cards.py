@@ -8,7 +8,18 @@ from imgui_bundle import imgui
 
 from viewer.panel import strength_slider
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import elide, grip, icon_button, menu, picture, right_edge, section, tip, typed_name
+from viewer.ui.widgets import (
+    drop_down,
+    elide,
+    grip,
+    icon_button,
+    menu,
+    picture,
+    right_edge,
+    section,
+    tip,
+    typed_name,
+)
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -101,13 +112,11 @@ def _slider(
         imgui.set_next_item_width(wide)
         label = f"{slot.upper()}   {cards[chosen].name}"
         room = wide - side - 2 * imgui.get_style().frame_padding.x
-        if imgui.begin_combo(f"##snapshot {slot}", elide(label, room)):
-            for i, card in enumerate(cards):
-                if imgui.selectable(f"{card.name}##{i}", i == chosen)[0]:
-                    actions.append(f"choose_snapshot:{slot}:{card.name}")
-            imgui.end_combo()
-        else:
-            tip(f"Snapshot {slot.upper()}, the {'left' if slot == 'a' else 'right'} end of the slider below")
+        help_ = f"Snapshot {slot.upper()}, the {'left' if slot == 'a' else 'right'} end of the slider below"
+        titles = [card.name for card in cards]
+        pressed = drop_down(f"##snapshot {slot}", elide(label, room), titles, chosen, ui, help_)
+        if pressed is not None:
+            actions.append(f"choose_snapshot:{slot}:{titles[pressed]}")
     number = imgui.calc_text_size("0.00").x
     at, room = imgui.get_cursor_screen_pos(), imgui.get_content_region_avail().x - number - 8.0 * ui.scale
     share = strength_slider.draw(

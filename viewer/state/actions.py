@@ -173,13 +173,15 @@ def _resize(workspace: Workspace, times: str) -> Workspace:
 
 
 def _step_back(workspace: Workspace, _: str) -> Workspace:
-    """The list of bindings goes, or the tool in the hand, or the other selected layers, or the focus."""
+    """The list of bindings goes, or the tool in the hand, the form, the other selected layers, the focus."""
     if workspace.help:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
         return _change_brush(workspace, active=False)
     if tool := workspace.view.select.tool:
         return _take_tool(workspace, tool)
+    if workspace.form_open:
+        return replace(workspace, form_open=False)
     if len(layer_selection.selected_layers(workspace)) > 1:
         return replace(workspace, selected=frozenset())
     return replace(workspace, focus=None)
@@ -215,7 +217,7 @@ def _back(workspace: Workspace, past: History) -> Workspace:
         return workspace
     kept = past.present
     workspace = replace(workspace, past=past, snapshots=kept.snapshots, renaming=None)
-    return with_layers_of(workspace, history.apply_edit(workspace.view, kept.edit))
+    return with_layers_of(workspace, history.apply_present(workspace.view, past))
 
 
 def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
@@ -223,7 +225,7 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
 
     def act(workspace: Workspace, argument: str) -> Workspace:
         view, player = playback.perform(workspace.view, workspace.player, f"{name}:{argument}")
-        past = workspace.past
+        past = history.follow_camera(workspace.past, workspace.view, view)
         if loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
             past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
         elif past.present.edit.layers == workspace.view.layers:
@@ -278,7 +280,8 @@ def _new_edit(workspace: Workspace, _: str) -> Workspace:
         form = replace(form, region=SELECTION)
     elif form.region not in known:
         form = replace(form, region=ALL)
-    return replace(workspace, form=replace(form, error=""), form_open=not workspace.form_open)
+    opens = not workspace.form_open
+    return replace(workspace, form=replace(form, error=""), form_open=opens, form_opening=opens)
 
 
 GLIDES = ("frame", "home", "look")

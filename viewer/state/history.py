@@ -1,9 +1,15 @@
-"""Undo and redo: one entry per gesture, of what is edited and of snapshots, never of where one looks from."""
+"""Undo and redo: one entry per gesture, of what is edited, of snapshots, and of up axis, field of view and
+background where a person sets them; never of where one looks from.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
+
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import ViewCamera, with_up
 
 from .selection import SelectionState
 from .view_state import Blend, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
@@ -25,25 +31,38 @@ class Edit:
 
 
 @dataclass(frozen=True)
+class Look:
+    """How the scene is looked at, as a person sets it."""
+
+    up: Vec3 = ViewCamera.up
+    fov_y: float = ViewCamera.fov_y
+    background: tuple[float, float, float] = ViewState.background
+
+
+@dataclass(frozen=True)
 class HistoryEntry:
     """What one entry brings back.
 
     Args:
         edit: the part of the state
+        look: as a person set it last
         snapshots: those there were, see snapshots.py, which is built on this module
     """
 
     edit: Edit
+    look: Look = Look()
     snapshots: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True)
 class History:
-    """Entries before and after the present one."""
+    """Entries before and after the present one; `seen`: the look of the state, also where the camera's way to
+    another view, a film or a file has changed it, which is no entry."""
 
     present: HistoryEntry
     past: tuple[HistoryEntry, ...] = ()
     future: tuple[HistoryEntry, ...] = ()
+    seen: Look = Look()
 
 
 def edit_of(state: ViewState) -> Edit:
@@ -58,9 +77,14 @@ def edit_of(state: ViewState) -> Edit:
     )
 
 
+def look_of(state: ViewState) -> Look:
+    return Look(state.camera.up, state.camera.fov_y, state.background)
+
+
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
     """A history whose present is `state` with these snapshots, and that has nothing to undo."""
-    return History(HistoryEntry(edit_of(state), snapshots))
+    look = look_of(state)
+    return History(HistoryEntry(edit_of(state), look, snapshots), seen=look)
 
 
 def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
@@ -68,10 +92,11 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
 
     A gesture that ends where it began leaves no entry.
     """
-    step = HistoryEntry(edit_of(state), snapshots)
-    if step == history.present:
-        return history
-    return History(step, (*history.past, history.present)[-LONGEST:])
+    seen, present = look_of(state), history.present
+    step = HistoryEntry(edit_of(state), _take_changes(present.look, history.seen, seen), snapshots)
+    if step == present:
+        return history if seen == history.seen else replace(history, seen=seen)
+    return History(step, (*history.past, present)[-LONGEST:], seen=seen)
 
 
 def merge(history: History) -> History:
@@ -90,12 +115,18 @@ def follow_playhead(history: History, before: ViewState, after: ViewState) -> Hi
     return replace(history, present=replace(history.present, edit=replace(edit, layers=layers)))
 
 
+def follow_camera(history: History, before: ViewState, after: ViewState) -> History:
+    """The camera went elsewhere: no entry; what a person has just set and is not recorded yet stays to be."""
+    seen = _take_changes(history.seen, look_of(before), look_of(after))
+    return history if seen == history.seen else replace(history, seen=seen)
+
+
 def undo(history: History) -> History:
     """One entry back; unchanged where there is none."""
     if not history.past:
         return history
     *past, back = history.past
-    return History(back, tuple(past), (history.present, *history.future))
+    return _go_to(history, back, tuple(past), (history.present, *history.future))
 
 
 def redo(history: History) -> History:
@@ -103,7 +134,22 @@ def redo(history: History) -> History:
     if not history.future:
         return history
     ahead, *future = history.future
-    return History(ahead, (*history.past, history.present), tuple(future))
+    return _go_to(history, ahead, (*history.past, history.present), tuple(future))
+
+
+def _go_to(
+    history: History, entry: HistoryEntry, past: tuple[HistoryEntry, ...], future: tuple[HistoryEntry, ...]
+) -> History:
+    return History(entry, past, future, _take_changes(history.seen, history.present.look, entry.look))
+
+
+def _take_changes(look: Look, before: Look, after: Look) -> Look:
+    """The look with what is different after than before."""
+    names = [
+        field.name for field in fields(Look) if getattr(before, field.name) != getattr(after, field.name)
+    ]
+    changes: dict[str, Any] = {name: getattr(after, name) for name in names}
+    return replace(look, **changes) if changes else look
 
 
 def apply_edit(state: ViewState, edit: Edit) -> ViewState:
@@ -118,3 +164,73 @@ def apply_edit(state: ViewState, edit: Edit) -> ViewState:
         groups=edit.groups,
         pair=edit.pair,
     )
+
+
+def apply_present(state: ViewState, history: History) -> ViewState:
+    """`state` as the present entry has it, seen from where it is; another up axis only rolls it upright."""
+    look, camera = history.seen, state.camera
+    if camera.up != look.up:
+        camera = replace(with_up(camera, look.up), up=look.up)
+    if camera.fov_y != look.fov_y:
+        camera = replace(camera, fov_y=look.fov_y)
+    return replace(apply_edit(state, history.present.edit), camera=camera, background=look.background)
+
+
+_OF_LAYERS = {
+    "name": "name",
+    "strength": "strength",
+    "gains": "gains",
+    "paint": "paint",
+    "enabled": "visibility",
+    "solo": "solo",
+    "locked": "lock",
+    "group": "group",
+}
+_OF_SELECTIONS = {"regions": "regions", "hidden": "hidden splats", "members": "selection"}
+_OF_EDITS = {
+    "timeline": "timeline",
+    "groups": "groups",
+    "blend": "blend rule",
+    "overshoot": "overshoot",
+    "pair": "snapshot pair",
+}
+_OF_LOOKS = {"up": "up axis", "fov_y": "field of view", "background": "background"}
+
+
+def next_undo(history: History) -> str:
+    """What an undo takes back, in a few words; "" where there is nothing."""
+    return _describe_change(history.past[-1], history.present) if history.past else ""
+
+
+def next_redo(history: History) -> str:
+    """What a redo brings back, in a few words; "" where there is nothing."""
+    return _describe_change(history.present, history.future[0]) if history.future else ""
+
+
+def _describe_change(before: HistoryEntry, after: HistoryEntry) -> str:
+    """The first that is different, of what matters most."""
+    old, new = ({layer.gdf: layer for layer in entry.edit.layers} for entry in (before, after))
+    if old.keys() != new.keys():
+        added, removed = new.keys() - old.keys(), old.keys() - new.keys()
+        names = [new[gdf].name for gdf in added] or [old[gdf].name for gdf in removed]
+        done = "replace" if added and removed else "add" if added else "delete"
+        return f"{done} {_one_or_many(names)}"
+    for attribute, word in _OF_LAYERS.items():
+        names = [new[gdf].name for gdf in new if getattr(old[gdf], attribute) != getattr(new[gdf], attribute)]
+        if names:
+            return f"{word} of {_one_or_many(names)}"
+    if before.edit.layers != after.edit.layers:
+        return "layer order"
+    for words, one, other in (
+        (_OF_SELECTIONS, before.edit.selection, after.edit.selection),
+        (_OF_EDITS, before.edit, after.edit),
+        (_OF_LOOKS, before.look, after.look),
+    ):
+        for attribute, word in words.items():
+            if getattr(one, attribute) != getattr(other, attribute):
+                return word
+    return "snapshots"
+
+
+def _one_or_many(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{len(names)} layers"

@@ -141,6 +141,7 @@ class Workspace:
         pointed: what else the mouse rests on in the panel, to be seen in the picture
         form: of a new edit, as it was last left
         form_open: whether it is shown
+        form_opening: it was opened and has no keyboard yet
         jobs: what is being trained, or waits for that, as the window last looked
         deliveries: what is being exported and rendered
         before: the original is shown, until its key is tapped again or a slider moves
@@ -168,6 +169,7 @@ class Workspace:
     pointed: Pointed | None = None
     form: NewEdit = NewEdit()
     form_open: bool = False
+    form_opening: bool = False
     jobs: tuple[TrainingJob, ...] = ()
     deliveries: tuple[Delivery, ...] = ()
     before: bool = False
@@ -203,10 +205,15 @@ def original(view: ViewState) -> ViewState:
 
 
 def with_message(
-    workspace: Workspace, text: str, now: float, error: bool = False, details: str = ""
+    workspace: Workspace,
+    text: str,
+    now: float,
+    error: bool = False,
+    details: str = "",
+    seconds: float = MESSAGE_S,
 ) -> Workspace:
     """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
-    until = now + (DETAILS_S if details else ERROR_S if error else MESSAGE_S)
+    until = now + (DETAILS_S if details else ERROR_S if error else seconds)
     return replace(workspace, message=Message(escape_text(" ".join(text.split())), until, error, details))
 
 
@@ -218,7 +225,7 @@ def record_undo(workspace: Workspace) -> Workspace:
 
 def cancel_drag(workspace: Workspace) -> Workspace:
     """As it was before the gesture under way."""
-    return replace(workspace, view=history.apply_edit(workspace.view, workspace.past.present.edit))
+    return replace(workspace, view=history.apply_present(workspace.view, workspace.past))
 
 
 def advance(workspace: Workspace, seconds: float) -> Workspace:
@@ -232,10 +239,11 @@ def advance(workspace: Workspace, seconds: float) -> Workspace:
     view = workspace.view
     player = playback.advance(workspace.player, view.timeline, seconds)
     view = timeline.state_at(view.timeline, player.frame, view, playback.LEAST_KEYS)
+    past = history.follow_camera(workspace.past, workspace.view, view)
     if loses_strengths(workspace, view):
-        past = history.record(workspace.past, view, workspace.snapshots)
+        past = history.record(past, view, workspace.snapshots)
     else:
-        past = history.follow_playhead(workspace.past, workspace.view, view)
+        past = history.follow_playhead(past, workspace.view, view)
     return replace(workspace, view=view, player=player, past=past)
 
 
@@ -249,7 +257,8 @@ def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
 
 def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
     """Looking from elsewhere; never an undo entry."""
-    return replace(workspace, view=replace(workspace.view, camera=camera))
+    view = replace(workspace.view, camera=camera)
+    return replace(workspace, view=view, past=history.follow_camera(workspace.past, workspace.view, view))
 
 
 def glide_from(workspace: Workspace, start: ViewCamera) -> Workspace:

@@ -105,6 +105,9 @@ class UiContext:
         io.set_ini_filename("")  # no imgui.ini left in the user's folder
         io.set_log_filename("")
         io.config_input_text_cursor_blink = False  # or an open text field has the window drawn all the time
+        io.config_flags |= imgui.ConfigFlags_.nav_enable_keyboard.value  # in lists, menus and the form
+        self.context.config_nav_windowing_key_next = self.context.config_nav_windowing_key_prev = 0
+        self.typed = ("", 0.0)  # into the list that is open, and when
         self.fonts = _load_fonts(io.fonts)
         self.scale = 0.0
         self.set_scale(scale)

@@ -9,6 +9,8 @@ from imgui_bundle import imgui
 
 from .context import PALETTE, SMALL_PX, Rgba, UiContext, u32
 
+TYPING_S = 1.0
+"""Between two letters of one word, at most, in a list."""
 _GRIP_PX = 4.0  # what moves no further is a click, at 1×
 
 
@@ -62,13 +64,13 @@ def picture(texture: int, at: imgui.ImVec2, end: imgui.ImVec2, rounding: float) 
 
 
 @contextmanager
-def card(name: str, color: Rgba, ui: UiContext) -> Iterator[None]:
-    """What is drawn within lies on a card of its own height."""
+def card(name: str, color: Rgba, ui: UiContext, nav: bool = False) -> Iterator[None]:
+    """What is drawn within lies on a card of its own height; `nav`: the keyboard goes through it."""
     imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*color))
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * ui.scale, 8 * ui.scale))
     child = imgui.ChildFlags_
     flags = child.auto_resize_y.value | child.always_use_window_padding.value
-    imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
+    imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, 0 if nav else imgui.WindowFlags_.no_nav.value)
     yield  # where this raises, the frame ends what is open
     imgui.end_child()
     imgui.pop_style_var()
@@ -120,15 +122,75 @@ def typed_name(name: str, room: float) -> str | None:
 
 @contextmanager
 def menu(name: str, ui: UiContext) -> Iterator[bool]:
-    """A context menu that `imgui.open_popup(name)` opens; whether it is open. Escape closes it."""
+    """A context menu that `imgui.open_popup(name)` opens; whether it is open."""
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(8.0 * ui.scale, 8.0 * ui.scale))
     is_open = imgui.begin_popup(name)
     imgui.pop_style_var()
     yield bool(is_open)  # where this raises, the frame ends what is open
     if is_open:
-        if imgui.is_key_pressed(imgui.Key.escape):
-            imgui.close_current_popup()
         imgui.end_popup()
+
+
+def drop_down(
+    name: str,
+    shown: str,
+    titles: Sequence[str],
+    current: int | None,
+    ui: UiContext,
+    help_: str,
+    tips: Sequence[str] = (),
+    faint: Collection[int] = (),
+    flags: int = 0,
+) -> int | None:
+    """A list that opens below what it shows; the index that was chosen, or None.
+
+    Arrows, Enter and Escape are imgui's own; letters go to the title that begins with them.
+
+    Args:
+        name: for imgui, shown nowhere
+        shown: of the present choice
+        titles: to choose from
+        current: which of them is chosen
+        help_: the tip of the closed list
+        tips: one for each title, or none
+        faint: which titles are drawn so
+        flags: of `imgui.ComboFlags_`
+    """
+    if not imgui.begin_combo(name, shown, flags):
+        tip(help_)
+        return None
+    goal, chosen = _typed_goal(titles, ui), None
+    for i, title in enumerate(titles):
+        if i == goal:
+            imgui.set_keyboard_focus_here()
+            imgui.set_nav_cursor_visible(True)
+        imgui.push_style_color(
+            imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if i in faint else PALETTE.text))
+        )
+        if imgui.selectable(f"{title}##{i}", i == current)[0]:
+            chosen = i
+        imgui.pop_style_color()
+        if i == current:
+            imgui.set_item_default_focus()
+        if tips:
+            tip(tips[i])
+    imgui.end_combo()
+    return chosen
+
+
+def _typed_goal(titles: Sequence[str], ui: UiContext) -> int | None:
+    """The title that begins with what was just typed, None where nothing was."""
+    now, (typed, at) = imgui.get_time(), ui.typed
+    letters = "".join(chr(code) for code in imgui.get_io().input_queue_characters)
+    if now - at > TYPING_S or imgui.is_window_appearing():
+        typed = ""
+    if typed:  # then a blank belongs to the name, and chooses nothing
+        imgui.internal.set_key_owner(imgui.Key.space, imgui.get_id("typed"))
+    if not letters:
+        return None
+    ui.typed = (typed + letters).lstrip(), now
+    begun = ui.typed[0].casefold()
+    return next((i for i, title in enumerate(titles) if begun and title.casefold().startswith(begun)), None)
 
 
 def is_released() -> bool:
@@ -189,7 +251,11 @@ def value_slider(
     flags = imgui.SliderFlags_.always_clamp.value
     if ends[0] > 0.0:
         flags |= imgui.SliderFlags_.logarithmic.value
-    alpha = 1.0 if imgui.get_io().want_text_input else 0.0
+    alpha = (
+        1.0
+        if imgui.get_io().want_text_input and imgui.internal.get_active_id() == imgui.get_id(name)
+        else 0.0
+    )
     imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.text[:3], alpha))
     changed, new = imgui.slider_float(name, value, *ends, form, flags)
     imgui.pop_style_color()

@@ -151,7 +151,7 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
             hand.key(chord)
         hand.frame(5)
         hand.wheel(900.0, 400.0, -100.0)
-        hand.main_view.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.session.json"))
+        hand.main_view.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
         hand.main_view.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())

@@ -12,7 +12,7 @@ from viewer.camera import view_camera as turntable
 from viewer.camera.view_camera import Bounds, ViewCamera
 from viewer.panel import panel
 from viewer.panel.strength_slider import parse_strength
-from viewer.state import workspace
+from viewer.state import history, workspace
 from viewer.state.actions import perform
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
@@ -270,7 +270,7 @@ def test_an_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
     hand.click(SIZE[0] - 65, 247)
     assert hand.work.view.camera.up == (0.0, 0.0, -1.0)
-    assert hand.work.past.past == (), "where one looks from is not in the undo stack"
+    assert history.next_undo(hand.work.past) == "up axis"
     hand.ui.close()
 
 

@@ -175,6 +175,7 @@ def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
         for _ in range(4):
             hand.key("Ctrl+Z")
         hand.move(5.0, 5.0)  # a name that the mouse rests on shows its region
+        hand.rest()  # until what was undone is no longer said
         assert np.array_equal(hand.picture(), bright)
 
 

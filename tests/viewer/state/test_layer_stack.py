@@ -186,6 +186,7 @@ def test_every_change_of_a_layer_is_one_undo_entry_and_comes_back(hand: Rig) -> 
     for _ in range(4):
         hand.key("Ctrl+Z")
     assert hand.main_view.work.view == first_view(bear(), 0.5, 0.5)
+    hand.rest()  # until what was undone is no longer said
     assert np.array_equal(hand.picture(), before)
 
 
@@ -429,6 +430,8 @@ def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> 
     assert not np.array_equal(hand.picture(), picture)
     hand.key("Ctrl+Z")
     assert hand.main_view.work.view.layers == before.layers
+    hand.move(5.0, 5.0)
+    hand.rest()
     assert np.array_equal(hand.picture(), picture)
     hand.key("1")
     hand.key("Ctrl+Delete")

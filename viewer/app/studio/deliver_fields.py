@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 
 from viewer.jobs.delivery import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions
 from viewer.ui.context import UiContext
-from viewer.ui.widgets import choice, label, tip
+from viewer.ui.widgets import choice, drop_down, label, tip
 
 COLUMN_PX = 100.0
 _LARGEST = 16_384
@@ -29,11 +29,9 @@ def draw(kind: str, path: str, options: DeliverOptions, ui: UiContext) -> tuple[
         return path, options if pressed is None else replace(options, alpha=pressed == 1)
     label("Moves", column)
     imgui.set_next_item_width(-1.0)
-    if imgui.begin_combo("##moves", _moves(options.moves)):
-        for name in options.can_move:
-            if imgui.selectable(_moves(name), name == options.moves)[0]:
-                options = replace(options, moves=name)
-        imgui.end_combo()
+    titles, now = [_moves(name) for name in options.can_move], options.can_move.index(options.moves)
+    pressed = drop_down("##moves", titles[now], titles, now, ui, "What moves in the film")
+    options = options if pressed is None else replace(options, moves=options.can_move[pressed])
     label("Format", column)
     pressed = choice("format", FORMAT_NAMES, FORMATS.index(options.format), ui)
     if pressed is not None:

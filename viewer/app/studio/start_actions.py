@@ -16,6 +16,7 @@ from viewer.gl.present import picture_texture
 from viewer.jobs.delivery import Deliveries
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
+from viewer.state import history
 from viewer.state.view_state import Comparison, ViewState
 
 from .start_page import RecentFile
@@ -69,7 +70,7 @@ class StartActions:
             self._app.open(scene)
             main_view = self._app.main_view
             view = replace(main_view.work.view, background=SKY)
-            main_view.work = replace(main_view.work, view=view)
+            main_view.work = replace(main_view.work, view=view, past=history.begin(view))
         edits = sorted(self._demo.glob("*/*.gdf"), key=lambda path: path.stat().st_mtime)
         for path in edits if self._app.document.path is not None else ():
             if path not in self._added:

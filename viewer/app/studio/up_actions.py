@@ -45,7 +45,8 @@ class UpActions:
         before = main_view.work.view.camera
         if strip is not None and name == "set_up":
             home = strip.choices[int(index)].camera
-            work = workspace.with_camera(replace(main_view.work, home=home), replace(home, mode=before.mode))
+            view = replace(main_view.work.view, camera=replace(home, mode=before.mode))
+            work = workspace.record_undo(replace(main_view.work, home=home, view=view))
             main_view.work = workspace.glide_from(work, before)
             self._answer(home.up)
         elif strip is not None:

@@ -1,0 +1,199 @@
+"""While a list, a menu, a question or the form of a new edit is open, keys are its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera import controls, inputs
+from viewer.camera.inputs import Keys, Press
+from viewer.jobs.new_edit import EDITORS
+from viewer.state.selection import NamedRegion
+from viewer.state.workspace import Dialog
+
+pytestmark = pytest.mark.gl
+
+WINDOW = (900, 700)
+LIST = (780.0, 139.0)
+"""Where the regions of the form are listed."""
+NAMES = ("Right", "Left", "Up", "Down", "Enter", "Escape", "Tab", "Space", "Backspace", "Delete")
+TOKENS = {
+    **{
+        name: getattr(imgui.Key, f"{name.lower()}_arrow" if i < 4 else name.lower())
+        for i, name in enumerate(NAMES)
+    },
+    **{letter.upper(): getattr(imgui.Key, letter) for letter in "abcdefghijklmnopqrstuvwxyz"},
+}
+MODIFIERS = {"Ctrl": imgui.Key.mod_ctrl, "Shift": imgui.Key.mod_shift, "Alt": imgui.Key.mod_alt}
+
+
+def strike(hand: Rig, chord: str) -> None:
+    """A key as the window hears it: imgui gets it, and our table."""
+    *held, name = chord.split("+")
+    for down in (True, False):
+        for modifier in held:
+            hand.io.add_key_event(MODIFIERS[modifier], down)
+        press = Press(chord, event_id=inputs.next_event_id())
+        if name in TOKENS:
+            hand.io.add_key_event(TOKENS[name], down)
+        hand.main_view.wake()
+        hand.frame(keys=Keys((press,) * down, frozenset({name} if down else ())))
+    hand.settle()
+
+
+def type_text(hand: Rig, text: str) -> None:
+    for letter in text:
+        hand.io.add_input_characters_utf8(letter)
+        strike(hand, "Space" if letter == " " else letter.upper())
+
+
+def list_is_open() -> bool:
+    return bool(imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value))
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    view = first_view(bear(), 0.5, 0.5)
+    names = ("arm", "red hat", "red jacket", "shoes")
+    regions = tuple(NamedRegion(name, Path(f"{name}.region.npy"), b"", 0) for name in names)
+    with rig(replace(view, selection=replace(view.selection, regions=regions)), WINDOW) as made:
+        yield made
+
+
+@pytest.fixture
+def form(hand: Rig) -> Rig:
+    """With the form open."""
+    strike(hand, "Ctrl+N")
+    return hand
+
+
+def test_the_form_that_opens_takes_what_is_typed_and_enter_trains_it(form: Rig) -> None:
+    before = form.main_view.work.view
+    type_text(form, "red jacket")
+    assert form.main_view.work.form.name == "red jacket"
+    assert form.main_view.work.view == before, "no letter was a shortcut"
+    strike(form, "Enter")
+    assert form.main_view.take_requests() == ("train",)
+    assert form.main_view.work.renaming is None
+
+
+def test_escape_closes_the_form_and_keeps_what_was_typed(form: Rig) -> None:
+    focus = form.main_view.work.focus
+    type_text(form, "hat")
+    strike(form, "Escape")
+    work = form.main_view.work
+    assert (work.form_open, work.form.name, work.focus) == (False, "hat", focus)
+    strike(form, "H")
+    assert not form.main_view.work.view.layers[1].enabled, "shortcuts are back"
+
+
+def test_tab_goes_through_the_form_both_ways_and_enter_presses_no_button_of_it(form: Rig) -> None:
+    seen = []
+    for _ in range(30):
+        seen.append(imgui.get_current_context().nav_id)
+        strike(form, "Tab")
+    assert len(set(seen)) >= 9, "lists, fields, buttons and sliders"
+    assert form.main_view.work.active_slider == "strength"
+    strike(form, "Shift+Tab")
+    assert imgui.get_current_context().nav_id in seen
+    quick = form.main_view.work.form.quick
+    strike(form, "Enter")
+    assert form.main_view.work.form.quick == quick
+    assert form.main_view.take_requests() == ("train",)
+
+
+def test_a_list_takes_arrows_and_enter(form: Rig) -> None:
+    form.click(*LIST)
+    assert list_is_open()
+    before = form.main_view.work.view
+    for chord in ("Up", "Up", "Enter"):
+        strike(form, chord)
+    assert not list_is_open()
+    assert form.main_view.work.form.region == "red jacket"
+    assert form.main_view.work.form_open
+    assert form.main_view.take_requests() == ()
+    assert form.main_view.work.view == before
+
+
+def test_escape_closes_a_list_and_nothing_else(form: Rig) -> None:
+    work = form.main_view.work
+    form.click(*LIST)
+    strike(form, "Down")
+    strike(form, "Escape")
+    assert not list_is_open()
+    after = form.main_view.work
+    assert (after.form_open, after.form.region, after.focus) == (True, work.form.region, work.focus)
+    strike(form, "Escape")
+    assert not form.main_view.work.form_open
+
+
+def test_letters_go_to_what_begins_with_them(form: Rig) -> None:
+    before = form.main_view.work.view
+    for word, chosen in (("s", "shoes"), ("red j", "red jacket"), ("RED H", "red hat"), ("a", "arm")):
+        form.click(*LIST)
+        form.pause(2.0)
+        type_text(form, word.lower())
+        strike(form, "Enter")
+        assert form.main_view.work.form.region == chosen
+    assert form.main_view.work.view == before
+
+
+def test_an_editor_is_chosen_by_its_first_letters(form: Rig) -> None:
+    form.click(LIST[0], LIST[1] + 31.0)
+    assert list_is_open()
+    type_text(form, "ni")
+    strike(form, "Enter")
+    assert EDITORS[form.main_view.work.form.editor].title == "Night"
+
+
+@pytest.mark.parametrize("what", ["menu", "list", "question", "form"])
+def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
+    if what in ("list", "form"):
+        strike(hand, "Ctrl+N")
+    if what == "list":
+        hand.click(*LIST)
+    if what == "menu":
+        hand.click(WINDOW[0] - 24.0, 24.0)
+    if what == "question":
+        hand.main_view.ask(Dialog("about", "1.0"))
+        hand.frame(2)
+    left_alone = ("Escape", "Enter", "Tab", "Shift+Tab", "Up", "Down", "Left", "Right", "Space", "Shift+F2")
+    for key in controls.KEYS:
+        if key.chord in left_alone or key.chord.endswith(("Up", "Down", "Left", "Right")):
+            continue
+        before = hand.main_view.work
+        hand.main_view.wake()
+        hand.frame(keys=Keys((Press(key.chord),), frozenset({key.chord}), frozenset("WASD")))
+        hand.frame(3)
+        after = hand.main_view.work
+        assert (after.view, after.requests, after.dialog, after.help, after.form_open) == (
+            before.view,
+            before.requests,
+            before.dialog,
+            before.help,
+            before.form_open,
+        ), key.chord
+
+
+def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:
+    hand.click(WINDOW[0] - 24.0, 24.0)
+    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+    depth = len(imgui.get_current_context().open_popup_stack)
+    for _ in range(20):
+        strike(hand, "Down")
+        if imgui.get_current_context().nav_id == 0:
+            continue
+        strike(hand, "Right")
+        if len(imgui.get_current_context().open_popup_stack) > depth:
+            break
+    assert len(imgui.get_current_context().open_popup_stack) == depth + 1, "a list of the menu"
+    strike(hand, "Escape")
+    assert len(imgui.get_current_context().open_popup_stack) == depth
+    strike(hand, "Escape")
+    assert not list_is_open()
+    assert hand.main_view.work.focus is not None

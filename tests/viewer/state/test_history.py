@@ -1,0 +1,147 @@
+"""Undo and redo of how one looks at a scene, and what they say that they take back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from progdf.compose.layers import Gains
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.camera.view_camera import eye, with_up
+from viewer.state import history, layers, selection, snapshots, workspace
+from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
+from viewer.state.workspace import Workspace, new_workspace
+
+TILTED = (0.6, 0.64, 0.48)
+LAYERS = (LayerState(0, "scarf", 0.5), LayerState(1, "ears", 0.5))
+PLAIN = ViewState(layers=LAYERS)
+
+
+def with_look(view: ViewState) -> ViewState:
+    camera = replace(with_up(view.camera, TILTED), fov_y=70.0)
+    return replace(view, camera=camera, background=(0.0, 0.5, 1.0))
+
+
+def undone(work: Workspace) -> Workspace:
+    past = history.undo(work.past)
+    return replace(work, past=past, view=history.apply_present(work.view, past))
+
+
+def recorded(work: Workspace, view: ViewState) -> Workspace:
+    return workspace.record_undo(replace(work, view=view))
+
+
+def test_up_axis_field_of_view_and_background_are_undone_where_one_stands() -> None:
+    work = recorded(new_workspace(PLAIN), with_look(PLAIN))
+    work = workspace.with_camera(work, replace(work.view.camera, azimuth=100.0, distance=9.0))
+    back = undone(work)
+    assert history.look_of(back.view) == history.look_of(PLAIN)
+    assert eye(back.view.camera) == pytest.approx(eye(work.view.camera))
+    assert workspace.record_undo(back) is back, "an undo is no entry"
+    again = history.redo(back.past)
+    assert history.look_of(history.apply_present(back.view, again)) == history.look_of(work.view)
+    assert again.present.look == history.look_of(work.view)
+
+
+def test_a_camera_that_goes_elsewhere_is_no_entry_and_other_undos_leave_it() -> None:
+    work = recorded(new_workspace(PLAIN), layers.change_layer(PLAIN, 0, lambda l: replace(l, strength=1.0)))
+    work = workspace.with_camera(work, replace(with_up(work.view.camera, TILTED), fov_y=20.0))
+    assert workspace.record_undo(work) is work
+    back = undone(work)
+    assert back.view.layers == LAYERS
+    assert (back.view.camera.up, back.view.camera.fov_y) == (TILTED, 20.0)
+    film = Timeline(
+        (Keyframe(0, camera=work.view.camera), Keyframe(9, camera=replace(work.view.camera, fov_y=90.0)))
+    )
+    playing = recorded(work, replace(work.view, timeline=film))
+    playing = replace(playing, player=replace(playing.player, playing=True))
+    after = workspace.advance(playing, 0.2)
+    assert after.view.camera.fov_y != playing.view.camera.fov_y
+    assert len(workspace.record_undo(after).past.past) == len(playing.past.past)
+
+
+def test_what_is_set_while_the_camera_moves_is_an_entry_all_the_same() -> None:
+    work = new_workspace(PLAIN)
+    sliding = replace(work, view=replace(work.view, camera=replace(work.view.camera, fov_y=70.0)))
+    flown = workspace.with_camera(sliding, replace(sliding.view.camera, distance=3.0))
+    back = undone(workspace.record_undo(flown))
+    assert (back.view.camera.fov_y, back.view.camera.distance) == (PLAIN.camera.fov_y, 3.0)
+    assert history.look_of(workspace.cancel_drag(flown).view) == history.look_of(PLAIN)
+
+
+def layer(**changes: object) -> Callable[[ViewState], ViewState]:
+    return lambda view: layers.change_layer(view, 1, lambda old: replace(old, **changes))  # type: ignore[arg-type]
+
+
+def selected(view: ViewState) -> ViewState:
+    return replace(view, selection=selection.select(view.selection, np.arange(9) < 4))
+
+
+CHANGES: dict[str, Callable[[ViewState], ViewState]] = {
+    "up axis": lambda view: replace(view, camera=with_up(view.camera, TILTED)),
+    "field of view": lambda view: replace(view, camera=replace(view.camera, fov_y=70.0)),
+    "background": lambda view: replace(view, background=(0.0, 0.0, 0.0)),
+    "strength of ears": layer(strength=0.7),
+    "strength of 2 layers": lambda v: replace(
+        v, layers=tuple(replace(one, strength=0.1) for one in v.layers)
+    ),
+    "gains of ears": layer(gains=Gains(0.5, 1.0, 1.0)),
+    "visibility of ears": layer(enabled=False),
+    "lock of ears": layer(locked=True),
+    "name of gold": layer(name="gold"),
+    "delete scarf": lambda view: replace(view, layers=view.layers[1:]),
+    "add hand": lambda view: replace(view, layers=(*view.layers, LayerState(2, "hand"))),
+    "replace hand": lambda view: replace(view, layers=(view.layers[0], LayerState(2, "hand"))),
+    "layer order": lambda view: replace(view, layers=view.layers[::-1]),
+    "selection": selected,
+    "hidden splats": lambda view: replace(view, selection=selection.hide(selected(view).selection, 9)),
+    "blend rule": lambda view: replace(view, blend="over"),
+    "timeline": lambda view: replace(view, timeline=Timeline((Keyframe(0),))),
+}
+
+
+@pytest.mark.parametrize("words", CHANGES)
+def test_undo_and_redo_say_what_they_take_back(words: str) -> None:
+    work = recorded(new_workspace(PLAIN), CHANGES[words](PLAIN))
+    assert (history.next_undo(work.past), history.next_redo(work.past)) == (words, "")
+    back = undone(work)
+    assert (history.edit_of(back.view), history.look_of(back.view)) == (
+        history.edit_of(PLAIN),
+        history.look_of(PLAIN),
+    )
+    assert (history.next_undo(back.past), history.next_redo(back.past)) == ("", words)
+
+
+def test_a_snapshot_is_named_too() -> None:
+    work = new_workspace(PLAIN)
+    work = workspace.record_undo(replace(work, snapshots=snapshots.take((), PLAIN)))
+    assert history.next_undo(work.past) == "snapshots"
+
+
+@pytest.mark.gl
+def test_ctrl_z_after_the_up_axis_leaves_the_layers_and_says_so_for_two_seconds() -> None:
+    with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
+        hand.key("Shift+Left")
+        before = hand.main_view.work.view
+        hand.main_view.work = replace(
+            hand.main_view.work, view=replace(before, camera=with_up(before.camera, TILTED))
+        )
+        hand.frame()
+        hand.key("Ctrl+Z")
+        after = hand.main_view.work
+        assert (after.view.camera.up, after.view.layers) == (before.camera.up, before.layers)
+        assert said(hand) == "Undid: up axis"
+        hand.rest(1.5)
+        assert said(hand) == "Undid: up axis"
+        hand.rest(1.0)
+        assert said(hand) == ""
+        hand.key("Ctrl+Shift+Z")
+        assert said(hand) == "Redid: up axis"
+
+
+def said(hand: Rig) -> str:
+    message = hand.main_view.work.message
+    return message.text if message else ""
