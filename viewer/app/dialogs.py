@@ -174,7 +174,7 @@ def _content(
         text, options = deliver_fields.draw(kind, dialog.text, dialog.options, ui)
         dialog = replace(dialog, text=text, options=options)
     if dialog.kind == "open":
-        chosen = _recent(recent, bottom, ui)
+        chosen = _recent(recent, bottom, "Down" in pressed, ui)
         if chosen is not None:
             return _submit(dialog, str(chosen))
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
@@ -241,8 +241,11 @@ def _answer(dialog: Dialog, button: str) -> Answer:
     return Answer(None)  # Cancel, Later
 
 
-def _recent(recent: Sequence[Path], bottom: float, ui: UiContext) -> Path | None:
-    """The list of files opened before, scrolled where it would reach beyond `bottom`; the one clicked."""
+def _recent(recent: Sequence[Path], bottom: float, down: bool, ui: UiContext) -> Path | None:
+    """The list of files opened before, scrolled where it would reach beyond `bottom`; the one chosen.
+
+    `down`: the arrow that leads from the path field into it was pressed.
+    """
     if not recent:
         return None
     section("Recent", ui)
@@ -252,6 +255,9 @@ def _recent(recent: Sequence[Path], bottom: float, ui: UiContext) -> Path | None
     space = max(bottom - imgui.get_cursor_screen_pos().y - below, 2 * row)
     chosen = None
     imgui.begin_child("recent", imgui.ImVec2(0.0, min(len(recent) * row, space)))
+    if down and not imgui.is_window_focused():
+        imgui.set_keyboard_focus_here()
+        imgui.set_nav_cursor_visible(True)
     for i, path in enumerate(recent):
         room = imgui.get_content_region_avail().x
         if imgui.selectable(f"{elide(escape_text(path.name), 0.4 * room)}##{i}", False)[0]:

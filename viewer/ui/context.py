@@ -131,15 +131,22 @@ class UiContext:
         try:
             yield
         except Exception as error:
-            io = imgui.get_io()
-            io.config_error_recovery_enable_assert = io.config_error_recovery_enable_debug_log = False
             if drawing:
+                _silence_imgui(True)  # what is not ended is known, and told by `report`
                 imgui.internal.error_recovery_try_to_recover_state(begun)
-            io.config_error_recovery_enable_assert = io.config_error_recovery_enable_debug_log = True
+                _silence_imgui(False)
             report(error)
 
     def close(self) -> None:
         imgui.destroy_context(self.context)
+
+
+def _silence_imgui(silent: bool) -> None:
+    """Whether imgui says nothing of what it finds begun and not ended."""
+    io = imgui.get_io()
+    io.config_error_recovery_enable_assert = not silent
+    io.config_error_recovery_enable_debug_log = not silent
+    io.config_error_recovery_enable_tooltip = not silent
 
 
 def _load_fonts(atlas: imgui.ImFontAtlas) -> Fonts:

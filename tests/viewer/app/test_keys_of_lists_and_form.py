@@ -197,3 +197,13 @@ def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:
     strike(hand, "Escape")
     assert not list_is_open()
     assert hand.main_view.work.focus is not None
+
+
+def test_down_leads_from_the_path_into_the_recent_files_and_enter_opens_one(hand: Rig) -> None:
+    hand.main_view.recent = tuple(Path(f"/scenes/{name}.ply") for name in ("a", "b", "c"))
+    hand.main_view.ask(Dialog("open"))
+    hand.frame(4)
+    for chord in ("Down", "Down", "Down", "Up", "Enter"):
+        strike(hand, chord)
+    assert hand.main_view.take_requests()[-1] == "open_file:/scenes/b.ply"
+    assert hand.main_view.work.dialog is None

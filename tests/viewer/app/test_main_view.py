@@ -35,6 +35,8 @@ def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(
     assert len(hand.main_view.work.past.past) == 1
     hand.key("Ctrl+Z")
     assert hand.strengths == [0.5, 0.5]
+    hand.move(5.0, 5.0)
+    hand.rest()  # until what was undone is no longer said
     assert np.array_equal(hand.picture(), before)
     hand.key("Ctrl+Shift+Z")
     assert hand.strengths == [1.0, 0.5]
