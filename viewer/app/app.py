@@ -17,7 +17,6 @@ from viewer.render.engine import ViewEngine
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import Message
 from viewer.ui.window import Window, interruptible
 
 from .application import error_details, error_line, log_error
@@ -30,6 +29,8 @@ from .studio.training_actions import TrainingActions
 from .studio.up_actions import UpActions
 
 SIZE = (1280, 800)
+SAY_AGAIN_S = 10.0
+"""Until what still fails in each frame is said again."""
 RETRY_S = 1.0
 """Until the next look at what raised at the last one."""
 
@@ -114,8 +115,7 @@ class App:
         self.is_closed = False
         self._title = ""
         self._memory = memory
-        self._logged: set[str] = set()  # where mistakes of ours were made that are in the log
-        self._said: tuple[Message | None, str] | None = None  # the last failure, and where it was
+        self._failures: dict[str, tuple[int, float]] = {}  # by place: in which frame last, and when said
         self.main_view.report = self.report
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
@@ -138,19 +138,20 @@ class App:
         where = repr(
             (type(error), [(at.filename, at.lineno) for at in traceback.extract_tb(error.__traceback__)])
         )
-        message = self.main_view.work.message
-        if message is not None and (message, where) == self._said:
+        frame, now = self.main_view.frames, time.perf_counter()
+        before, said = self._failures.get(where, (-2, 0.0))
+        goes_on = frame - before <= 1 and now - said < SAY_AGAIN_S
+        self._failures[where] = frame, said if goes_on else now
+        if goes_on:
             return  # what fails in each frame asks for no further one
         line, details = error_line(error), ""
         if not line:
             details = error_details(error)
-            if where not in self._logged:
-                self._logged.add(where)
+            if before < 0:
                 log_error(details, self._memory)
             what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             line = f"Internal error ({what[:200]}); {self.file_actions.keep_work()}"
         self.main_view.show_message(line, True, details)
-        self._said = self.main_view.work.message, where
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:

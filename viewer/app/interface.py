@@ -132,13 +132,13 @@ def over_picture(
     if strip is not None and work.dialog is None:
         work = replace(work, requests=(*work.requests, *up_strip.draw(strip, above, ui)))
         above = replace(above, height=above.height - up_strip.height(strip, area, ui))
-    if work.message is not None:
-        clicked, top = overlay.message(work.message, above, ui)
+    if (line := work.message) is not None:
+        clicked, top = overlay.message(line, above, ui)
         free = imgui.ImVec2(free.x, top)
         if clicked == "copy":
-            imgui.set_clipboard_text(work.message.details)
+            imgui.set_clipboard_text(line.details)
             work = workspace.with_message(work, "Copied; paste it into a report of what you did", pointer.now)
-        elif clicked == "close" or pointer.now >= work.message.until:
+        elif clicked == "close" or pointer.now >= line.until:
             work = replace(work, message=None)
     if work.help:
         bindings.draw(free, ui)

@@ -97,7 +97,7 @@ def test_no_action_ends_the_window(
         before = window.main_view.work.view
         with monkeypatch.context() as broken:
             broken.setattr(interface, "perform", raises(BrokenError(f"in {name}")))
-            window.main_view.work = replace(window.main_view.work, message=None)
+            window.main_view.frames += 2  # not what failed before and goes on
             window.main_view._perform(name)
         assert message(window).text.startswith(f"Internal error (BrokenError: in {name});")
         assert window.main_view.work.view == before
@@ -127,6 +127,13 @@ def test_a_part_of_a_frame_that_fails_each_time_leaves_the_others_as_they_are(
     assert f"BrokenError: {part}" in message(window).text
     assert message(window).details.count(part) >= 1
     assert log(tmp_path).count("Traceback") == 1, "once, however often it fails"
+    window.main_view.work = replace(window.main_view.work, message=None)
+    turns(window)
+    assert window.main_view.work.message is None, "its cross takes the message away"
+    monkeypatch.setattr(application, "SAY_AGAIN_S", 0.0)
+    turns(window, 2)
+    assert f"BrokenError: {part}" in message(window).text, "and after a while it is said again"
+    monkeypatch.setattr(application, "SAY_AGAIN_S", 10.0)
     drawn = window.main_view.frames
     while (wait := window.main_view.next_frame_delay()) == 0.0:
         window.draw()
@@ -144,10 +151,15 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_panel_and_undo(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     press(window, "Shift+Left")
+    monkeypatch.setattr(snapshot_cards, "draw", raises(BrokenError("no snapshots either")))
     monkeypatch.setattr(window.main_view.canvas, "draw", raises(BrokenError("no picture")))
     monkeypatch.setattr(window.main_view.canvas, "awaits_picture", raises(BrokenError("no picture")))
     turns(window)
     assert "BrokenError: no picture" in message(window).text
+    drawn = window.main_view.frames
+    while window.main_view.next_frame_delay() == 0.0:
+        window.draw()
+        assert window.main_view.frames - drawn < 50, "a window at rest rests"
     press(window, "Ctrl+Z")
     assert window.main_view.work.view.layers[-1].strength == 0.5
 
