@@ -85,7 +85,7 @@ class MainView:
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
         self._taps = Taps()
-        self._listed = False  # whether a list or menu was open in the last frame
+        self._popups = 0, 0  # how many were open as the last frame began, and this one
         self._half = 0  # of two pictures side by side, the one that the mouse is in
         self._clock = 0.0
         self._pending = PendingKeys()
@@ -308,9 +308,9 @@ class MainView:
 
     def _takes_keys(self) -> bool:
         """Whether a question, a list, a menu or the form takes all keys, or Escape has just closed one."""
-        listed, self._listed = self._listed, imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
+        self._popups = self._popups[1], len(imgui.get_current_context().open_popup_stack)
         form = self.work.form_open and new_edit_form.has_keyboard()
-        return self.work.dialog is not None or listed or self._listed or form
+        return self.work.dialog is not None or max(self._popups) > 0 or form
 
     def _cancel_drag(self) -> None:
         """What is dragged goes back to where it was, and nothing is held any more."""
@@ -353,7 +353,8 @@ class MainView:
     def _draw_overlays(self) -> None:
         """What is drawn over the picture; where some of it goes away, another frame follows."""
         pointer, before = self._pointer(), self.work
-        pressed = [press.chord for press in self._keys.pressed]
+        over = max(self._popups) > 1  # a list over the question takes its keys
+        pressed = [] if over else [press.chord for press in self._keys.pressed]
         with self._guarded():
             self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
         original = self._shows_original

@@ -12,6 +12,7 @@ from imgui_bundle import imgui
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera import controls, inputs
 from viewer.camera.inputs import Keys, Press
+from viewer.jobs.delivery import DeliverOptions
 from viewer.jobs.new_edit import EDITORS
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
@@ -207,3 +208,27 @@ def test_down_leads_from_the_path_into_the_recent_files_and_enter_opens_one(hand
         strike(hand, chord)
     assert hand.main_view.take_requests()[-1] == "open_file:/scenes/b.ply"
     assert hand.main_view.work.dialog is None
+
+
+def test_escape_and_enter_in_a_list_of_a_question_leave_the_question(hand: Rig) -> None:
+    options = DeliverOptions(moves="scarf", can_move=("timeline", "scarf", "ears"))
+    hand.main_view.ask(Dialog("render_film", "film.mp4", options=options))
+    hand.frame(4)
+    dialog = next(w for w in imgui.get_current_context().windows if w.name == "##dialog")
+    place = dialog.pos.x + 300.0, dialog.pos.y + 136.0
+    hand.click(*place)
+    assert len(imgui.get_current_context().open_popup_stack) == 2
+    strike(hand, "Down")
+    strike(hand, "Enter")
+    assert (question(hand).moves, hand.main_view.take_requests()) == ("ears", ())
+    hand.click(*place)
+    strike(hand, "Escape")
+    assert question(hand).moves == "ears"
+    strike(hand, "Escape")
+    assert hand.main_view.work.dialog is None
+
+
+def question(hand: Rig) -> DeliverOptions:
+    assert hand.main_view.work.dialog is not None
+    assert hand.main_view.work.dialog.options is not None
+    return hand.main_view.work.dialog.options
