@@ -5,7 +5,6 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -156,10 +155,9 @@ class FileActions:
         try:
             if not self.has_unsaved:
                 return "nothing was unsaved"
-            self.session_autosave.wait(
-                math.inf, workspace.worth_saving(self._app.main_view.work), self._autosave_base, self._write
-            )
-            return f"unsaved work is kept in {self.session_autosave.path}"
+            kept = workspace.worth_saving(self._app.main_view.work)
+            path = self.session_autosave.write(kept, self._autosave_base, self._write)
+            return f"unsaved work is kept in {path}"
         except Exception as error:  # what is wrong may be the work itself
             log_error(error_details(error), self._memory)
             return f"unsaved work could not be kept ({error}); save it under another name"

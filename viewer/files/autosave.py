@@ -51,12 +51,16 @@ class SessionAutosave:
             self._due = now + AUTOSAVE_S
         if now < self._due:
             return self._due - now
-        self._due = None
+        self.write(kept, beside, save)
+        return 0.0
+
+    def write(self, kept: object, beside: Callable[[], Path], save: Callable[[Path], None]) -> Path:
+        """Write it at once; the file. Arguments as of `wait`."""
+        self._due, self._kept = None, kept
         if self.path is None:
             self.path = next(path for path in _numbered_paths(beside(), "autosave") if not path.exists())
         save(self.path)
-        self._kept = kept  # now: what could not be saved is tried again
-        return 0.0
+        return self.path
 
     def stop(self) -> None:
         """There is nothing unsaved."""
