@@ -114,7 +114,6 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
         )
         _log.warning(warning)
     return WindowSession(opened, view, snapshots, warning)
-    return WindowSession(opened, view, snapshots, warning)
 
 
 def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewState:
