@@ -17,19 +17,26 @@ BASE_CHANNELS = sum(_WIDTHS.values())
 
 _SH_BANDS = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 
+Origin = tuple[float, float, float]
+"""A point of the world in float64, which float32 coordinates are relative to."""
+
+ZERO: Origin = (0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians as raw tensors; activate with `scales`, `opacities`, `unit_quats`.
 
     Args:
-        means: centers, world units. [N,3]
+        means: centers relative to `origin`, world units. [N,3]
         quats: rotations wxyz, any nonzero length. [N,4]
         log_scales: log of the standard deviations in world units. [N,3]
         logit_opacities: opacities before the sigmoid. [N]
         sh0: color, band 0 of the spherical harmonics. [N,3]
         shN: color, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
         antialiased: trained with Mip-Splatting's 2D filter and to be drawn with it, see `rasterize`
+        origin: where in the world the means begin, see `progdf.formats.repair.find_origin`. Everything inside
+            the program, cameras too, is relative to it; files, options and messages are in the world
 
     Raises:
         ValueError: a shape does not fit the others.
@@ -42,6 +49,7 @@ class Gaussians:
     sh0: Tensor
     shN: Tensor
     antialiased: bool = False
+    origin: Origin = ZERO
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -68,6 +76,11 @@ class Gaussians:
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """The selected rows. `index`: int64 indices [M], a bool mask [N] or a slice."""
         return replace(self, **{name: getattr(self, name)[index] for name in ATTRIBUTES})
+
+    @property
+    def world_means(self) -> Tensor:
+        """Centers in the world. [N,3] float64"""
+        return self.means.detach().double() + torch.tensor(self.origin, dtype=torch.float64)
 
     @property
     def sh_degree(self) -> int:

@@ -60,14 +60,23 @@ def from_labels(name: str, labels: Tensor, ids: Sequence[int]) -> Region:
 
 
 def inside_box(name: str, scene: Gaussians, corner: Tensor, opposite: Tensor) -> Region:
-    """The Gaussians whose mean lies in the axis-aligned box between two opposite corners, edges included."""
+    """The Gaussians whose mean lies in the axis-aligned box between two opposite corners, edges included.
+
+    `corner`, `opposite`: in the world. [3], float64 where the scene is far from 0
+    """
+    corner, opposite = _relative(corner, scene), _relative(opposite, scene)
     low, high = torch.minimum(corner, opposite), torch.maximum(corner, opposite)
     return from_mask(name, ((scene.means >= low) & (scene.means <= high)).all(dim=1))
 
 
 def inside_sphere(name: str, scene: Gaussians, center: Tensor, radius: float) -> Region:
-    """The Gaussians whose mean is at most `radius` world units from `center`."""
-    return from_mask(name, (scene.means - center).norm(dim=1) <= radius)
+    """The Gaussians whose mean is at most `radius` world units from `center`; see `inside_box`."""
+    return from_mask(name, (scene.means - _relative(center, scene)).norm(dim=1) <= radius)
+
+
+def _relative(point: Tensor, scene: Gaussians) -> Tensor:
+    """A point of the world [3] as the means are kept."""
+    return (point.double() - torch.tensor(scene.origin, dtype=torch.float64)).to(scene.means)
 
 
 def union(a: Region, b: Region, name: str = "") -> Region:

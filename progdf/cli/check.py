@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
     options = parse_options(CheckOptions, argv, "progdf check")
     scene, report = load_scene_with_report(options.scene)
-    cameras = [] if options.cameras is None else load_cameras(options.cameras)
+    cameras = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
     up = find_up(scene, cameras, options.up)
     for line in report.lines() + survey(scene, up).lines():
         print_line(line)

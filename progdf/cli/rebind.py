@@ -103,7 +103,8 @@ def main(argv: Sequence[str]) -> int:
 def match_scenes(a: Gaussians, b: Gaussians) -> Match:
     """The Gaussian of A that each one of B is; both hold at least one."""
     k = min(_CANDIDATES, len(a))
-    distances, candidates = cKDTree(a.means.numpy()).query(b.means.numpy(), k=k, workers=-1)
+    places = b.means.numpy() + np.subtract(b.origin, a.origin)  # relative to A's origin, float64
+    distances, candidates = cKDTree(a.means.numpy()).query(places, k=k, workers=-1)
     distances, candidates = distances.reshape(len(b), k), candidates.reshape(len(b), k)
     sizes = a.scales.amax(dim=1).numpy()
     typical = max(float(np.median(sizes)), 1e-12)

@@ -7,6 +7,7 @@ smaller components of a quaternion; opacities are bytes; f_rest bytes cover −4
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +71,9 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
         "sh0": (rgb - 0.5) / C0,
         "shN": higher,
     }
-    tensors = {key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in found.items()}
+    tensors: dict[str, Any] = {
+        key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in found.items()
+    }
     return Gaussians(**tensors, antialiased=ply.antialiased)
 
 

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import dataclass
+
+from progdf.gaussians import ZERO, Origin
+
+_log = logging.getLogger(__name__)
 
 _EXPLAINED = {
     "filter_3D": "filter_3D (Mip-Splatting's: fuse it into the scales and opacities for the exact look)"
@@ -20,6 +26,9 @@ class LoadReport:
         count: Gaussians N; loading never drops or adds a row
         sh_degree: 0..4
         antialiased: it says that it was trained with Mip-Splatting's 2D filter
+        origin: what the means are kept relative to, see `repair.find_origin`
+        distinct: how many different x, y and z there are, of positions that were float32 far from 0; 0 on an
+            axis that is near 0, () where nothing was lost
         hidden: rows made invisible because a number was unusable; the next five say which number
         bad_means: NaN, infinite or beyond ±1e18
         bad_scales: NaN, infinite or beyond e^40
@@ -43,6 +52,8 @@ class LoadReport:
     count: int
     sh_degree: int
     antialiased: bool = False
+    origin: Origin = ZERO
+    distinct: tuple[int, ...] = ()
     hidden: int = 0
     bad_means: int = 0
     bad_scales: int = 0
@@ -81,6 +92,22 @@ class LoadReport:
         return tuple(f"{format_count(rows)} {what}" for rows, what in phrases if rows)
 
     @property
+    def lost(self) -> str:
+        """What cannot be repaired, "" for nothing: positions that float32 has rounded."""
+        if not self.distinct:
+            return ""
+        step = max(2.0 ** (math.frexp(at)[1] - 24) for at in self.origin if at)
+        left = ", ".join(
+            f"{group_digits(count)} distinct {axis}"
+            for axis, count in zip("xyz", self.distinct, strict=True)
+            if count
+        )
+        return (
+            f"positions are float32, which has steps of {step:.2g} so far from 0: {left} are left of "
+            f"{format_count(self.count)}; export the scene near 0, or with x, y, z as doubles"
+        )
+
+    @property
     def ignored(self) -> tuple[str, ...]:
         """One phrase for each part of the file that was not used."""
         phrases = []
@@ -90,6 +117,13 @@ class LoadReport:
         if self.trailing_bytes:
             phrases.append(f"{format_count(self.trailing_bytes, 'byte')} after the last row")
         return tuple(phrases)
+
+    def log(self) -> None:
+        """Warn of what was repaired, and of what was lost."""
+        for phrase in self.repairs:
+            _log.warning("%s: repaired: %s", self.file, phrase)
+        if self.lost:
+            _log.warning("%s: %s", self.file, self.lost)
 
     def lines(self) -> list[str]:
         """The report for a person, a line per fact."""
@@ -106,6 +140,10 @@ class LoadReport:
             lines.append(
                 f"normalized: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
             )
+        if self.origin != ZERO:
+            lines.append(f"origin: {' '.join(f'{at:.17g}' for at in self.origin)}, as it lies far from 0")
+        if self.lost:
+            lines.append(f"lost: {self.lost}")
         return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]
 
 
@@ -117,6 +155,12 @@ def format_count(count: int, noun: str = "Gaussian") -> str:
 def file_size(count: int) -> str:
     """Bytes for a person: "4.7 MB", "1.8 kB"."""
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
+
+
+def format_place(at: float, size: float, digits: int) -> str:
+    """A coordinate of something of this size: so many digits, and those by which it is farther off."""
+    beyond = math.log10(abs(at) / size) if at and size > 0 else 0.0
+    return f"{at:.{digits + max(0, math.floor(beyond))}g}"
 
 
 def group_digits(number: int) -> str:

@@ -7,7 +7,6 @@ their indices: an unusable row becomes an invisible Gaussian (see `progdf.format
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians
 from progdf.io.atomic import atomic_write
 
 from .load_report import LoadReport
@@ -27,8 +26,6 @@ from .ply_file import ANTIALIASED_COMMENT, PlyFile, read_header
 from .repair import repair
 
 Floats = npt.NDArray[np.float32]
-
-_log = logging.getLogger(__name__)
 
 GEOMETRY = {
     "means": ("x", "y", "z"),
@@ -45,16 +42,16 @@ _SH_REST = (0, 9, 24, 45, 72)
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
-    """The scene in a 3DGS .ply file, float32; what had to be repaired is logged as a warning.
+    """The scene in a 3DGS .ply file, float32; what had to be repaired or was lost is logged as a warning.
 
-    Quaternions come out with unit length, wxyz. Rows keep their order and number.
+    Positions are read as doubles where they are, and kept relative to `Gaussians.origin`. Quaternions come
+    out with unit length, wxyz. Rows keep their order and number.
 
     Raises:
         ProgdfError: the file is missing, broken, holds no Gaussians, or is no 3DGS .ply.
     """
     scene, report = load_ply_with_report(path)
-    for phrase in report.repairs:
-        _log.warning("%s: repaired: %s", report.file, phrase)
+    report.log()
     return scene
 
 
@@ -84,8 +81,8 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
 def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     """Write a 3DGS .ply: binary little-endian float32, properties in the order of the original 3DGS code.
 
-    The file appears whole or not at all, and says if the scene is anti-aliased. If the quaternions have unit
-    length it loads to the same bits.
+    Of a scene with an origin x, y and z are doubles. The file appears whole or not at all, and says if the
+    scene is anti-aliased. If the quaternions have unit length it loads to the same bits.
 
     Raises:
         ProgdfError: the scene is empty or holds a NaN or an infinity, or the folder does not exist.
@@ -111,6 +108,11 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
         "shN": tuple(f"f_rest_{i}" for i in range(columns["shN"].shape[1])),
     }
     rows = table.view([(name, "=f4") for key in columns for name in names[key]])[:, 0]
+    if scene.origin != ZERO:
+        layout = [(name, "=f8" if name in "xyz" else "=f4") for key in columns for name in names[key]]
+        rows = rows.astype(layout)
+        for name, column in zip("xyz", scene.world_means.unbind(1), strict=True):
+            rows[name] = column.cpu().numpy()
     vertex = PlyElement.describe(rows, "vertex")
     comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
     with atomic_write(path) as temporary_file:
@@ -177,6 +179,9 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
             if key == "shN":  # channel-major in the file, rgb innermost here
                 found = found.reshape(len(block), 3, bands).transpose(0, 2, 1)
             array[first : first + _BLOCK_ROWS] = found
+    places = [rows[name] for name in columns["means"]]
+    if np.result_type(np.float32, *places) == np.float64:
+        arrays["means"] = np.stack(places, axis=1).astype(np.float64)
     tensors: dict[str, Any] = {key: torch.from_numpy(array) for key, array in arrays.items()}
     tensors["logit_opacities"] = tensors["logit_opacities"][:, 0]
     return Gaussians(**tensors)

@@ -7,7 +7,6 @@ gaussforge, in a process of its own (see `gaussforge_child`), as its native code
 from __future__ import annotations
 
 import importlib.util
-import logging
 import os
 import signal
 import subprocess
@@ -34,8 +33,6 @@ from .load_report import LoadReport
 from .ply import load_ply_with_report
 from .ply_file import read_header
 from .repair import repair
-
-_log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
@@ -83,7 +80,7 @@ def scene_name(path: Path) -> str:
 
 
 def load_scene(path: str | os.PathLike[str]) -> Gaussians:
-    """The scene in a file of any known format; what had to be repaired is logged as a warning.
+    """The scene in a file of any known format; what had to be repaired or was lost is logged as a warning.
 
     Axes are those of the 3DGS .ply: an .spz, which has y up and z towards the viewer, is turned about x.
 
@@ -91,8 +88,7 @@ def load_scene(path: str | os.PathLike[str]) -> Gaussians:
         ProgdfError: the file is missing, broken or no scene, or its reader is not installed.
     """
     scene, report = load_scene_with_report(path)
-    for phrase in report.repairs:
-        _log.warning("%s: repaired: %s", report.file, phrase)
+    report.log()
     return scene
 
 
@@ -117,7 +113,12 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         meta = _sog_meta(path) or {}
         antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
     report = replace(
-        report, file=scene_name(path), file_bytes=_size(path), format=told, antialiased=antialiased
+        report,
+        file=scene_name(path),
+        file_bytes=_size(path),
+        format=told,
+        antialiased=antialiased,
+        origin=scene.origin,
     )
     return replace(scene, antialiased=antialiased), report
 
@@ -128,9 +129,11 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
     degree = scene.sh_degree
     # a basis function of order m changes its sign with y for m < 0, and with z for l + m odd
     signs = [(-1.0) ** (l + m + (m < 0)) for l in range(1, degree + 1) for m in range(-l, l + 1)]
+    x, y, z = scene.origin
     return replace(
         scene,
         means=scene.means * turn,
+        origin=(x, 0.0 - y, 0.0 - z),
         quats=scene.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
         shN=scene.shN * torch.tensor(signs)[:, None],
     )

@@ -27,7 +27,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from progdf.errors import ProgdfError
 from progdf.field.bake import rows_hash
 from progdf.field.baked import BakedField
-from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
+from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
 from progdf.io.atomic import atomic_write, read_file
 from progdf.io.tensors import table_of, write_tensors
 from progdf.region import Region
@@ -44,8 +44,8 @@ from .header import (
 )
 from .region_packing import pack_region, unpack_region
 
-_FINGERPRINTS: MutableMapping[Tensor, tuple[int, str]] = WeakIdKeyDictionary()
-"""Version and hash of the centers of scenes that are alive."""
+_FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
+"""Version, origin and hash of the centers of scenes that are alive."""
 _FAR = 1e18
 """An offset that is larger is absurd, as a position is (see `progdf.formats.repair`)."""
 _FARTHEST = {"log_scales": 80.0}
@@ -87,14 +87,18 @@ class Gdf:
 
 
 def fingerprint(scene: Gaussians) -> SceneFingerprint:
-    """What a .gdf of this scene must carry; hashed once while the means are the same, unwritten tensor."""
+    """What a .gdf of this scene must carry; hashed once while the means are the same, unwritten tensor.
+
+    The means are those of the world, so the hash does not depend on the origin that loading has chosen.
+    """
     means = scene.means
-    version = -1 if means.is_inference() else means._version
-    known_version, sha256 = _FINGERPRINTS.get(means, (-1, ""))
-    if version < 0 or version != known_version:
-        content = means.detach().to("cpu", torch.float32).contiguous().numpy().tobytes()
+    state = None if means.is_inference() else (means._version, scene.origin)
+    known_state, sha256 = _FINGERPRINTS.get(means, (None, ""))
+    if state is None or state != known_state:
+        world = means.detach() if scene.origin == ZERO else scene.world_means
+        content = world.to("cpu", torch.float32).contiguous().numpy().tobytes()
         sha256 = hashlib.sha256(content).hexdigest()
-        _FINGERPRINTS[means] = version, sha256
+        _FINGERPRINTS[means] = state, sha256
     return SceneFingerprint(len(scene), sha256)
 
 

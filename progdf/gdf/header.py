@@ -47,7 +47,7 @@ _BYTES: Mapping[_Type, int] = {
 
 @dataclass(frozen=True)
 class SceneFingerprint:
-    """What binds a .gdf to its scene: number of Gaussians and SHA-256 of the means (float32 bytes)."""
+    """What binds a .gdf to its scene: number of Gaussians, SHA-256 of the world means (float32 bytes)."""
 
     count: int
     means_sha256: str

@@ -1,5 +1,5 @@
 """Cameras as the formats describe them: our own entries, Inria's and nerfstudio's. All are read, checked and
-turned into `Camera`s here; `cameras` knows the files.
+turned into `Camera`s of the world here, in float64; `cameras` knows the files.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def _camera(
     lens: Lens | None = None,
 ) -> Camera:
     try:
-        return Camera(viewmat.float(), K.float(), int(width), int(height), str(name), lens)
+        return Camera(viewmat, K.float(), int(width), int(height), str(name), lens)
     except ValueError as error:
         raise ProgdfError(f"{where} is broken: {error}") from None
 

@@ -1,5 +1,8 @@
 """Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, also in a picture, known by
 their content; and folders: a COLMAP sparse model, or a folder with one of these files in it.
+
+Files have cameras in the world; in the program they are relative to the origin of their scene, as its means
+are (`Gaussians.origin`). All of them pass here on their way in and out.
 """
 
 from __future__ import annotations
@@ -13,8 +16,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
+from progdf.gaussians import ZERO, Origin
 
 from .atomic import atomic_write, read_file
 from .camera_formats import inria_camera, nerfstudio_camera, own_camera
@@ -32,7 +39,7 @@ _FILES = ("cameras.json", "transforms.json")
 _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 
 
-def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
+def load_cameras(path: str | os.PathLike[str], origin: Origin = ZERO) -> list[Camera]:
     """The cameras in a JSON file, in file order, or of a COLMAP sparse model, in the order of their names.
 
     Three kinds of files are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
@@ -41,6 +48,10 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     model (see `progdf.io.colmap`) or holds one, or a cameras.json or transforms.json.
 
     The views are those of pinholes. A lens that bends photographs is kept as `Camera.lens` and logged.
+
+    Args:
+        path: file or folder
+        origin: of the scene, which the cameras are relative to; by default they are in the world
 
     Raises:
         ProgdfError: nothing of that name, none of these kinds, several of them in one folder, a broken
@@ -54,11 +65,29 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
             "%s: %d of %d cameras have a lens that bends photographs; what is drawn is straight",
             path, bent, len(cameras),
         )  # fmt: skip
-    return cameras
+    return [_enter(camera, origin, os.fspath(path)) for camera in cameras]
 
 
-def read_camera(text: str) -> Camera:
+def _enter(camera: Camera, origin: Origin, where: str) -> Camera:
+    """A float64 camera of the world as the program has it: float32, relative to an origin."""
+    viewmat = relative_viewmat(camera.viewmat, origin).float()
+    if not bool(viewmat.isfinite().all()):
+        raise ProgdfError(f"{where} has a camera too far away to be used; export the cameras again")
+    return replace(camera, viewmat=viewmat)
+
+
+def relative_viewmat(viewmat: Tensor, origin: Origin) -> Tensor:
+    """World → camera as origin → camera: of coordinates that are `origin` less. [4,4] -> [4,4] float64"""
+    moved = viewmat.double().clone()
+    if origin != ZERO:  # -0.0 stays what it is
+        moved[:3, 3] += moved[:3, :3] @ torch.tensor(origin, dtype=torch.float64)
+    return moved
+
+
+def read_camera(text: str, origin: Origin = ZERO) -> Camera:
     """The camera of `FILE[:INDEX]`, the first one where no index is given; −1 is the last.
+
+    It is relative to `origin`, as of `load_cameras`.
 
     Raises:
         ProgdfError: the file is missing or holds no cameras, or not that many.
@@ -66,7 +95,7 @@ def read_camera(text: str) -> Camera:
     name, colon, index = text.rpartition(":")
     numbered = re.fullmatch(r"-?[0-9]{1,18}", index) is not None and bool(colon) and not os.path.exists(text)
     path, number = (name, int(index)) if numbered else (text, 0)
-    cameras = load_cameras(path)
+    cameras = load_cameras(path, origin)
     if not -len(cameras) <= number < len(cameras):
         last = len(cameras) - 1
         raise ProgdfError(f"{path} has no camera {number}; it holds {len(cameras)}, numbered 0 to {last}")
@@ -98,7 +127,7 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
         return load_model(model)
     found = read_file(path)
     if found.startswith(_PNG):
-        camera = camera_in_picture(path)
+        camera = _carried_camera(path)
         if camera is None:
             raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
         return [camera]
@@ -111,12 +140,18 @@ def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     return _from_content(name, content, Path(path))
 
 
-def camera_in_picture(path: str | os.PathLike[str]) -> Camera | None:
-    """The camera that a rendered picture carries; None for one that carries none.
+def camera_in_picture(path: str | os.PathLike[str], origin: Origin = ZERO) -> Camera | None:
+    """The camera that a rendered picture carries, relative to `origin`; None for one that carries none.
 
     Raises:
         ProgdfError: no picture, or what it carries is no camera.
     """
+    camera = _carried_camera(path)
+    return None if camera is None else _enter(camera, origin, os.fspath(path))
+
+
+def _carried_camera(path: str | os.PathLike[str]) -> Camera | None:
+    """It in the world, in float64."""
     from .images import picture_text  # Pillow, which camera files do without
 
     text = picture_text(path, PICTURE_KEY)
@@ -162,21 +197,25 @@ def kind_of_cameras(path: str | os.PathLike[str]) -> str:
     return "own" if isinstance(content, dict) and content.get("format") == _FORMAT else "other"
 
 
-def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera]) -> None:
-    """Write cameras as JSON, whole or not at all; `load_cameras` gives the same bits back."""
+def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera], origin: Origin = ZERO) -> None:
+    """Write cameras as JSON, whole or not at all; `load_cameras` gives the same bits back.
+
+    `origin`: of the scene, which the cameras are relative to; the file has them in the world.
+    """
     with atomic_write(path) as temporary_file:
-        temporary_file.write_text(cameras_to_json(cameras, indent=1), encoding="utf-8")
+        temporary_file.write_text(cameras_to_json(cameras, 1, origin), encoding="utf-8")
 
 
-def cameras_to_json(cameras: Sequence[Camera], indent: int | None = None) -> str:
-    """What a file of saved cameras holds, ASCII."""
+def cameras_to_json(cameras: Sequence[Camera], indent: int | None = None, origin: Origin = ZERO) -> str:
+    """What a file of saved cameras holds, ASCII; see `save_cameras`."""
+    x, y, z = origin
     entries = [
         {
             "name": camera.name,
             "width": camera.width,
             "height": camera.height,
             "K": camera.K.double().tolist(),
-            "viewmat": camera.viewmat.double().tolist(),
+            "viewmat": relative_viewmat(camera.viewmat, (-x, -y, -z)).tolist(),
             **({"lens": asdict(camera.lens)} if camera.lens else {}),
         }
         for camera in cameras

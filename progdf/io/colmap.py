@@ -64,7 +64,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def load_model(model: Path) -> list[Camera]:
-    """The registered images of a sparse model as cameras, in the order of their names.
+    """The registered images of a sparse model as float64 cameras of the world, in the order of their names.
 
     Args:
         model: the folder with cameras.bin and images.bin, or .txt
@@ -125,7 +125,7 @@ def _camera(model: Path, image: _Image) -> Camera:
     try:
         viewmat[:3] = torch.tensor(image.pose, dtype=torch.float64)
         K = torch.tensor(image.K, dtype=torch.float64)
-        camera = Camera(viewmat.float(), K.float(), image.width, image.height, image.name)
+        camera = Camera(viewmat, K.float(), image.width, image.height, image.name)
     except ValueError as error:
         raise ProgdfError(f"{where} is broken: {error}") from None
     rotation = viewmat[:3, :3]

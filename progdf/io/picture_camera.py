@@ -15,6 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
+from progdf.gaussians import ZERO, Origin
 
 from .cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras
 from .images import picture_text
@@ -23,11 +24,11 @@ EDITS_KEY = "progdf:edits"
 """Of the text in a .png that names the edits which it shows."""
 
 
-def camera_chunk(camera: Camera, edits: Sequence[str] = ()) -> PngInfo:
+def camera_chunk(camera: Camera, edits: Sequence[str] = (), origin: Origin = ZERO) -> PngInfo:
     """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered, and the
-    names of the edits that it shows."""
+    names of the edits that it shows. `origin`: of the scene, which the camera is relative to."""
     info = PngInfo()
-    info.add_text(PICTURE_KEY, cameras_to_json([camera]))
+    info.add_text(PICTURE_KEY, cameras_to_json([camera], origin=origin))
     if edits:
         info.add_itxt(EDITS_KEY, ", ".join(edits))
     return info
@@ -38,13 +39,16 @@ def edits_in_picture(path: str | os.PathLike[str]) -> str:
     return picture_text(path, EDITS_KEY) or ""
 
 
-def find_picture_camera(path: str | os.PathLike[str], given: Sequence[Camera] = ()) -> Camera:
+def find_picture_camera(
+    path: str | os.PathLike[str], given: Sequence[Camera] = (), origin: Origin = ZERO
+) -> Camera:
     """The camera of a picture: the one that it carries; else of A.camera.json beside A.png; else of the given
     ones the one that is named as the picture is.
 
     Args:
         path: the picture, of any format
         given: as of --cameras
+        origin: of the scene, which the camera is relative to, and the given ones are
 
     Returns:
         The camera, named as the picture is, of the size at which the picture was rendered.
@@ -53,10 +57,10 @@ def find_picture_camera(path: str | os.PathLike[str], given: Sequence[Camera] = 
         ProgdfError: no picture, a camera that cannot be used, or none is found.
     """
     path = Path(path)
-    camera = camera_in_picture(path)
+    camera = camera_in_picture(path, origin)
     beside = path.with_name(f"{path.stem}.camera.json")
     if camera is None and beside.is_file():
-        cameras = load_cameras(beside)
+        cameras = load_cameras(beside, origin)
         if len(cameras) != 1:
             raise ProgdfError(f"{beside} holds {len(cameras)} cameras; keep the one of {path.name}")
         camera = cameras[0]

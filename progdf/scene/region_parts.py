@@ -25,7 +25,7 @@ from PIL import ImageColor
 from progdf.camera import Camera
 from progdf.color.oklab import srgb_to_oklab
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ZERO, Gaussians
 from progdf.io.cameras import read_camera
 
 from .neighborhood import Neighborhood, grow_along_surface
@@ -68,11 +68,11 @@ def read_part(kind: str, rest: str) -> Selecting:
         x, y, z = _numbers(kind, rest, ",".join(words), "x,y,z[,tolerance]")
         return lambda scene: _flood(scene, (x, y, z), tolerance)
     if kind == "front":
-        camera = _camera(kind, rest, "CAMERA")
-        return lambda scene: front_surface(scene, camera, project_centers(scene, camera))
+        camera_of = _camera(kind, rest, "CAMERA")
+        return lambda scene: _front(scene, camera_of(scene))
     form, least, odd = _FORMS[kind]
     where, _, text = rest.rpartition(":")
-    camera, numbers = _camera(kind, where, f"CAMERA:{form}"), _numbers(kind, rest, text, f"CAMERA:{form}")
+    camera_of, numbers = _camera(kind, where, f"CAMERA:{form}"), _numbers(kind, rest, text, f"CAMERA:{form}")
     if len(numbers) < least or len(numbers) % 2 != odd or (kind == "rectangle" and len(numbers) > least):
         raise ProgdfError(
             f"region '{kind}:{shorten(rest)}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}"
@@ -81,7 +81,7 @@ def read_part(kind: str, rest: str) -> Selecting:
         raise ProgdfError(
             f"the radius in region '{kind}:{shorten(rest)}' is {numbers[0]:g}; it must be positive"
         )
-    return partial(_inside, kind, camera, numbers)
+    return partial(_inside, kind, camera_of, numbers)
 
 
 def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
@@ -106,8 +106,14 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
     return step
 
 
-def _inside(kind: str, camera: Camera, numbers: list[float], scene: Gaussians) -> Mask:
-    points = project_centers(scene, camera).points
+def _front(scene: Gaussians, camera: Camera) -> Mask:
+    return front_surface(scene, camera, project_centers(scene, camera))
+
+
+def _inside(
+    kind: str, camera_of: Callable[[Gaussians], Camera], numbers: list[float], scene: Gaussians
+) -> Mask:
+    points = project_centers(scene, camera_of(scene)).points
     if kind == "rectangle":
         return inside_rectangle(points, numbers[:2], numbers[2:])
     if kind == "lasso":
@@ -117,14 +123,16 @@ def _inside(kind: str, camera: Camera, numbers: list[float], scene: Gaussians) -
 
 def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float) -> Mask:
     neighborhood, colors = Neighborhood(scene), base_colors(scene)
-    seed = neighborhood.nearest(point)
+    seed = neighborhood.nearest(tuple(np.subtract(point, scene.origin).tolist()))
     return grow_along_surface(neighborhood, colors, np.array([seed]), colors[seed], tolerance)
 
 
-def _camera(kind: str, text: str, form: str) -> Camera:
+def _camera(kind: str, text: str, form: str) -> Callable[[Gaussians], Camera]:
+    """Gives the camera for a scene, which it is relative to; that it can be read is checked at once."""
     if not text:
         raise ProgdfError(f"{kind}: needs a camera; write {kind}:{form}, CAMERA as --camera has it")
-    return read_camera(text)
+    read_camera(text, ZERO)
+    return lambda scene: read_camera(text, scene.origin)
 
 
 def _with_tolerance(kind: str, rest: str, count: int, form: str) -> tuple[list[str], float]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count
+from progdf.formats.load_report import format_count, format_place
 from progdf.gaussians import Gaussians
 from progdf.io.npy import open_npy
 from progdf.region import (
@@ -269,7 +269,7 @@ def _corners(rest: str) -> list[float]:
 
 
 def _box(rest: str, scene: Gaussians) -> Region:
-    numbers = torch.tensor(_corners(rest))
+    numbers = torch.tensor(_corners(rest), dtype=torch.float64)
     return inside_box(f"box:{rest}", scene, numbers[:3], numbers[3:])
 
 
@@ -282,7 +282,7 @@ def _ball(rest: str) -> list[float]:
 
 def _sphere(rest: str, scene: Gaussians) -> Region:
     numbers = _ball(rest)
-    return inside_sphere(f"sphere:{rest}", scene, torch.tensor(numbers[:3]), numbers[3])
+    return inside_sphere(f"sphere:{rest}", scene, torch.tensor(numbers[:3], dtype=torch.float64), numbers[3])
 
 
 def _numbers(kind: str, rest: str, form: str) -> list[float]:
@@ -295,5 +295,9 @@ def _numbers(kind: str, rest: str, form: str) -> list[float]:
 
 
 def _extent(scene: Gaussians) -> str:
-    low, high = scene.means.amin(dim=0).tolist(), scene.means.amax(dim=0).tolist()
-    return ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", low, high, strict=True))
+    low, high = (torch.tensor(scene.origin, dtype=torch.float64) + end for end in scene.means.aminmax(dim=0))
+    ends = [
+        (axis, *(format_place(at, b - a, 3) for at in (a, b)))
+        for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+    ]
+    return ", ".join(f"{axis} {a} to {b}" for axis, a, b in ends)

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
-from progdf.formats.load_report import format_count
+from progdf.formats.load_report import format_count, format_place
 from progdf.gaussians import Gaussians
 
 from .bounds import is_surrounding, scene_sphere
@@ -30,10 +29,10 @@ class Survey:
 
     Args:
         count: Gaussians N
-        center: median of the means, world units
+        center: median of the means, in the world
         radius: distance from the center within which 97 % of the means lie, world units
         farthest: distance of the farthest mean from the center, world units
-        box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis
+        box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis, in the world
         up: which way is up, and how that was decided
         surrounding: it looks like a scene to stand inside, which cameras around it cannot frame
         median_size: median of the longest axes, one standard deviation, world units
@@ -59,9 +58,9 @@ class Survey:
 
     def lines(self) -> list[str]:
         """The survey for a person, a line per fact."""
-        x, y, z = self.center
+        center = " ".join(format_place(at, self.radius, 4) for at in self.center)
         lines = [
-            f"place: center {x:.4g} {y:.4g} {z:.4g}, radius {self.radius:.4g} (97 % of the Gaussians), "
+            f"place: center {center}, radius {self.radius:.4g} (97 % of the Gaussians), "
             f"farthest {self.farthest:.4g}",
             f"up: {self.up.name}, {self.up.reason}",
             f"bulk, 95 % along each axis: --region {_box(self.bulk_box)}",
@@ -95,14 +94,14 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
     axes = scene.log_scales.sort(dim=1).values
     longest = axes[:, 2].exp()
     needles = (axes[:, 2] - axes[:, 1] > torch.tensor(NEEDLE).log()) & (longest > LONG * radius)
-    x, y, z = center.tolist()
+    x, y, z = (at + middle for at, middle in zip(scene.origin, center.tolist(), strict=True))
     return Survey(
         count=len(scene),
         center=(x, y, z),
         radius=radius,
         farthest=float((scene.means - center).norm(dim=1).max()),
-        box=_corners(scene.means, 0.0),
-        bulk_box=_corners(scene.means, 0.025),
+        box=_corners(scene, 0.0),
+        bulk_box=_corners(scene, 0.025),
         up=up,
         surrounding=is_surrounding(scene, up.direction),
         median_size=float(longest.median()),
@@ -113,11 +112,12 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
     )
 
 
-def _corners(means: Tensor, left_out: float) -> tuple[float, ...]:
+def _corners(scene: Gaussians, left_out: float) -> tuple[float, ...]:
     """Least x, y, z and largest x, y, z of what is left without a share of the means on each side."""
-    ordered = means.sort(dim=0).values
+    ordered = scene.means.sort(dim=0).values
     cut = int(left_out * len(ordered))
-    return tuple(torch.cat([ordered[cut], ordered[len(ordered) - 1 - cut]]).tolist())
+    ends = torch.cat([ordered[cut], ordered[len(ordered) - 1 - cut]]).tolist()
+    return tuple(at + end for at, end in zip(2 * scene.origin, ends, strict=True))
 
 
 def _box(corners: tuple[float, ...]) -> str:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.images import picture_size, read_picture
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import render
@@ -124,15 +124,15 @@ def strengths_of(path: Path) -> dict[float, Path]:
     return found
 
 
-def picture_cameras(paths: Sequence[Path], given: Sequence[Camera]) -> list[Camera]:
-    """The cameras of the pictures, at their size.
+def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
+    """The cameras of the pictures, at their size; `origin`: of the scene, which they are relative to.
 
     Raises:
         ProgdfError: none is found for one, see `find_picture_camera`, or its proportions are another's.
     """
     cameras = []
     for path in paths:
-        camera = find_picture_camera(path, given)
+        camera = find_picture_camera(path, given, origin)
         width, height = picture_size(path)
         if abs(width * camera.height / (height * camera.width) - 1) > _SKEWED:
             raise ProgdfError(

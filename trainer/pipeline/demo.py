@@ -195,7 +195,7 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
     save_ply(folder / "scene.ply", scene.gaussians)
     with atomic_write(folder / "labels.npy") as temporary_file:
         np.save(temporary_file, scene.labels.numpy())
-    save_cameras(folder / "cameras.json", scene.cameras)
+    save_cameras(folder / "cameras.json", scene.cameras, scene.gaussians.origin)
 
 
 def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
@@ -308,7 +308,7 @@ def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -
         picture = render(gaussians, camera, scene.background).image.clamp(0, 1)
         painted = to_picture(paint(picture, camera, cover))
     with atomic_write(path) as temporary_file:
-        painted.save(temporary_file, pnginfo=camera_chunk(camera))
+        painted.save(temporary_file, pnginfo=camera_chunk(camera, origin=scene.gaussians.origin))
 
 
 def _gdf(folder: Path, edit: DemoEdit) -> Path:

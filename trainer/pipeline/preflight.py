@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from progdf.gaussians import ZERO
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.scene.region_spec import check_region
@@ -36,10 +37,10 @@ def check_command(plan: Plan, out: Path, resume: bool) -> None:
     if not plan.scene.is_dir():  # some formats are folders
         read_file(plan.scene, 0)
     if plan.views.cameras is not None and not resume:
-        load_cameras(plan.views.cameras)
+        load_cameras(plan.views.cameras, ZERO)
     if plan.views.pictures:
-        given = [] if plan.views.cameras is None else load_cameras(plan.views.cameras)
-        picture_cameras(plan.views.pictures, given)
+        given = [] if plan.views.cameras is None else load_cameras(plan.views.cameras, ZERO)
+        picture_cameras(plan.views.pictures, given, ZERO)
     if not resume or load_region(out) is None:
         check_region(plan.region.region, region_checks(region_settings(plan, out, quiet=True)))
     if not folder.root.is_dir() or not any(folder.root.iterdir()):

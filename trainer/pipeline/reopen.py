@@ -80,7 +80,7 @@ def render_run_views(run: FinishedRun) -> TrainingSetup:
     """The run's views, rendered; their boxes hold the region, not what an edit may show beside it."""
     background = torch.tensor(run.record.background)
     held_out = set(run.record.held_out)
-    cameras = with_near_plane(load_cameras(run.folder.cameras), run.scene)
+    cameras = with_near_plane(load_cameras(run.folder.cameras, run.scene.origin), run.scene)
     views = [make_view(run.scene, run.region, camera, background) for camera in cameras]
     return TrainingSetup(
         run.scene,

@@ -156,7 +156,7 @@ def _render_originals(plan: Plan, scene: Gaussians, region: Region, folder: RunF
     write_views(folder, "original", {view.camera.name: view.image for view in views})
     masks = {view.camera.name: view.mask[..., None].expand(-1, -1, 3) for view in views}
     write_views(folder, "mask", masks)
-    save_cameras(folder.cameras, [view.camera for view in views])
+    save_cameras(folder.cameras, [view.camera for view in views], scene.origin)
     return setup
 
 

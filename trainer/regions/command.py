@@ -65,7 +65,7 @@ def show(options: RegionOptions) -> list[str]:
     if suffix == ".npy":
         save_npy(options.out, region.members.numpy())
     else:
-        given = [] if options.cameras is None else load_cameras(options.cameras)
+        given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
         up = find_up(scene, given, options.up).direction
         cameras = with_near_plane(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
@@ -89,7 +89,7 @@ def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
 
 def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
     if options.camera is not None:
-        return [replace(read_camera(options.camera), lens=None)]
+        return [replace(read_camera(options.camera, scene.origin), lens=None)]
     if options.orbit is None:
         return [_fit_camera(scene, up, azimuth, elevation, None, size) for azimuth, elevation in _SIDES]
     words = options.orbit.split(",")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.picture_camera import edits_in_picture
 from progdf.region import Region
@@ -86,7 +86,7 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
     def from_folder(rest: str, scene: Gaussians, bent: bool) -> Region:
         kind = "photomasks" if bent else "masks"
         folder, file = _mask_folder(kind, rest, settings)
-        cameras = _cameras(file)
+        cameras = _cameras(file, scene)
         masks = read_masks(folder, cameras, bent)
         count = sum(mask is not None for mask in masks)
         if settings.say is not None and count < len(masks):
@@ -107,7 +107,7 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
             cameras, found = [*cameras, *nearer], _masks_with_pixels(masks, prompt, settings)
         # with these the folder is one for masks:DIR, of the same region
         telling = [camera for camera, mask in zip(cameras, found, strict=True) if mask is not None]
-        save_cameras(folder / "cameras.json", telling)
+        save_cameras(folder / "cameras.json", telling, scene.origin)
         return _lift(scene, cameras, found, f"text:{prompt}", settings)
 
     return {
@@ -115,7 +115,7 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
         "photomasks": lambda rest, scene: from_folder(rest, scene, bent=True),
         "text": from_text,
         "changed": lambda rest, scene: changed_region(
-            scene, *_changed_pictures(rest, settings), settings.threshold, settings.say
+            scene, *_changed_pictures(rest, settings, scene.origin), settings.threshold, settings.say
         ),
     }
 
@@ -128,14 +128,16 @@ def region_checks(settings: RegionSettings) -> dict[str, Check]:
         SEGMENTER_CHECKS["text"](settings.segmenter)
 
     return {
-        "masks": lambda rest: load_cameras(_mask_folder("masks", rest, settings)[1]),
-        "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, settings)[1]),
+        "masks": lambda rest: load_cameras(_mask_folder("masks", rest, settings)[1], ZERO),
+        "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, settings)[1], ZERO),
         "text": of_text,
-        "changed": lambda rest: _changed_pictures(rest, settings),
+        "changed": lambda rest: _changed_pictures(rest, settings, ZERO),
     }
 
 
-def _changed_pictures(rest: str, settings: RegionSettings) -> tuple[Sequence[Path], Sequence[Camera]]:
+def _changed_pictures(
+    rest: str, settings: RegionSettings, origin: Origin
+) -> tuple[Sequence[Path], Sequence[Camera]]:
     """The pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
     paths = picture_paths(rest) if rest else settings.pictures
     if not paths:
@@ -148,8 +150,8 @@ def _changed_pictures(rest: str, settings: RegionSettings) -> tuple[Sequence[Pat
                 f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
                 "without them, or name the region with --region"
             )
-    given = [] if settings.cameras is None else load_cameras(settings.cameras)
-    return paths, picture_cameras(paths, given)
+    given = [] if settings.cameras is None else load_cameras(settings.cameras, origin)
+    return paths, picture_cameras(paths, given, origin)
 
 
 def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, Path]:
@@ -248,7 +250,7 @@ def _segment(
 def _segmented_cameras(scene: Gaussians, settings: RegionSettings) -> list[Camera]:
     """The given cameras, evenly thinned out, or a rig around the scene."""
     if settings.cameras is not None:
-        offered = _cameras(settings.cameras)
+        offered = _cameras(settings.cameras, scene)
         count = min(settings.views, len(offered))
         taken = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
         return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
@@ -264,8 +266,8 @@ def _near_cameras(scene: Gaussians, region: Region, settings: RegionSettings) ->
     return [replace(camera, name=f"near_{i:03d}") for i, camera in enumerate(rig)]
 
 
-def _cameras(path: Path) -> list[Camera]:
-    return name_cameras(load_cameras(path))
+def _cameras(path: Path, scene: Gaussians) -> list[Camera]:
+    return name_cameras(load_cameras(path, scene.origin))
 
 
 def _slug(prompt: str) -> str:

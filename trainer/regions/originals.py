@@ -42,7 +42,7 @@ def write(options: ViewsOptions) -> str:
     if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
         raise ProgdfError(f"{out / 'cameras.json'} already exists; give --out another folder")
     scene = load_scene(options.scene)
-    given = [] if options.cameras is None else load_cameras(options.cameras)
+    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
     up = find_up(scene, given, options.up).direction
     region = None
     if options.region is not None:
@@ -63,7 +63,7 @@ def write(options: ViewsOptions) -> str:
         cameras = [view.camera for view in choice.views]
     for camera in cameras:
         write_image(out / "original" / f"{camera.name}.png", render_view(scene, camera, background))
-    save_cameras(out / "cameras.json", cameras)
+    save_cameras(out / "cameras.json", cameras, scene.origin)
     return (
         f"wrote {len(cameras)} views to {out / 'original'}; draw masks (white on black) as "
         f"{out}/NAME.png for some of them, then progdf train {options.scene} "

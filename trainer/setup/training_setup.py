@@ -92,7 +92,7 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
     """
     background = torch.tensor(BACKGROUND)
-    given = [] if settings.cameras is None else load_cameras(settings.cameras)
+    given = [] if settings.cameras is None else load_cameras(settings.cameras, scene.origin)
     up = find_up(scene, given, settings.up)
     if settings.pictures:
         return _picture_setup(settings, scene, region, given, up)
@@ -125,7 +125,7 @@ def _picture_setup(
 ) -> TrainingSetup:
     """The views of changed pictures. All are trained on: what one shows no other may."""
     background, size = torch.tensor(BACKGROUND), settings.image_size or PICTURE_SIZE
-    cameras = [fit_size(camera, size) for camera in picture_cameras(settings.pictures, given)]
+    cameras = [fit_size(camera, size) for camera in picture_cameras(settings.pictures, given, scene.origin)]
     views = [
         make_view(scene, region, camera, background)
         for camera in with_near_plane(name_cameras(cameras), scene)

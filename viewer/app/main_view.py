@@ -417,7 +417,7 @@ class MainView:
             self.work, what = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
             return f"Pasted strength and gains to {what}"
         if request == "timeline_file":
-            return saved_files.timeline(self.pictures, title, view)
+            return saved_files.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":
             return saved_files.picture(self.pictures, title, read_rgb(screen, size))
         taken = request == "take_view"

@@ -28,7 +28,7 @@ def look_through(main_view: MainView, path: Path) -> None:
     Raises:
         ProgdfError: it holds none.
     """
-    _take_camera(main_view, load_cameras(path)[0])
+    _take_camera(main_view, load_cameras(path, main_view.facts.origin)[0])
     main_view.show_message(f"Looking through the first camera of {path.name}")
 
 
@@ -38,7 +38,7 @@ def edit_picture(main_view: MainView, path: Path) -> None:
     Raises:
         ProgdfError: it is no picture, its camera is not found, or it was taken with edits on.
     """
-    camera = find_picture_camera(path)
+    camera = find_picture_camera(path, origin=main_view.facts.origin)
     if edits := edits_in_picture(path):
         raise ProgdfError(f"{path.name} was taken with edits on ({edits}); take the view with Ctrl+F2")
     _take_camera(main_view, camera)
@@ -60,7 +60,7 @@ def keep_camera(app: Application, session: Path | None) -> None:
     main_view = app.main_view
     place = session or app.document.path or main_view.pictures / app.document.title
     camera = to_camera(main_view.work.view.camera, *main_view.picture_size)
-    path, count = exports.camera(place, camera)
+    path, count = exports.camera(place, camera, main_view.facts.origin)
     main_view.show_message(
         f"Saved as camera {count} in {path.resolve()}; use it with progdf train … --cameras {path.name}"
     )
@@ -73,6 +73,6 @@ def open_timeline(main_view: MainView, path: Path) -> None:
         ProgdfError: see `timeline_file.load`.
     """
     view = main_view.work.view
-    main_view.change(replace(view, timeline=timeline_file.load(path, view.layers)))
+    main_view.change(replace(view, timeline=timeline_file.load(path, view.layers, main_view.facts.origin)))
     main_view.work = replace(main_view.work, player=Player(shown=True))
     main_view.show_message(f"Opened {path.name}; press Space to play it")

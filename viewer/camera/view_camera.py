@@ -203,6 +203,11 @@ def with_up(camera: ViewCamera, up: Vec3) -> ViewCamera:
     return look_along(replace(camera, up=unit(up, camera.up)), back)
 
 
+def move_camera(camera: ViewCamera, by: Vec3) -> ViewCamera:
+    """The same view of a scene that lies elsewhere; files have cameras in the world (`Gaussians.origin`)."""
+    return replace(camera, pivot=add_scaled(camera.pivot, (1.0, by)))
+
+
 def look_from(camera: ViewCamera, position: Vec3, pivot: Vec3) -> ViewCamera:
     """The eye at `position`, looking at `pivot`; the direction stays where the two coincide."""
     back = (position[0] - pivot[0], position[1] - pivot[1], position[2] - pivot[2])

@@ -235,7 +235,7 @@ def choose_camera(
     if options.camera is not None:
         if options.frame is not None:
             raise ProgdfError("--camera and --frame cannot be combined; give only one of them")
-        camera = read_camera(options.camera)
+        camera = read_camera(options.camera, scene.origin)
         return camera if size is None else fit_camera(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height

@@ -106,10 +106,11 @@ def _render_still(
     options: RenderOptions, found: OpenStack, view: ViewState, camera: Camera, engine: ViewEngine
 ) -> str:
     """One picture, compared as `view` asks; gives what to say about the comparison."""
+    origin = found.document.scene.origin
     if options.alpha:
         picture = Image.fromarray(transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
-            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view)))
+            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin))
         return ""
     where = found.document.recordings()
     missing = recordings.obstacle(where)
@@ -123,7 +124,7 @@ def _render_still(
     try:
         image = comparer.image(view, camera=camera)
         # a comparison is no view that could be edited and trained on
-        carried = camera_chunk(camera, shown_edits(view)) if view.compare.mode == "off" else None
+        carried = camera_chunk(camera, shown_edits(view), origin) if view.compare.mode == "off" else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)
@@ -154,7 +155,11 @@ def _keys(options: RenderOptions, found: OpenStack) -> Timeline:
     """The timeline that was asked for: of a file of its own, or of the session."""
     assert options.timeline is not None
     own = found.session is not None and options.timeline.exists() and options.timeline.samefile(found.session)
-    keys = found.view.timeline if own else timeline_file.load(options.timeline, found.view.layers)
+    keys = (
+        found.view.timeline
+        if own
+        else timeline_file.load(options.timeline, found.view.layers, found.document.scene.origin)
+    )
     if own and not keys.keys:
         raise ProgdfError(f"{options.timeline} has no keys on its timeline; set some with K in the window")
     if timeline.camera_at(keys, 0) is not None and (options.camera or options.orbit or options.frame):

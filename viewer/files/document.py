@@ -53,6 +53,7 @@ class Document:
             title=self.title,
             count=len(scene),
             bounds=bounds_of(scene),
+            origin=scene.origin,
             rows=rows,
             recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, scene, aspect),

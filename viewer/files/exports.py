@@ -14,6 +14,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
+from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.io.session import SUFFIX
@@ -53,7 +54,7 @@ def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | 
     return _try_save("picture", folder, save)
 
 
-def timeline(folder: Path, title: str, view: ViewState) -> str:
+def timeline(folder: Path, title: str, view: ViewState, origin: Origin = ZERO) -> str:
     """Save the keys of `view` under the scene's name; the line that says where, and what for.
 
     Raises:
@@ -62,14 +63,19 @@ def timeline(folder: Path, title: str, view: ViewState) -> str:
     path = free_path(folder, f"{Path(title).stem}_timeline", ".json")
 
     def save() -> str:
-        timeline_file.save(path, view.timeline, view.layers)
+        timeline_file.save(path, view.timeline, view.layers, origin)
         return f"Saved {path.resolve()}; render it with progdf render … --timeline {path.name}"
 
     return _try_save("timeline", folder, save)
 
 
-def camera(place: Path, seen: Camera) -> tuple[Path, int]:
+def camera(place: Path, seen: Camera, origin: Origin = ZERO) -> tuple[Path, int]:
     """Add a camera to NAME.cameras.json beside a scene or session NAME; where that is, and how many it holds.
+
+    Args:
+        place: the scene or session
+        seen: the camera
+        origin: of the scene, which it is relative to
 
     Raises:
         ProgdfError: it cannot be written, or holds something else.
@@ -78,9 +84,9 @@ def camera(place: Path, seen: Camera) -> tuple[Path, int]:
     path = place.with_name(f"{name}{CAMERAS}")
     if path.exists() and kind_of_cameras(path) != "own":
         raise ProgdfError(f"{path} was not made with F4; move it elsewhere, as it would be overwritten")
-    kept = load_cameras(path) if path.exists() else []
+    kept = load_cameras(path, origin) if path.exists() else []
     number = 1 + max((int(c.name[5:]) for c in kept if re.fullmatch(r"view_\d{1,9}", c.name)), default=-1)
-    save_cameras(path, [*kept, replace(seen, name=f"view_{number:03d}")])
+    save_cameras(path, [*kept, replace(seen, name=f"view_{number:03d}")], origin)
     return path, len(kept) + 1
 
 

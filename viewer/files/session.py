@@ -22,6 +22,8 @@ from progdf.io.session import (
     write_session,
 )
 from progdf.terminal import escape_text
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import move_camera
 from viewer.state import paint
 from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import check as check_selection
@@ -60,14 +62,15 @@ def save(path: Path, session: WindowSession) -> None:
     if session.document.path is None or len(session.document.gdf_paths) != len(session.document.gdfs):
         raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
     scene, session = session.document.path, prune(session)
+    view, snapshots = _move(session.view, session.snapshots, session.document.scene.origin)
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
     folder = path.parent
     state = SessionFile(
         reference(scene, folder),
         tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
-        plain(_with_region_paths(session.view, lambda region: Path(relative_name(region, folder)))),
-        tuple(plain(snapshot) for snapshot in session.snapshots),
+        plain(_with_region_paths(view, lambda region: Path(relative_name(region, folder)))),
+        tuple(plain(snapshot) for snapshot in snapshots),
     )
     write_session(path, state)
 
@@ -87,6 +90,8 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
     view, snapshots = _states(path.name, file)
     scene, gdfs = verify_files(path, file)
     opened = document.load(scene, gdfs)
+    x, y, z = opened.scene.origin
+    view, snapshots = _move(view, snapshots, (-x, -y, -z))
     check_selection(view.selection, len(opened.scene))
     named, folder = view.selection.regions, path.resolve().parent
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
@@ -114,6 +119,15 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
         )
         _log.warning(warning)
     return WindowSession(opened, view, snapshots, warning)
+
+
+def _move(
+    view: ViewState, snapshots: tuple[SliderSnapshot, ...], by: Vec3
+) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
+    """The same for a scene that lies elsewhere: a session has its cameras in the world."""
+    moved = tuple(replace(kept, camera=move_camera(kept.camera, by)) for kept in snapshots)
+    timeline = timeline_file.move_keys(view.timeline, by)
+    return replace(view, camera=move_camera(view.camera, by), timeline=timeline), moved
 
 
 def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewState:

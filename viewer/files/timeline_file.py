@@ -9,14 +9,15 @@
       ]
     }
 
-A key without a camera leaves the camera alone; with none in any key, a film is taken from one place. A key
-need not name every edit. What a key leaves out lies between its neighbors that do not.
+Cameras are in the world. A key without one leaves the camera alone; with none in any key, a film is taken
+from one place. A key need not name every edit. What a key leaves out lies between its neighbors that do not.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,9 +25,11 @@ import msgspec
 
 from progdf.cli.info import TIMELINE_MARK as MARK
 from progdf.errors import ProgdfError
+from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import convert_json, decode_json, plain
-from viewer.camera.view_camera import ViewCamera
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import ViewCamera, move_camera
 from viewer.state.view_state import Easing, Fps, Frame, Keyframe, LayerState, Length, Strength, Timeline
 
 VERSION = 1
@@ -52,18 +55,31 @@ class TimelineFile(msgspec.Struct, frozen=True):
     ping_pong: bool = False
 
 
-def save(path: Path, shown: Timeline, layers: Sequence[LayerState]) -> None:
-    """Write a timeline, whole or not at all.
+def move_keys(shown: Timeline, by: Vec3) -> Timeline:
+    """The same film of a scene that lies elsewhere; see `move_camera`."""
+    return replace(
+        shown,
+        keys=tuple(
+            replace(key, camera=None if key.camera is None else move_camera(key.camera, by))
+            for key in shown.keys
+        ),
+    )
+
+
+def save(path: Path, shown: Timeline, layers: Sequence[LayerState], origin: Origin = ZERO) -> None:
+    """Write a timeline, its cameras in the world, whole or not at all.
 
     Args:
         path: where to
         shown: what to write; strengths of edits that are no longer open are left out
         layers: give the edits their names
+        origin: of the scene, which the cameras are relative to
 
     Raises:
         ProgdfError: the folder does not exist.
         OSError: it cannot be written.
     """
+    shown = move_keys(shown, origin)
     names = {layer.gdf: layer.name for layer in layers}
     keys = tuple(
         FileKey(
@@ -76,8 +92,8 @@ def save(path: Path, shown: Timeline, layers: Sequence[LayerState]) -> None:
         temporary_file.write_text(json.dumps(plain(file), indent=2) + "\n", encoding="utf-8")
 
 
-def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
-    """Read a timeline for the edits that are open.
+def load(path: Path, layers: Sequence[LayerState], origin: Origin = ZERO) -> Timeline:
+    """Read a timeline for the edits that are open, its cameras relative to the origin of the scene.
 
     Raises:
         ProgdfError: the file is missing, no timeline, damaged, of a newer version, or names an edit that is
@@ -98,7 +114,8 @@ def load(path: Path, layers: Sequence[LayerState]) -> Timeline:
         check(found, "keys")
     except ValueError as error:
         raise ProgdfError(f"{path} cannot be read: {error}; correct it, or write it again") from None
-    return found
+    x, y, z = origin
+    return move_keys(found, (-x, -y, -z))
 
 
 def check(found: Timeline, where: str) -> None:

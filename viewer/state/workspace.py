@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from progdf.gaussians import ZERO, Origin
 from progdf.scene.neighborhood import Neighborhood
 from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
@@ -57,6 +58,7 @@ class SceneFacts:
         title: the scene's name
         count: Gaussians in the scene
         bounds: of the bulk of the scene
+        origin: where in the world the scene and its cameras begin, see `Gaussians.origin`
         rows: one per .gdf, indexed by `LayerState.gdf`
         recordings: where each .gdf was recorded, in the same order
         fit: gives the camera that `frame` takes with nothing selected and no layer focused
@@ -70,6 +72,7 @@ class SceneFacts:
     bounds: Bounds
     rows: Sequence[LayerRow]
     recordings: Sequence[RecordingFile] = ()
+    origin: Origin = ZERO
     fit: Fit = keep_camera
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
     home: Fit = keep_camera
