@@ -239,6 +239,42 @@ def test_the_test_of_what_is_started_sees_each_way(code: str) -> None:
     assert unsafe_starts('run([sys.executable, "-P", "-m", "progdf"])', "x.py") == []
 
 
+# Where the origin of the scene stands among the arguments of what lets cameras in or out.
+ORIGIN_AT = {
+    "load_cameras": 1,
+    "read_camera": 1,
+    "camera_in_picture": 1,
+    "save_cameras": 2,
+    "cameras_to_json": 2,
+    "camera_chunk": 2,
+    "find_picture_camera": 2,
+    "picture_cameras": 2,
+}
+
+
+def calls_without_origin(source: str, where: str) -> list[str]:
+    """Calls that would take a camera of the world for one of the scene, or the other way round."""
+    found = []
+    for node in ast.walk(parse(source)):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func).rpartition(".")[2]
+            given = len(node.args) > ORIGIN_AT.get(name, -1) or any(k.arg == "origin" for k in node.keywords)
+            found += [] if given else [f"{where}:{node.lineno} {name}"]
+    return found
+
+
+def test_cameras_enter_and_leave_with_the_origin_of_their_scene(sources: dict[Path, str]) -> None:
+    assert [
+        line for path, source in sources.items() for line in calls_without_origin(source, str(path))
+    ] == []
+
+
+def test_the_test_of_origins_sees_a_call_without_one() -> None:
+    assert calls_without_origin("load_cameras(path)\nx.read_camera(text, scene.origin)", "a.py") == [
+        "a.py:1 load_cameras"
+    ]
+
+
 def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str]) -> None:
     # an `__init__` that says what its folder holds, and nothing more, is no source
     filled = [path for path, source in sources.items() if len(parse(source).body) > 1]

@@ -14,6 +14,7 @@ import tyro
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import file_size, format_count, group_digits
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
+from progdf.gaussians import ZERO
 from progdf.gdf.header import GdfHead, read_head
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
@@ -149,7 +150,7 @@ def _describe_field(gdf: GdfHead) -> str:
 
 
 def _camera_lines(path: Path) -> Iterator[str]:
-    cameras = load_cameras(path)
+    cameras = load_cameras(path, ZERO)
     yield f"{path.name}: {format_count(len(cameras), 'camera')}"
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""

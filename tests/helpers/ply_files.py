@@ -42,6 +42,12 @@ def table_of(scene: Gaussians) -> dict[str, np.ndarray]:
     return {name: values.numpy() for name, values in columns.items()}
 
 
+def moved_columns(scene: Gaussians, by: Sequence[float]) -> dict[str, np.ndarray]:
+    """The columns of the scene elsewhere in the world, x, y and z as doubles."""
+    places = {name: scene.means[:, i].double().numpy() + by[i] for i, name in enumerate("xyz")}
+    return table_of(scene) | places
+
+
 def write(
     path: Path,
     columns: dict[str, np.ndarray],

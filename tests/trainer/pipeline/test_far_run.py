@@ -1,0 +1,100 @@
+"""A run on a scene of doubles far from 0 makes the edit of the same scene near 0, bit for bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.formats.ply import load_ply
+from progdf.gdf.file import load_gdf
+from progdf.io.cameras import load_cameras
+from progdf.io.images import read_picture, to_picture
+from progdf.io.picture_camera import camera_chunk
+from progdf.scene.region_spec import parse_region
+from tests.helpers.ply_files import moved_columns, write
+from tests.helpers.trained import quick_options, train
+from trainer.editors.pictures import picture_cameras
+from trainer.pipeline.reopen import render_run_views, reopen_run
+from trainer.pipeline.run import RunResult
+from trainer.regions import originals
+from trainer.regions.from_pictures import RegionSettings, region_kinds
+from trainer.regions.options import ViewsOptions
+
+FAR = (1e6, 2e6, -5e5)
+BOX = (-0.9, -0.9, -0.4, 0.9, 0.9, 0.9)
+
+
+@pytest.fixture(scope="module")
+def runs(folder: Path) -> dict[str, RunResult]:
+    """Of the same box of the bear, near and far."""
+    made = {}
+    for name, origin in (("near", (0.0, 0.0, 0.0)), ("far", FAR)):
+        write(folder / f"{name}.ply", moved_columns(load_ply(folder / "scene.ply"), origin))
+        box = ",".join(map(repr, np.add(BOX, 2 * origin).tolist()))
+        more = {
+            "views": 6,
+            "image_size": 48,
+            "steps": 40,
+            "stages": 2,
+            "region": f"box:{box}",
+            "name": "coat",
+        }
+        options = replace(quick_options(folder), scene=folder / f"{name}.ply", out=folder / name, **more)
+        made[name] = train(options)
+    return made
+
+
+def test_the_edit_is_the_same(folder: Path, runs: dict[str, RunResult]) -> None:
+    near, far = (load_gdf(runs[name].gdf, load_ply(folder / f"{name}.ply")) for name in ("near", "far"))
+    assert torch.equal(far.region.members, near.region.members)
+    assert torch.equal(far.field.offsets(0.7), near.field.offsets(0.7))
+    assert near.scene != far.scene
+
+
+def test_cameras_of_a_run_are_in_the_world_and_are_read_back(
+    folder: Path, runs: dict[str, RunResult]
+) -> None:
+    near = load_cameras(runs["near"].folder.cameras)
+    for a, b in zip(near, load_cameras(runs["far"].folder.cameras), strict=True):
+        assert np.abs((b.position - a.position).numpy() - FAR).max() < 1.0  # float32 at 2e6
+    for a, b in zip(near, load_cameras(runs["far"].folder.cameras, FAR), strict=True):
+        assert torch.allclose(a.viewmat, b.viewmat, atol=1e-6)
+
+
+def test_a_far_run_is_opened_again_with_its_views(runs: dict[str, RunResult]) -> None:
+    views = render_run_views(reopen_run(runs["far"].folder.root)).views
+    for view in views:
+        original = read_picture(runs["far"].folder.view("original", view.camera.name))
+        assert float((view.image.clamp(0, 1) - original).abs().max()) < 2 / 255
+
+
+def test_masks_over_views_of_a_far_scene_find_their_region(folder: Path, runs: dict[str, RunResult]) -> None:
+    scene = load_ply(folder / "far.ply")
+    originals.write(ViewsOptions(folder / "far.ply", folder / "drawn", views=4, image_size=64))
+    for path in sorted((folder / "drawn" / "original").iterdir()):
+        picture = read_picture(path)
+        mask = (picture.mean(dim=2) < 0.5).float()[..., None].expand(-1, -1, 3)
+        to_picture(mask).save(folder / "drawn" / path.name)
+    settings = RegionSettings(None, 30, lambda: folder, quiet=True, scene=folder / "far.ply")
+    found = parse_region(f"masks:{folder / 'drawn'}", scene, kinds=region_kinds(settings))
+    assert 0 < len(found) < len(scene)
+
+
+def test_a_changed_picture_of_a_far_scene_tells_what_was_changed(
+    folder: Path, runs: dict[str, RunResult]
+) -> None:
+    scene = load_ply(folder / "far.ply")
+    view = render_run_views(reopen_run(runs["far"].folder.root)).views[0]
+    changed = view.image.clone()
+    changed[16:28, 18:30] = torch.tensor([0.1, 0.2, 0.9])
+    path = folder / "A.png"
+    to_picture(changed).save(path, pnginfo=camera_chunk(view.camera, origin=scene.origin))
+    (camera,) = picture_cameras([path], (), scene.origin)
+    assert torch.allclose(camera.viewmat, view.camera.viewmat, atol=1e-6)
+    settings = RegionSettings(None, 30, lambda: folder, quiet=True, pictures=[path])
+    found = parse_region("changed", scene, kinds=region_kinds(settings))
+    assert 0 < len(found) < len(scene) // 2

@@ -1,0 +1,150 @@
+"""A scene is the same wherever in the world it lies: its pictures by every engine, its cameras, regions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import pytest
+import torch
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import Gaussians
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.rasterize import render
+from progdf.rasterize.depth import render_depth
+from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.region_spec import parse_region
+from progdf.scene.stats import survey
+from progdf.scene.subject import subject_rows
+from progdf.scene.up_axis import find_up
+from tests.helpers.ply_files import moved_columns, write
+from tests.helpers.stacks import Stack
+from viewer.camera.view_camera import first_camera, move_camera
+from viewer.render.engine import ViewEngine
+from viewer.state.view_state import ViewState
+
+MOVES = [1e3, 1e5, 1e6, 1234567.891]
+"""The last one is on no grid: positions are rounded anew, to 1e-7 of the scene's size."""
+
+ENGINES = {"cpu": 3, "reference": 1, "gl": 3}
+"""With how many cameras each draws; the reference takes long."""
+
+
+@pytest.fixture(scope="module", params=MOVES)
+def moved(request: pytest.FixtureRequest, stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> Moved:
+    return Moved(stack.scene, request.param, tmp_path_factory.mktemp("moved"))
+
+
+class Moved:
+    """A scene, and what is loaded of it when it lies elsewhere.
+
+    Args:
+        scene: near 0
+        by: how far it is moved along x, twice as far along y, back along z
+        folder: for its file
+    """
+
+    def __init__(self, scene: Gaussians, by: float, folder: Path) -> None:
+        self.near, self.by, self.folder = scene, np.array([by, 2 * by, -by]), folder
+        self.far = load_scene(write(folder / "far.ply", moved_columns(scene, self.by.tolist())))
+
+    def cameras(self, cameras: list[Camera]) -> list[Camera]:
+        """The same cameras moved as the scene is, through a file."""
+        x, y, z = self.by.tolist()
+        save_cameras(self.folder / "cameras.json", cameras, (x, y, z))
+        return load_cameras(self.folder / "cameras.json", self.far.origin)
+
+    def spec(self, kind: str, point: tuple[float, ...], rest: str) -> str:
+        """A region's words, with points moved as the scene is."""
+        points = np.reshape(point, (-1, 3)) + self.by
+        return f"{kind}:{','.join(map(repr, points.ravel().tolist()))}{rest}"
+
+
+@pytest.fixture(scope="module")
+def cameras(stack: Stack) -> list[Camera]:
+    return orbit_rig(stack.scene, 3, 80, 60)
+
+
+@pytest.fixture
+def draw(ctx: moderngl.Context, request: pytest.FixtureRequest) -> Iterator[object]:
+    made: list[ViewEngine] = []
+
+    def picture(scene: Gaussians, camera: Camera) -> np.ndarray:
+        if request.param != "gl":
+            return render(scene, camera, engine=request.param).image.detach().clamp(0, 1).numpy()
+        made.append(ViewEngine(ctx, scene, (), "gl", "auto"))
+        return np.asarray(made[-1].image(ViewState(), camera=camera))
+
+    yield picture
+    for engine in made:
+        engine.release()
+
+
+@pytest.mark.parametrize(("draw", "count"), ENGINES.items(), indirect=["draw"])
+def test_its_pictures_do_not_change(moved: Moved, cameras: list[Camera], draw: object, count: int) -> None:
+    for camera, same in zip(cameras[:count], moved.cameras(cameras[:count]), strict=True):
+        off = np.abs(draw(moved.far, same) - draw(moved.near, camera))  # type: ignore[operator]
+        assert off.max() <= 1 / 255
+
+
+def test_its_depth_does_not_change(moved: Moved, cameras: list[Camera]) -> None:
+    far, near = render_depth(moved.far, moved.cameras(cameras)[0]), render_depth(moved.near, cameras[0])
+    assert torch.allclose(far.depth, near.depth, atol=1e-4)
+
+
+def test_its_up_its_rig_and_its_subject_do_not_change(moved: Moved) -> None:
+    near, far = moved.near, moved.far
+    up = find_up(near)
+    assert (find_up(far).name, find_up(far).reason) == (up.name, up.reason)
+    assert torch.equal(subject_rows(far, up.direction), subject_rows(near, up.direction))
+    radius, by = survey(near).radius, moved.by - far.origin
+    for a, b in zip(orbit_rig(near, 5, 64, 64), orbit_rig(far, 5, 64, 64), strict=True):
+        assert torch.allclose(a.viewmat[:3, :3], b.viewmat[:3, :3], atol=1e-6)
+        assert np.abs((b.position - a.position).numpy() - by).max() < 1e-5 * radius
+
+
+def test_its_first_view_does_not_change(moved: Moved) -> None:
+    near, far = first_camera(moved.near), first_camera(moved.far)
+    x, y, z = (moved.by - moved.far.origin).tolist()
+    assert np.allclose(far.pivot, move_camera(near, (x, y, z)).pivot, atol=1e-4)
+    assert np.allclose(
+        (far.distance, far.azimuth, far.elevation), (near.distance, near.azimuth, near.elevation)
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "point", "rest"),
+    [
+        ("box", (-1.013, -0.517, -0.511, 0.497, 0.503, 1.009), ""),
+        ("sphere", (0.011, 0.207, 0.303), ",0.71"),
+        ("flood", (0.0, 0.3, 0.6), ",0.1"),
+    ],
+)
+def test_a_region_by_coordinates_of_the_world_is_the_same(
+    moved: Moved, kind: str, point: tuple[float, ...], rest: str
+) -> None:
+    near = parse_region(f"{kind}:{','.join(map(repr, point))}{rest}", moved.near)
+    far = parse_region(moved.spec(kind, point, rest), moved.far)
+    assert 10 < len(near) < len(moved.near)
+    assert torch.equal(far.members, near.members)
+
+
+@pytest.mark.parametrize("shape", ["rectangle:{}:20,20,60,60", "front:{}"])
+def test_a_region_drawn_over_a_picture_is_the_same(moved: Moved, cameras: list[Camera], shape: str) -> None:
+    save_cameras(moved.folder / "near.json", cameras)
+    moved.cameras(cameras)
+    near = parse_region(shape.format(moved.folder / "near.json"), moved.near)
+    assert torch.equal(
+        parse_region(shape.format(moved.folder / "cameras.json"), moved.far).members, near.members
+    )
+
+
+def test_an_empty_region_says_where_in_the_world_the_scene_is(moved: Moved) -> None:
+    x = survey(moved.near).box[0] + moved.by[0]
+    with pytest.raises(ProgdfError, match=rf"the scene reaches x {int(x)}\.\d+ to "):
+        parse_region("box:0,0,0,1,1,1", moved.far)
