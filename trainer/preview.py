@@ -50,7 +50,10 @@ class PreviewOptions:
 
 
 class Request(msgspec.Struct, frozen=True):
-    """A picture that is wanted: where it goes, what is edited how, and from where one looks."""
+    """A picture that is wanted: where it goes, what is edited how, and from where one looks.
+
+    `viewmat` is relative to the origin of the scene, which window and child load alike.
+    """
 
     number: int
     out: str

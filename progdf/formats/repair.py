@@ -28,8 +28,8 @@ INVISIBLE_LOGIT = -30.0
 """In place of −inf: opacity 1e-13, far under the 1/255 that every rasterizer skips."""
 
 LEAST_QUAT = 1e-6
-_SAMPLE = 100_000
-"""Rows that the origin is found from; a scene with more is sampled evenly."""
+_SAMPLE = 10_000
+"""Rows that the origin is found from, an even sample: its median is off by 1 % of the extent."""
 
 UNIT_TOLERANCE = 1e-6
 """A quaternion this close to unit length is left alone, so that a saved scene loads bit for bit."""
