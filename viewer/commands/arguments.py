@@ -25,7 +25,8 @@ from viewer.camera.view_camera import (
     frame,
     to_camera,
 )
-from viewer.state.view_state import MOST_AMPLIFIED, Comparison, LayerState
+from viewer.state.layers import visible_layers
+from viewer.state.view_state import MOST_AMPLIFIED, Comparison, LayerState, ViewState
 
 from .options import RenderOptions
 
@@ -44,17 +45,13 @@ class Named(Protocol):
 def layers_of(
     gdfs: Sequence[Gdf], settings: Sequence[str], most: float = 1.0, unset: float = 0.0
 ) -> tuple[LayerState, ...]:
-    """One layer per edit, at 0 unless a `NAME=S` of `settings` says otherwise.
-
-    Args:
-        unset: the strength of all of them where there are no settings
+    """One layer per edit, at `unset` unless a `NAME=S` of `settings` says otherwise.
 
     Raises:
         ProgdfError: there is no edit NAME, or S is no number from 0 to `most`.
     """
     strengths = strengths_of(gdfs, settings, most)
-    rest = 0.0 if strengths else unset
-    return tuple(LayerState(i, gdf.name, strengths.get(gdf.name, rest)) for i, gdf in enumerate(gdfs))
+    return tuple(LayerState(i, gdf.name, strengths.get(gdf.name, unset)) for i, gdf in enumerate(gdfs))
 
 
 def strengths_of(edits: Sequence[Named], settings: Sequence[str], most: float = 1.0) -> dict[str, float]:
@@ -72,6 +69,11 @@ def strengths_of(edits: Sequence[Named], settings: Sequence[str], most: float = 
             )
         strengths[known_edit(name, edits, "--set")] = _strength(setting, text, most)
     return strengths
+
+
+def describe_strengths(view: ViewState) -> str:
+    """The layers that take part, each with its strength."""
+    return ", ".join(f"{layer.name} {layer.strength:g}" for layer in visible_layers(view)) or "no edits"
 
 
 def known_edit(name: str, gdfs: Sequence[Named], option: str) -> str:

@@ -70,7 +70,7 @@ def export(argv: Sequence[str]) -> int:
         save_ply(temporary_file, edited)
         _check_reloaded(edited, load_ply(temporary_file))
     far = ", x y z as doubles as it is far from 0" if found.document.scene.origin != ZERO else ""
-    strengths = ", ".join(f"{state.name} {state.strength:g}" for state in states) or "no edits"
+    strengths = arguments.describe_strengths(found.view)
     print_line(f"wrote {options.out}: {format_count(len(edited))}, {strengths}{far}; read back and compared")
     source = found.document.path
     if source is not None and (kind := scene_format(source)) != "ply":

@@ -38,7 +38,7 @@ def stack_of(
         solo: names of the edits that alone are shown
         overshoot: whether strengths go to `OVERSHOOT`
         paint: `NAME=WEIGHTS.npy`, a weight 0..1 per member, or per Gaussian of the scene
-        unset: the strength of the edits where there are no settings
+        unset: the strength of the edits that no setting names
 
     Raises:
         ProgdfError: there is no such edit or kind, or a number is outside its range.

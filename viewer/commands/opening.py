@@ -68,7 +68,7 @@ def open_stack(options: StackOptions, unset: float = 0.0) -> OpenStack:
 
     Args:
         options: of the command
-        unset: the strength of a scene's edits where no --set names one
+        unset: the strength of a scene's edits that no --set names
 
     Raises:
         ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, options

@@ -32,8 +32,8 @@ class StackOptions:
     gdfs: Edits = ()
     """Edits of this scene, the lowest layer first."""
     set: Settings = ()
-    """Strength of an edit, 0 to 1; repeat it for several edits. Without any, `render` and `export` show every
-    edit at 1 and `view` opens at 0; with a session it replaces the session's."""
+    """Strength of an edit, 0 to 1; repeat it for several edits. An edit that is not named is at 1 in `render`
+    and `export`, at 0 in `view`, --sweep and --sheet, and as a session has it."""
     gain: Gains = ()
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
     solo: Solo = ()

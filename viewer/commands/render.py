@@ -73,7 +73,8 @@ def render(argv: Sequence[str]) -> int:
             told = _render_still(options, found, view, camera, engine)
         drawn_by = _describe_engine(engine)
     each = "each " if options.sheet is not None else ""
-    print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by})")
+    strengths = "" if swept else f": {arguments.describe_strengths(view)}"
+    print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by}){strengths}")
     if told:
         print_line(told)
     if view.layers and not swept and not any(layer.strength for layer in view.layers):
