@@ -33,8 +33,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "view": ("viewer.commands.cli:view", "open the window: splats, layers, sliders"),
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
+    "edit": ("progdf.cli.edit:main", "write a scene again without strays"),
     "export": ("viewer.commands.cli:export", "write the edited scene as a 3DGS .ply file"),
-    "check": ("progdf.cli.check:main", "report what a scene holds and what had to be repaired"),
+    "check": (
+        "progdf.cli.check:main",
+        "report what a scene holds, what had to be repaired and what is stray",
+    ),
     "info": ("progdf.cli.info:main", "tell what a scene or a .gdf holds, with its error report"),
 }
 HIDDEN = {"preview": "trainer.preview:serve"}

@@ -1,7 +1,8 @@
-"""`progdf check SCENE`: what the file holds, what had to be repaired, what is odd about the scene."""
+"""`progdf check SCENE`: what the file holds, what had to be repaired, what is stray in the scene."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import tyro
 from progdf.formats.scene_file import load_scene_with_report
 from progdf.io.cameras import load_cameras
 from progdf.scene.stats import survey
+from progdf.scene.strays import find_strays
 from progdf.scene.up_axis import UpChoice, find_up
 from progdf.terminal import print_line
 
@@ -34,11 +36,15 @@ class CheckOptions:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Print the load report, then the survey. Raises ProgdfError for a file that cannot be loaded."""
+    """Print the load report, the survey, the strays. Raises ProgdfError for a file that cannot be loaded."""
     options = parse_options(CheckOptions, argv, "progdf check")
     scene, report = load_scene_with_report(options.scene)
     cameras = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
     up = find_up(scene, cameras, options.up)
     for line in report.lines() + survey(scene, up).lines():
         print_line(line)
+    strays = find_strays(scene)
+    if len(strays.rows):
+        path = shlex.quote(str(options.scene))
+        print_line(f"strays: {strays.describe()}; progdf edit {path} --clean -o CLEAN.ply leaves them out")
     return 0

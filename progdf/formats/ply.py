@@ -18,7 +18,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians
+from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, normalize_quats
 from progdf.io.atomic import atomic_write
 
 from .load_report import LoadReport
@@ -117,6 +117,31 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
     with atomic_write(path) as temporary_file:
         PlyData([vertex], byte_order="<", comments=comments).write(str(temporary_file))
+
+
+def save_ply_checked(path: str | os.PathLike[str], scene: Gaussians) -> None:
+    """`save_ply` that reads the file back before it takes the place of `path`.
+
+    Raises:
+        ProgdfError: the file gives back anything but what was written into it; `path` is as it was.
+    """
+    with atomic_write(Path(path)) as temporary_file:
+        save_ply(temporary_file, scene)
+        read = load_ply(temporary_file)
+        for name in ATTRIBUTES:
+            written, loaded = getattr(scene, name), getattr(read, name)
+            if name == "means" and (scene.origin, read.origin) != (ZERO, ZERO):
+                # what moved may have moved the origin, about which each is rounded
+                off = (read.world_means - scene.world_means).abs()
+                same = bool((off <= 2.0**-23 * (loaded.abs() + written.abs())).all())
+            elif name == "quats":
+                same = torch.allclose(normalize_quats(written), loaded, rtol=0.0, atol=1e-6)
+            else:
+                same = torch.equal(written, loaded)
+            if not same:
+                raise ProgdfError(
+                    f"the written file does not match in its {name}; check the disk and try again"
+                )
 
 
 def _check_properties(ply: PlyFile) -> int:

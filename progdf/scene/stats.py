@@ -1,4 +1,4 @@
-"""What a scene is like: where it lies, how large its Gaussians are, which of them are odd."""
+"""What a scene is like: where it lies, how large its Gaussians are."""
 
 from __future__ import annotations
 
@@ -7,20 +7,11 @@ from dataclasses import dataclass
 
 import torch
 
-from progdf.formats.load_report import format_count, format_place
+from progdf.formats.load_report import format_place
 from progdf.gaussians import Gaussians
 
 from .bounds import is_surrounding, scene_sphere
 from .up_axis import UpAxis, find_up
-
-GIANT = 0.5
-"""Of the scene's radius: a Gaussian with a longer axis (one standard deviation) covers most of a picture."""
-
-NEEDLE = 30.0
-LONG = 0.05
-"""A needle's longest axis is 30 times its middle one and at least a twentieth of the scene's radius."""
-
-INVISIBLE = 1 / 255
 
 
 @dataclass(frozen=True)
@@ -37,9 +28,6 @@ class Survey:
         surrounding: it looks like a scene to stand inside, which cameras around it cannot frame
         median_size: median of the longest axes, one standard deviation, world units
         largest_size: the longest axis of all
-        invisible: Gaussians with an opacity under 1/255, which no rasterizer draws
-        giants: see `GIANT`
-        needles: see `NEEDLE`
     """
 
     count: int
@@ -52,9 +40,6 @@ class Survey:
     surrounding: bool
     median_size: float
     largest_size: float
-    invisible: int
-    giants: int
-    needles: int
 
     def lines(self) -> list[str]:
         """The survey for a person, a line per fact."""
@@ -68,12 +53,6 @@ class Survey:
             f"size: median {self.median_size:.3g}, largest {self.largest_size:.3g} "
             "(longest axis, one standard deviation)",
         ]
-        odd = (
-            (self.invisible, "Gaussian", "too transparent to be drawn (opacity under 1/255)"),
-            (self.giants, "giant", f"(longer than {GIANT:g} of the scene's radius)"),
-            (self.needles, "needle", f"({NEEDLE:g} times as long as wide, and long)"),
-        )
-        lines += [f"odd: {format_count(rows, noun)} {what}" for rows, noun, what in odd if rows]
         if self.surrounding:
             lines.append(
                 "cameras: a scene to stand inside, which cameras around it cannot frame; give its own, "
@@ -91,9 +70,7 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
     """
     center, radius = scene_sphere(scene)
     up = find_up(scene) if up is None else up
-    axes = scene.log_scales.sort(dim=1).values
-    longest = axes[:, 2].exp()
-    needles = (axes[:, 2] - axes[:, 1] > torch.tensor(NEEDLE).log()) & (longest > LONG * radius)
+    longest = scene.log_scales.amax(dim=1).exp()
     x, y, z = (at + middle for at, middle in zip(scene.origin, center.tolist(), strict=True))
     return Survey(
         count=len(scene),
@@ -106,9 +83,6 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
         surrounding=is_surrounding(scene, up.direction),
         median_size=float(longest.median()),
         largest_size=float(longest.max()),
-        invisible=int((scene.opacities < INVISIBLE).sum()),
-        giants=int((longest > GIANT * radius).sum()),
-        needles=int(needles.sum()),
     )
 
 

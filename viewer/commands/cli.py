@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
-
 from progdf.cli.options import parse_options
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import format_count
-from progdf.formats.ply import load_ply, save_ply
+from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import scene_format
-from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, normalize_quats
-from progdf.io.atomic import atomic_write, check_not_an_input
+from progdf.gaussians import ZERO
+from progdf.io.atomic import check_not_an_input
 from progdf.terminal import print_line
 from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
@@ -66,9 +64,7 @@ def export(argv: Sequence[str]) -> int:
     gdfs, states = found.document.gdfs, visible_layers(found.view)
     layers = [layer_of(gdfs[state.gdf], state.strength, state.gains, state.paint) for state in states]
     edited = compose_layers(found.document.scene, layers, found.view.blend)
-    with atomic_write(options.out) as temporary_file:
-        save_ply(temporary_file, edited)
-        _check_reloaded(edited, load_ply(temporary_file))
+    save_ply_checked(options.out, edited)
     far = ", x y z as doubles as it is far from 0" if found.document.scene.origin != ZERO else ""
     strengths = arguments.describe_strengths(found.view)
     print_line(f"wrote {options.out}: {format_count(len(edited))}, {strengths}{far}; read back and compared")
@@ -76,19 +72,3 @@ def export(argv: Sequence[str]) -> int:
     if source is not None and (kind := scene_format(source)) != "ply":
         print_line(f"{found.document.title} is a .{kind}, this is a plain .ply")
     return 0
-
-
-def _check_reloaded(written: Gaussians, read: Gaussians) -> None:
-    """Raises ProgdfError where the file gives back anything but what was written into it."""
-    for name in ATTRIBUTES:
-        expected, found = getattr(written, name), getattr(read, name)
-        if name == "means" and (written.origin, read.origin) != (ZERO, ZERO):
-            # what moved may have moved the origin, about which each is rounded
-            off = (read.world_means - written.world_means).abs()
-            same = bool((off <= 2.0**-23 * (read.means.abs() + written.means.abs())).all())
-        elif name == "quats":
-            same = torch.allclose(normalize_quats(expected), found, rtol=0.0, atol=1e-6)
-        else:
-            same = torch.equal(expected, found)
-        if not same:
-            raise ProgdfError(f"the written file does not match in its {name}; check the disk and try again")

@@ -74,16 +74,16 @@ def test_check_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "repaired: nothing" not in lines
 
 
-def test_check_points_at_odd_gaussians(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_points_at_strays_and_at_the_command_that_leaves_them_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene = tidy()
     scene.log_scales[0] = torch.tensor(50.0).log()
-    scene.log_scales[1:4, 0] = torch.tensor(1.0).log()
+    scene.log_scales[1:4, 0] = torch.tensor(20.0).log()
     scene.logit_opacities[4:9] = -9.0
     save_ply(tmp_path / "scene.ply", scene)
     text = "\n".join(lines_of(capsys, "check", str(tmp_path / "scene.ply")))
-    assert "odd: 1 giant " in text
-    assert "odd: 3 needles" in text
-    assert "odd: 5 Gaussians too transparent" in text
+    assert "strays: 4 giants, 5 too transparent to be drawn; progdf edit " in text
 
 
 def test_the_survey_is_about_the_bulk_of_the_scene() -> None:

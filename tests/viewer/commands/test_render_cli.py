@@ -298,13 +298,13 @@ def test_an_exported_scene_is_the_composed_one(
 def test_an_export_that_does_not_read_back_leaves_no_file(
     run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from viewer.commands import cli
+    from progdf.formats import ply
 
     def damaged(path: Path) -> object:
         scene = load_ply(path)
         return replace(scene, sh0=scene.sh0 + 1e-3) if Path(path).name != "bear.ply" else scene
 
-    monkeypatch.setattr(cli, "load_ply", damaged)
+    monkeypatch.setattr(ply, "load_ply", damaged)
     assert run("export", "bear.ply", "ears.gdf", "-o", "damaged.ply") == 2
     assert "does not match in its sh0" in capsys.readouterr().err
     assert not Path("damaged.ply").exists()

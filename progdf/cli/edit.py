@@ -1,0 +1,82 @@
+"""`progdf edit SCENE … -o OUT.ply`: a scene with its Gaussians changed for good, as a new file."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from progdf.errors import ProgdfError
+from progdf.formats.load_report import format_count, group_digits
+from progdf.formats.ply import save_ply_checked
+from progdf.formats.scene_file import load_scene, scene_name
+from progdf.gaussians import Gaussians
+from progdf.metrics.image import NO_DIFFERENCE
+from progdf.scene.strays import clean, find_strays, picture_difference
+from progdf.terminal import print_line
+
+from .options import parse_options
+
+
+@dataclass(frozen=True)
+class EditOptions:
+    """Write a scene again without what should not be in it. The scene itself is never changed.
+
+    Args:
+        scene: a .ply, .spz, .splat, .ksplat or .sog
+        out: the .ply file to write
+        clean: leave out floaters, needles, giants and what is too transparent to be drawn
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply")]
+    clean: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+
+
+def main(argv: Sequence[str]) -> int:
+    """Do what is asked for and write it. Raises ProgdfError where that is nothing, or would leave nothing."""
+    options = parse_options(EditOptions, argv, "progdf edit")
+    if not options.clean:
+        raise ProgdfError("nothing was asked for; say what to do with the scene, for example --clean")
+    if options.out.suffix.lower() != ".ply":
+        raise ProgdfError(f"{options.out} is not a .ply file; give the new scene a name that ends in .ply")
+    if options.out.exists() and os.path.samefile(options.out, options.scene):
+        raise ProgdfError(f"{options.out} is the scene itself; choose another name for the new one")
+    scene = load_scene(options.scene)
+    edited = _clean(scene)
+    if not len(edited):
+        raise ProgdfError(f"nothing of {options.scene} would be left; it has no Gaussian that is drawn")
+    save_ply_checked(options.out, edited)
+    print_line(f"wrote {options.out}: {format_count(len(edited))}")
+    if len(edited) < len(scene):
+        old, new = shlex.quote(str(options.scene)), shlex.quote(str(options.out))
+        print_line(
+            f"rows have new numbers: labels and edits of {scene_name(options.scene)} no longer fit; "
+            f"an edit is carried over by progdf rebind EDIT.gdf --from {old} --to {new} -o NEW.gdf"
+        )
+    return 0
+
+
+def _clean(scene: Gaussians) -> Gaussians:
+    """Without strays; prints which, and what that changes in pictures."""
+    strays = find_strays(scene)
+    if not len(strays.rows):
+        print_line("clean: there are no strays")
+        return scene
+    edited = clean(scene, strays)
+    print_line(
+        f"clean: {group_digits(len(strays.rows))} of {format_count(len(scene))} left out: {strays.describe()}"
+    )
+    mean, worst = picture_difference(scene, edited) if len(edited) else (0.0, 0.0)
+    if worst >= NO_DIFFERENCE:
+        print_line("pictures from all around: no pixel differs")
+    else:
+        print_line(
+            f"pictures from all around: {mean:.1f} dB to those before, {worst:.1f} dB where most differs"
+        )
+    return edited

@@ -1,0 +1,213 @@
+"""Strays: what is planted is found, what belongs to a scene stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.__main__ import main
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gdf.file import load_gdf
+from progdf.scene.strays import Strays, clean, find_strays, picture_difference
+from tests.helpers.paths import SHARED_DATA
+from tests.helpers.scenes import concatenate, one_gaussian
+from tests.helpers.stacks import bear_stack
+
+ONE_STEP_DB = 20 * np.log10(255)
+"""PSNR at which pictures differ by one step of 8 bits: what does not show."""
+
+
+@cache
+def bear() -> Gaussians:
+    return bear_stack(3000).scene
+
+
+@cache
+def littered() -> tuple[Gaussians, dict[str, list[int]]]:
+    """The bear with strays among its rows, and where these are."""
+    scene = bear()
+    small = float(scene.scales.median())
+    rng = np.random.default_rng(3)
+    quats = rng.normal(size=(40, 4))
+    planted: dict[str, list[Gaussians]] = {
+        "giants": [
+            one_gaussian((x, 2.0, 0.5), scales=(3.0, 2.5, 0.05), quat=tuple(q))
+            for x, q in zip((-1.0, 0.0, 1.5), quats, strict=False)
+        ],
+        "needles": [
+            one_gaussian((x, 1.0, z), scales=(2.0, small / 20, small / 20), quat=(1.0, 0.0, 0.3 * z, 1.0))
+            for x, z in ((0.5, 0.2), (-0.6, 0.4), (0.0, -0.8))
+        ],
+        "floaters": [
+            *(one_gaussian(tuple(p), scales=(small,) * 3) for p in rng.normal(size=(9, 3)) * 2 + (0, 9, 0)),
+            *(one_gaussian((6.0, 4.0 + d, 3.0), scales=(small,) * 3) for d in (0.0, small, 2 * small)),
+        ],
+        "faint": [one_gaussian(tuple(p), opacity=0.003) for p in rng.normal(size=(5, 3))],
+    }
+    strays = [(kind, each) for kind, those in planted.items() for each in those]
+    more = [replace(s, shN=torch.zeros(1, scene.shN.shape[1], 3)) for _, s in strays]
+    whole = concatenate(scene, *more)
+    order = torch.from_numpy(rng.permutation(len(whole)))
+    place = {int(row): i for i, row in enumerate(order)}
+    where: dict[str, list[int]] = {kind: [] for kind in planted}
+    for i, (kind, _) in enumerate(strays):
+        where[kind].append(place[len(scene) + i])
+    return whole[order], where
+
+
+def same(a: Strays, b: Strays) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+
+
+def test_planted_strays_are_found_and_the_scenes_own_rows_are_kept() -> None:
+    scene, where = littered()
+    found = find_strays(scene)
+    assert sorted(where["faint"]) == found.faint.tolist()
+    assert sorted(where["floaters"]) == found.floaters.tolist()
+    assert sorted(where["giants"] + where["needles"]) == sorted([*found.giants, *found.needles])
+    assert set(where["giants"]) <= set(found.giants.tolist())
+    assert found.describe().endswith("12 floaters, 5 too transparent to be drawn")
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0**-9, 2.0**11])
+def test_a_moved_turned_and_scaled_scene_has_the_same_strays(factor: float) -> None:
+    scene, _ = littered()
+    half_turn = scene.quats[:, [1, 0, 3, 2]] * torch.tensor([-1.0, 1.0, -1.0, 1.0])  # about x
+    moved = replace(
+        scene,
+        means=scene.means * torch.tensor([1.0, -1.0, -1.0]) * factor
+        + factor * torch.tensor([8.0, -4.0, 2.0]),
+        quats=half_turn,
+        log_scales=scene.log_scales + float(np.log(factor)),
+    )
+    assert same(find_strays(moved), find_strays(scene))
+
+
+def test_what_is_cleaned_has_nothing_left_to_clean() -> None:
+    scene, _ = littered()
+    cleaned = clean(scene, find_strays(scene))
+    assert find_strays(cleaned).describe() == "none"
+    assert len(cleaned) == len(bear())
+
+
+@pytest.mark.parametrize("size", [1000, 2000, 4000])
+def test_a_clean_scene_loses_nothing_that_shows(size: int) -> None:
+    scene = bear_stack(size).scene
+    _, worst = picture_difference(scene, clean(scene, find_strays(scene)))
+    assert worst >= ONE_STEP_DB
+
+
+def test_what_is_too_transparent_to_be_drawn_changes_no_pixel() -> None:
+    scene = bear()
+    faint = replace(scene, logit_opacities=scene.logit_opacities.clone())
+    faint.logit_opacities[::3] = -5.6  # 1/271
+    strays = Strays(np.arange(0, len(scene), 3), *[np.zeros(0, np.int64)] * 3)
+    assert np.array_equal(find_strays(faint).faint, strays.faint)
+    assert picture_difference(faint, clean(faint, strays)) == (99.0, 99.0)
+
+
+@pytest.mark.parametrize("count", [1, 10, 70])
+def test_few_gaussians_or_many_in_one_place_have_no_strays(count: int) -> None:
+    assert find_strays(bear()[:count]).describe() == "none"
+    assert find_strays(one_gaussian()[torch.zeros(count, dtype=torch.int64)]).describe() == "none"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["plant.ply", "playbot_31k.ply"])
+def test_a_real_scene_is_clean_after_it_was_cleaned(name: str) -> None:
+    path = SHARED_DATA / name
+    if not path.exists():
+        pytest.skip(f"{name} is not here")
+    scene = load_ply(path)
+    cleaned = clean(scene, find_strays(scene))
+    assert 0 < len(scene) - len(cleaned) < len(scene) // 100
+    assert find_strays(cleaned).describe() == "none"
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(list(arguments)) == 0
+    return capsys.readouterr().out
+
+
+def test_edit_writes_a_scene_without_strays_and_says_what_that_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene, _ = littered()
+    save_ply("dirty.ply", scene)
+    before = Path("dirty.ply").read_bytes()
+    assert "progdf edit dirty.ply --clean -o CLEAN.ply leaves them out" in run(capsys, "check", "dirty.ply")
+    told = run(capsys, "edit", "dirty.ply", "--clean", "-o", "clean.ply").splitlines()
+    assert told[0].startswith("clean: 23 of 3 023 Gaussians left out: ")
+    assert told[1].startswith("pictures from all around: ")
+    assert told[2] == "wrote clean.ply: 3 000 Gaussians"
+    assert "labels and edits of dirty.ply no longer fit" in told[3]
+    assert "progdf rebind EDIT.gdf --from dirty.ply --to clean.ply -o NEW.gdf" in told[3]
+    assert Path("dirty.ply").read_bytes() == before
+    again = run(capsys, "edit", "clean.ply", "--clean", "-o", "again.ply").splitlines()
+    assert again == ["clean: there are no strays", "wrote again.ply: 3 000 Gaussians"]
+    assert Path("again.ply").read_bytes() == Path("clean.ply").read_bytes()
+    assert "strays" not in run(capsys, "check", "clean.ply")
+
+
+def test_an_edit_is_carried_over_to_the_cleaned_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    stack = bear_stack(3000)
+    path, scarf, _ = stack.save(tmp_path)
+    faint = replace(stack.scene, logit_opacities=stack.scene.logit_opacities.clone())
+    faint.logit_opacities[5:40:5] = -9.0
+    save_ply("clean.ply", clean(faint, find_strays(faint)))
+    run(capsys, "rebind", str(scarf), "--from", str(path), "--to", "clean.ply", "-o", "new.gdf")
+    cleaned = load_ply("clean.ply")
+    members = load_gdf(Path("new.gdf"), cleaned).region.members
+    kept = set(stack.gdfs[0].region.members.tolist()) - set(range(5, 40, 5))
+    rows = [row for row in range(3000) if row not in range(5, 40, 5)]
+    assert {rows[int(i)] for i in members} == kept
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("-o", "x.ply"), "nothing was asked for; say what to do with the scene, for example --clean"),
+        (("--clean", "-o", "x.splat"), "x.splat is not a .ply file"),
+        (("--clean", "-o", "bear.ply"), "bear.ply is the scene itself; choose another name"),
+    ],
+)
+def test_an_edit_that_cannot_be_is_one_line(
+    arguments: tuple[str, ...],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_ply("bear.ply", bear())
+    assert main(["edit", "bear.ply", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"progdf: {line}")
+    assert error.count("\n") == 1
+    assert [path.name for path in Path().iterdir()] == ["bear.ply"]
+
+
+def test_a_scene_of_which_nothing_is_drawn_is_not_cleaned_away(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_ply(tmp_path / "a.ply", one_gaussian(opacity=0.001))
+    assert main(["edit", str(tmp_path / "a.ply"), "--clean", "-o", str(tmp_path / "b.ply")]) == 2
+    assert "nothing of" in capsys.readouterr().err
+
+
+def test_attributes_of_what_stays_are_the_same_bits() -> None:
+    scene, _ = littered()
+    strays = find_strays(scene)
+    rows = np.setdiff1d(np.arange(len(scene)), strays.rows)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(clean(scene, strays), name), getattr(scene, name)[rows])
