@@ -20,6 +20,7 @@ from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.window import Window, interruptible
 
 from .application import error_details, error_line, log_error
+from .edit_actions import StrayActions
 from .file_actions import FileActions
 from .main_view import MainView
 from .studio.deliver_actions import DeliverActions
@@ -112,6 +113,7 @@ class App:
         self.preview = PreviewActions(
             self, self.context, lambda form, folder: self.training.region_spec(form, folder, "preview")
         )
+        self.strays = StrayActions(self)
         self.is_closed = False
         self._title = ""
         self._memory = memory
@@ -128,7 +130,7 @@ class App:
                 parts.callback(close)
             parts.callback(self.main_view.ui.make_current)
             parts.callback(self.file_actions.release)
-            for part in (self.training, self.up, self.preview, self.start, self.deliver):
+            for part in (self.training, self.strays, self.up, self.preview, self.start, self.deliver):
                 parts.callback(part.close)
             self._keep_picture()
 
@@ -205,13 +207,20 @@ class App:
     def _handle(self, request: str) -> None:
         if request == "full_screen":
             self.window.toggle_full_screen()
-        elif not any(part.handle(request) for part in (self.training, self.deliver, self.start, self.up)):
+        elif not any(part.handle(request) for part in self._parts):
             self.file_actions.handle(request)
+
+    @property
+    def _parts(
+        self,
+    ) -> tuple[TrainingActions | DeliverActions | StartActions | UpActions | StrayActions, ...]:
+        return self.training, self.deliver, self.start, self.up, self.strays
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
         # first: what was chosen, or trained, wakes the main view
-        looks = [self._look(part.poll) for part in (self.training, self.preview, self.deliver, self.start)]
+        parts = (self.training, self.preview, self.deliver, self.start, self.strays)
+        looks = [self._look(part.poll) for part in parts]
         return (
             self._look(self.file_actions.poll_dialog),
             *looks,

@@ -19,6 +19,7 @@ _SAVES = (("Save", "Ctrl+S", "save"), ("Save as…", "Ctrl+Shift+S", "save_as"))
 _MAKES = (
     ("New edit", "Ctrl+N", "new_edit"),
     ("Take this view", "Ctrl+F2", "take_view"),
+    ("Hide strays", "", "hide_strays"),
     ("Export .ply…", "Ctrl+E", "export"),
     ("Render picture…", "Ctrl+P", "render_picture"),
     ("Render film…", "Ctrl+Shift+P", "render_film"),

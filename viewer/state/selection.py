@@ -120,10 +120,10 @@ def select_none(state: SelectionState) -> SelectionState:
     return replace(state, members=NOBODY, count=0)
 
 
-def hide(state: SelectionState, total: int) -> SelectionState:
-    """What is selected is not drawn any more, and no longer selected."""
-    hidden = unpack(state.hidden, total) | unpack(state.members, total)
-    return replace(state, members=NOBODY, count=0, hidden=pack(hidden))
+def hide(state: SelectionState, mask: Mask) -> SelectionState:
+    """What is in the mask is not drawn any more, and no longer selected. [N]"""
+    hidden = unpack(state.hidden, len(mask)) | mask
+    return select(replace(state, hidden=pack(hidden)), unpack(state.members, len(mask)))
 
 
 def isolate(state: SelectionState, total: int) -> SelectionState:
@@ -155,7 +155,7 @@ def change(
         case "select_invert":
             return select(state, ~mask)
         case "hide_selected":
-            return hide(state, total)
+            return hide(state, mask)
         case "isolate":
             return isolate(state, total)
         case "show_hidden":

@@ -38,7 +38,7 @@ REQUESTS = (
     *("export", "render_picture", "render_film", "deliver", "stop_delivery", "drop_and_quit"),
     *("about", "demo"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
-    *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up"),
+    *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up", "hide_strays"),
 )
 """What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
 afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +12,11 @@ import pytest
 from imgui_bundle import imgui
 
 from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
+from progdf.scene.strays import find_strays
+from tests.helpers.null_app import null_app, press
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
+from viewer.files.document import Document
 from viewer.state import selection
 from viewer.state.selection import SelectionState, unpack
 from viewer.state.view_state import SelectTool
@@ -352,3 +356,30 @@ def test_the_panel_selects_shows_and_keeps_regions() -> None:
         hand.modifier(imgui.Key.enter, False)
         hand.frame(2)
         assert hand.main_view.take_requests() == ("save_region:hat",)
+
+
+def test_strays_are_hidden_when_asked_for_and_undo_shows_them_again(tmp_path: Path) -> None:
+    scene = replace(bear().scene, logit_opacities=bear().scene.logit_opacities.clone())
+    scene.logit_opacities[:7] = -9.0
+    with null_app(Document("a", scene), first_view(bear()), tmp_path) as app:
+        app.main_view.request("hide_strays")
+        app.draw()
+        assert "Looking for strays" in app.main_view.work.message.text
+        while app.strays.poll() is not None:
+            time.sleep(0.05)
+        hidden = unpack(app.main_view.work.view.selection.hidden, len(scene))
+        assert np.array_equal(np.flatnonzero(hidden), find_strays(scene).rows)
+        said = app.main_view.work.message.text
+        assert said.startswith("Hid 7 strays (7 too transparent to be drawn): no pixel differs")
+        press(app, "Ctrl+Z")
+        assert not app.main_view.work.view.selection.hidden
+
+
+def test_strays_of_a_scene_that_is_no_longer_open_hide_nothing(tmp_path: Path) -> None:
+    with null_app(Document("a", bear().scene), first_view(bear()), tmp_path) as app:
+        app.strays.handle("hide_strays")
+        app.show(Document("b", bear(1000).scene))
+        while app.strays.poll() is not None:
+            time.sleep(0.05)
+        assert not app.main_view.work.view.selection.hidden
+        assert "strays (" not in app.main_view.work.message.text

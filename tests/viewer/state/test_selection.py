@@ -46,7 +46,7 @@ def test_a_mask_that_does_not_fit_is_refused(members: bytes) -> None:
 def test_what_is_hidden_cannot_be_selected_until_all_is_shown() -> None:
     state = selection.select(SelectionState(), every(2))
     assert state.count == 502
-    hidden = selection.hide(state, TOTAL)
+    hidden = selection.hide(state, every(2))
     assert hidden.count == 0
     assert selection.select(hidden, every(1)).count == 501
     assert selection.select(selection.show_all(hidden), every(1)).count == TOTAL
