@@ -98,11 +98,15 @@ class Opened:
 
     def processor_s(self) -> float:
         """Processor time that all its threads have used, seconds."""
+        if sys.platform == "win32":
+            raise NotImplementedError("Xvfb is not for Windows")
         numbers = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
 
     def memory_mb(self) -> float:
         """Memory that it holds now (resident set), MB of 1e6 bytes."""
+        if sys.platform == "win32":
+            raise NotImplementedError("Xvfb is not for Windows")
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 

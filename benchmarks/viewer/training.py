@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -26,20 +27,20 @@ class Training:
 
     def __init__(self, child: Child) -> None:
         self._child = child
-        self._send(signal.SIGSTOP)
+        self._send("SIGSTOP")
 
     @contextmanager
     def runs(self) -> Iterator[None]:
         """Let it go on meanwhile."""
-        self._send(signal.SIGCONT)
+        self._send("SIGCONT")
         try:
             yield
         finally:
-            self._send(signal.SIGSTOP)
+            self._send("SIGSTOP")
 
-    def _send(self, number: int) -> None:
-        if self._child.status is None:
-            os.killpg(self._child.pid, number)
+    def _send(self, name: str) -> None:
+        if sys.platform != "win32" and self._child.status is None:
+            os.killpg(self._child.pid, signal.Signals[name])
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import io
 import json
 import sys
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -40,15 +41,18 @@ def _bundle(meta: Path) -> bytes:
 def main(kind: str, source: str, target: str, memory: int, output: int, seconds: int) -> None:
     import gaussforge
 
-    try:
+    if sys.platform != "win32":  # which has no such limits: the time limit of the caller has to do there
         import resource
-    except ImportError:  # not on Windows, where the time limit of the caller has to do
-        pass
-    else:
-        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-        resource.setrlimit(resource.RLIMIT_FSIZE, (output, output))
-        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+        limits = (
+            (resource.RLIMIT_AS, memory),
+            (resource.RLIMIT_FSIZE, output),
+            (resource.RLIMIT_CPU, seconds),
+            (resource.RLIMIT_CORE, 0),
+        )
+        for limit, most in limits:
+            with suppress(ValueError, OSError):  # macOS takes no RLIMIT_AS
+                resource.setrlimit(limit, (most, most))
     path = Path(source)
     content = _bundle(path) if path.name.lower() == "meta.json" else path.read_bytes()
     found = gaussforge.GaussForge().convert(content, kind, "ply")

@@ -24,6 +24,8 @@ _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _TEMPORARY = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9})-\w{8}(\..*)?", re.DOTALL)
 _A_DAY = 86400.0
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.I | re.S)
+_IN_USE = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION
+_WAITS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 @contextmanager
@@ -60,7 +62,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise write_error(target, error) from error
     try:
         yield temporary_file
-        os.replace(temporary_file, target)
+        replace_file(temporary_file, target)
     except (OSError, ProgdfError) as error:  # the latter of one within, which knows `temporary_file` alone
         full = disk_full(error)
         if full is None:
@@ -86,6 +88,23 @@ def temporary_subfolder(folder: Path) -> Path:
 
 def _temporary_name() -> str:
     return f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def replace_file(path: Path, target: Path) -> None:
+    """`os.replace`, which Windows refuses while anybody has the target open, if only to read or to scan it.
+
+    Raises:
+        OSError: it still does after two seconds, or the file cannot be moved at all.
+    """
+    for wait in _WAITS_S:
+        try:
+            os.replace(path, target)
+            return
+        except PermissionError as error:
+            if getattr(error, "winerror", None) not in _IN_USE:
+                raise
+        time.sleep(wait)
+    os.replace(path, target)
 
 
 def _create(path: Path, mode: int | None) -> None:

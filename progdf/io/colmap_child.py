@@ -11,20 +11,20 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 
 def main(folder: str, memory: int, seconds: int) -> None:
     import pycolmap
 
-    try:
+    if sys.platform != "win32":  # which has no such limits: the time limit of the caller has to do there
         import resource
 
-        taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    except (ImportError, OSError):  # not on Windows, where the time limit of the caller has to do
-        pass
-    else:
-        resource.setrlimit(resource.RLIMIT_AS, (taken + memory, taken + memory))
+        with suppress(OSError, ValueError):  # macOS has no /proc, and takes no RLIMIT_AS
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+            most = pages * resource.getpagesize() + memory
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     found = pycolmap.Reconstruction(folder)

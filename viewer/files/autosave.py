@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from progdf.io.atomic import replace_file
 from progdf.io.session import SUFFIX
 
 AUTOSAVE_S = 20.0
@@ -121,7 +122,7 @@ def put_aside(path: Path) -> Path:
     ]
     free = [name for name in names if not name.exists()]
     to = free[0] if free else min(names, key=lambda name: name.stat().st_mtime)
-    os.replace(path, to)
+    replace_file(path, to)
     os.utime(to)  # the age that counts is since when it is discarded
     return to
 

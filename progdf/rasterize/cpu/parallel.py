@@ -96,7 +96,7 @@ def _leave(core: int) -> None:
     A virtual machine's idle cores look busy to Linux, which therefore wakes a thread on the core of the one
     that wakes it: both would share it for up to two ticks, 8 ms, while the other core idles.
     """
-    if core >= 0 and getattr(_left, "core", None) != core:
+    if sys.platform == "linux" and core >= 0 and getattr(_left, "core", None) != core:
         others = os.sched_getaffinity(os.getpid()) - {core}
         if others:
             with suppress(OSError):  # a container may forbid it
