@@ -46,7 +46,7 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
     server = subprocess.Popen(command, pass_fds=[send], stderr=subprocess.DEVNULL)
     os.close(send)
     try:
-        with os.fdopen(receive) as told:
+        with os.fdopen(receive, encoding="ascii") as told:
             yield f":{told.readline().strip()}"
     finally:
         server.terminate()
@@ -100,14 +100,14 @@ class Opened:
         """Processor time that all its threads have used, seconds."""
         if sys.platform == "win32":
             raise NotImplementedError("Xvfb is not for Windows")
-        numbers = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        numbers = Path(f"/proc/{self.process.pid}/stat").read_text("utf-8").rpartition(")")[2].split()
         return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
 
     def memory_mb(self) -> float:
         """Memory that it holds now (resident set), MB of 1e6 bytes."""
         if sys.platform == "win32":
             raise NotImplementedError("Xvfb is not for Windows")
-        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text("ascii").split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def close(self) -> None:

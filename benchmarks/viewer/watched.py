@@ -70,7 +70,7 @@ def _most_mb() -> float:
 
     Not `resource.getrusage`: its figure begins with what the parent held when it started this process.
     """
-    status = Path("/proc/self/status").read_text()
+    status = Path("/proc/self/status").read_text("utf-8")
     (most,) = [line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:")]
     return 1024 * int(most) / 1e6
 

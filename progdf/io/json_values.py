@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import msgspec
@@ -85,8 +85,12 @@ def one_of(names: Sequence[str]) -> msgspec.Meta:
 
 
 def plain(value: object) -> Any:
-    """The JSON value that `convert_json` reads back; paths are text."""
-    return msgspec.to_builtins(value, enc_hook=str)
+    """The JSON value that `convert_json` reads back; paths are text, with forward slashes on any system."""
+    return msgspec.to_builtins(value, enc_hook=_text)
+
+
+def _text(value: object) -> str:
+    return value.as_posix() if isinstance(value, PurePath) else str(value)
 
 
 def _path(kind: type, value: object) -> object:

@@ -20,7 +20,7 @@ import json
 import os
 import re
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import msgspec
@@ -88,7 +88,7 @@ def relative_name(path: Path, folder: Path) -> str:
         name.encode()
     except UnicodeEncodeError:
         raise ProgdfError(f"a session cannot hold the file name {name}: it is not UTF-8; rename it") from None
-    return str(PurePosixPath(Path(name)))
+    return Path(name).as_posix()
 
 
 def reference(path: Path, folder: Path) -> FileRef:
@@ -145,15 +145,20 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
 def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
     """The scene and the edits of the session at `path`, each found and with the content it had then.
 
+    A file that is not where it was, as on another computer or system, is taken from beside the session.
+
     Raises:
         ProgdfError: one is missing or has changed.
     """
     found = []
     for ref in (session.scene, *session.edits):
-        file = ref.path(path.resolve().parent)
+        folder = path.resolve().parent
+        file, beside = ref.path(folder), folder / PureWindowsPath(ref.file).name
+        if not os.path.isfile(file) and os.path.isfile(beside):
+            file = beside
         if not os.path.isfile(file):  # pathlib's raises where a name is too long
             raise ProgdfError(
-                f"{path.name} needs {file}, which does not exist; put it back or save the session again"
+                f"{path.name} needs {file}, which does not exist; put it back, or beside the session"
             )
         if sha256(file) != ref.sha256.lower():
             raise ProgdfError(

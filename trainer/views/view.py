@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
+from progdf.io.atomic import is_portable
 from progdf.rasterize import Crop, render
 from progdf.region import Region
 from progdf.scene.bounds import near_plane, scene_sphere
@@ -173,15 +175,20 @@ def fit_size(camera: Camera, image_size: int) -> Camera:
 
 
 def name_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras with names that are distinct and can be file names."""
+    """The cameras with names that can be file names on any system, and differ in more than case there."""
     taken: set[str] = set()
     result = []
     for i, camera in enumerate(cameras):
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name.rsplit("/", 1)[-1])
         name = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg")) else name
         name = name[:_LONGEST_NAME]
-        if not name.strip("._") or name in taken:
+        if not name.strip("._") or not is_portable(name) or _twin(name) in taken:
             name = f"view_{i:03d}"
-        taken.add(name)
+        taken.add(_twin(name))
         result.append(replace(camera, name=name))
     return result
+
+
+def _twin(name: str) -> str:
+    """Equal for names that Windows or macOS take for one."""
+    return unicodedata.normalize("NFC", name).casefold()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ MOUSE_HELP = (
     ("Right-click", "menu of a layer or snapshot"),
     ("Esc, right-click", "cancel a drag"),
 )
+
+_MAC = (("Cmd", "does what Ctrl does here; shortcuts take both"),)
 
 TOPICS = (
     ("Layers", "focus:1"),
@@ -61,7 +64,9 @@ def topics() -> tuple[Topic, ...]:
     ends = [min((s for s in starts if s > start), default=len(controls.KEYS)) for start in starts]
     keys = (_describe_keys(controls.KEYS[start:end]) for start, end in zip(starts, ends, strict=True))
     named = zip((name for name, _ in TOPICS), keys, strict=True)
-    return Topic("Mouse", MOUSE_HELP), *(Topic(name, rows) for name, rows in named)
+    return Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ())), *(
+        Topic(name, rows) for name, rows in named
+    )
 
 
 def columns(shown: Sequence[Topic], count: int) -> list[list[Topic]]:

@@ -203,12 +203,13 @@ class Window:
             self._down.pop(key, None)
             self._chorded.discard(key)
             return
-        if mods & glfw.MOD_CONTROL and action == glfw.PRESS:
-            self._chorded.add(key)
         name = key_name(key, scancode)
+        pressed = chord(name, mods)
+        if pressed.startswith("Ctrl+") and action == glfw.PRESS:
+            self._chorded.add(key)
         self._down[key] = name
         # imgui adds its own event after this one
-        self._pressed.append(Press(chord(name, mods), action == glfw.REPEAT, next_event_id()))
+        self._pressed.append(Press(pressed, action == glfw.REPEAT, next_event_id()))
 
     def present(self) -> None:
         glfw.swap_buffers(self.handle)

@@ -51,6 +51,13 @@ def test_view_names_are_distinct_and_can_be_file_names() -> None:
     assert not any("/" in name or name.startswith(".") for name in found)
 
 
+def test_view_names_are_files_of_their_own_on_windows_and_macos() -> None:
+    camera = small().views[0].camera
+    names = ["Front", "front", "caf\u00e9", "cafe\u0301", "CON", "nul.x", "a.", "LPT1.png"]
+    found = [c.name for c in name_cameras([replace(camera, name=name) for name in names])]
+    assert found == ["Front", "view_001", "caf\u00e9", "cafe_", *(f"view_{i:03d}" for i in range(4, 8))]
+
+
 def test_a_name_too_long_for_a_file_is_cut() -> None:
     camera = small().views[0].camera
     first, second = (c.name for c in name_cameras([replace(camera, name="\U00020000" * 300)] * 2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 from imgui_bundle import imgui
 
@@ -93,3 +95,26 @@ def test_in_a_window_that_is_too_small_the_list_scrolls_to_its_end() -> None:
             hand.wheel(320.0, 200.0, -2.0)
         assert shown(hand).scroll.y == shown(hand).scroll_max.y
         assert hand.main_view.work.view.camera == before, "the wheel over it zooms nothing"
+
+
+def test_on_a_mac_command_does_what_control_does_and_the_list_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from viewer.ui import window
+
+    assert window.chord("S", window.glfw.MOD_SUPER) == "S"
+    assert not any("Cmd" in row for topic in bindings.topics() for row in topic.rows)
+    monkeypatch.setattr(sys, "platform", "darwin")
+    both = window.glfw.MOD_SUPER | window.glfw.MOD_SHIFT
+    assert window.chord("S", both) == window.chord("S", window.glfw.MOD_CONTROL | window.glfw.MOD_SHIFT)
+    assert window.chord("S", both) == "Ctrl+Shift+S"
+    assert any("Cmd" in row for topic in bindings.topics() for row in topic.rows)
+
+
+def test_the_window_asks_for_the_only_context_that_a_mac_gives() -> None:
+    from viewer.ui import window
+
+    asked, glfw = dict(window._HINTS), window.glfw
+    assert (asked[glfw.CONTEXT_VERSION_MAJOR], asked[glfw.CONTEXT_VERSION_MINOR]) == (3, 3)
+    assert asked[glfw.OPENGL_PROFILE] == glfw.OPENGL_CORE_PROFILE
+    assert asked[glfw.OPENGL_FORWARD_COMPAT]

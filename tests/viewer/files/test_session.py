@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from progdf.__main__ import main
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
+from progdf.io.json_values import plain
 from progdf.io.session import read_session, sha256
 from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session, spoilt
 from tests.helpers.ui_rig import bear, first_view
@@ -55,6 +56,23 @@ def test_a_session_can_be_read_by_people_and_moves_with_its_folder(saved: Path, 
     tmp_path.rename(elsewhere)
     assert session.open_session(elsewhere / saved.name).view == full_view()
     elsewhere.rename(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["C:\\\\scenes\\\\", "D:/scenes/", "\\\\\\\\server\\\\share\\\\", "//server/share/", "/home/somebody/"],
+)
+def test_a_session_of_another_system_finds_its_files_beside_it(saved: Path, place: str) -> None:
+    text = saved.read_text("utf-8")
+    saved.write_text(text.replace('"bear.ply"', f'"{place}bear.ply"'), "utf-8")
+    assert session.open_session(saved).document.path == saved.parent / "bear.ply"
+    (saved.parent / "bear.ply").write_bytes(b"another")
+    with pytest.raises(ProgdfError, match="was saved with another bear"):
+        session.open_session(saved)
+
+
+def test_paths_in_files_have_forward_slashes_on_any_system() -> None:
+    assert plain({"path": PureWindowsPath("edits\\red.region.npy")}) == {"path": "edits/red.region.npy"}
 
 
 def test_regions_come_back_with_their_files_wherever_the_folder_went(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,82 @@
+"""What a person does with the program, in a process that `bare_system` has stripped: commands or jobs."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from progdf.__main__ import main
+from progdf.formats.ply import save_ply
+from tests.helpers.demo_scenes import bear
+from viewer.files import document, session
+from viewer.files.session import WindowSession
+from viewer.jobs import run_files
+from viewer.jobs.training_job import EditOrder
+from viewer.jobs.training_queue import TrainingQueue
+from viewer.state.view_state import LayerState, ViewState
+
+EARS = "sphere:0,1.9,0,0.6"
+TRAIN = (
+    "--editor=tint:#3060d0",
+    "--steps=32",
+    "--views=3",
+    "--image-size=48",
+    "--threads=1",
+    "--field=separable",
+)
+
+
+def run(*arguments: str) -> None:
+    status = main(list(arguments))
+    assert status == 0, (arguments, status)
+
+
+def commands() -> None:
+    run("info", "bear.ply")
+    run("check", "bear.ply")
+    run("render", "bear.ply", "--size=64x48", "--engine=cpu", "--out=a.png")
+    run("train", "bear.ply", "--out=run", f"--region={EARS}", *TRAIN)
+    run("info", "run/run.gdf")
+    for _ in range(2):  # the second replaces what the first wrote
+        run("export", "bear.ply", "run/run.gdf", "--out=edited.ply")
+        opened = document.load(Path("bear.ply"), [Path("run/run.gdf")])
+        view = ViewState(layers=(LayerState(0, "run", 0.25),))
+        session.save(Path("work.session.json"), WindowSession(opened, view))
+    assert session.open_session(Path("work.session.json")).view.layers[0].strength == 0.25
+    run("render", "work.session.json", "--size=64x48", "--engine=cpu", "--out=b.png")
+
+
+def jobs() -> None:
+    def order(name: str) -> EditOrder:
+        out = run_files.free_run(run_files.edits_folder(Path("bear.ply")), name)
+        return EditOrder(Path("bear.ply"), out, name, EARS, "tint:#3060d0", quick=True, threads=1)
+
+    def wait(until: str = "") -> str:
+        """What became of the job, or that it does `until`."""
+        while queue.busy:
+            for ended in queue.poll():
+                return ended.status + ended.error
+            if until and any(job.progress.doing == until for job in queue.jobs):
+                break
+            time.sleep(0.05)
+        return until
+
+    queue = TrainingQueue()
+    number = queue.add(order("blue"))
+    assert wait("optimize") == "optimize"
+    queue.stop(number)
+    assert (said := wait()) == "stopped", said
+    queue.resume(number)
+    assert (said := wait()) == "done", said
+    queue.add(order("red"))
+    assert wait("optimize") == "optimize"
+    assert queue._child is not None
+    queue._child.kill()
+    assert wait().startswith("failed")
+    queue.close()
+
+
+if __name__ == "__main__":
+    save_ply("bear.ply", bear(400).gaussians)
+    {"commands": commands, "jobs": jobs}[sys.argv[1]]()

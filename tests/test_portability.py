@@ -1,0 +1,135 @@
+"""What holds on Windows and macOS too, as far as Linux can show it."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import atomic_write, is_portable
+from tests.helpers.paths import ROOT
+from tests.test_structure import parse, source_files
+
+BARE = ROOT / "tests" / "helpers" / "bare_system"
+
+
+def run_bare(folder: Path, what: str) -> str:
+    """`tests.helpers.bare_run` in a process without what Windows lacks, on a console without UTF-8."""
+    environment = {
+        **os.environ,
+        "BARE_FOLDER": os.path.realpath(folder),
+        "PYTHONPATH": os.pathsep.join((str(BARE), str(ROOT))),
+        "PYTHONIOENCODING": "ascii",
+        "USERNAME": "somebody",  # what getpass reads there
+    }
+    told = subprocess.run(
+        [sys.executable, "-m", "tests.helpers.bare_run", what],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert told.returncode == 0, told.stdout + told.stderr
+    return (folder / "bare.txt").read_text("utf-8")
+
+
+def test_commands_need_nothing_that_windows_lacks(tmp_path: Path) -> None:
+    assert run_bare(tmp_path, "commands").count("\n") == 1
+    assert sorted(path.name for path in tmp_path.glob("*.p*")) == ["a.png", "b.png", "bear.ply", "edited.ply"]
+
+
+@pytest.mark.slow
+def test_trainings_of_the_window_start_stop_resume_and_die_without_what_windows_lacks(tmp_path: Path) -> None:
+    children = run_bare(tmp_path, "jobs").splitlines()[1:]
+    assert [line.endswith("--resume") for line in children] == [False, True, False]
+
+
+@pytest.mark.parametrize("times", [1, 3, 100])
+def test_a_file_that_somebody_has_open_is_replaced_once_he_closes_it(
+    times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, real, calls = tmp_path / "a.txt", os.replace, 0
+
+    def replace(source: Path, target: Path) -> None:
+        nonlocal calls
+        calls += 1
+        if calls <= times:
+            error = PermissionError(13, "The process cannot access the file", str(target))
+            error.winerror = 32  # type: ignore[attr-defined]
+            raise error
+        real(source, target)
+
+    path.write_text("old", encoding="utf-8")
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr("progdf.io.atomic._WAITS_S", (0.0,) * 5)
+    try:
+        with atomic_write(path) as temporary_file:
+            temporary_file.write_text("new", encoding="utf-8")
+    except (PermissionError, ProgdfError):
+        assert times == 100
+    assert path.read_text("utf-8") == ("old" if times == 100 else "new")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    "name", ["CON", "nul.x", "Com1.png", "lpt².a.b", "aux ", "a.", "b ", "conout$", "a:b"]
+)
+def test_names_that_windows_cannot_have_are_known(name: str) -> None:
+    assert not is_portable(name)
+
+
+@pytest.mark.parametrize("name", ["console", "nulls.x", "a.con", "view_001", "lpt", "é"])
+def test_ordinary_names_are_portable(name: str) -> None:
+    assert is_portable(name)
+
+
+def text_without_encoding(tree: ast.AST) -> Iterator[int]:
+    """Lines of calls that open a file as text and leave the encoding to the system."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        called = node.func
+        name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
+        values = [*node.args, *(word.value for word in node.keywords if word.arg == "mode")]
+        said = [value.value for value in values if isinstance(value, ast.Constant)]
+        modes = [mode for mode in said if isinstance(mode, str) and mode and set(mode) <= set("rwaxbt+")]
+        if name == "open":  # the function, or a path's; not `Image.open(path)` or a window's own
+            asks = isinstance(called, ast.Name) or bool(modes) or not (node.args or node.keywords)
+        else:
+            asks = name in ("fdopen", "read_text", "write_text")
+        given = name in ("read_text", "write_text") and len(node.args) > (name == "write_text")
+        named = any(word.arg == "encoding" for word in node.keywords)
+        if asks and not (given or named or any("b" in mode for mode in modes)):
+            yield node.lineno
+
+
+def test_every_text_file_is_opened_with_an_encoding() -> None:
+    found = [
+        f"{path}:{line}"
+        for path in source_files()
+        for line in text_without_encoding(parse((ROOT / path).read_text(encoding="utf-8")))
+    ]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "open(p)",
+        "open(p, 'w')",
+        "p.open()",
+        "p.open('a')",
+        "p.read_text()",
+        "p.write_text(s)",
+        "os.fdopen(h)",
+    ],
+)
+def test_the_test_of_encodings_sees_each_way_to_open_a_text(line: str) -> None:
+    assert list(text_without_encoding(ast.parse(line)))
