@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import load_scene, scene_name
 from progdf.gaussians import Gaussians
+from progdf.io.atomic import check_not_an_input
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import clean, find_strays, picture_difference
 from progdf.terminal import print_line
@@ -45,8 +45,7 @@ def main(argv: Sequence[str]) -> int:
         raise ProgdfError("nothing was asked for; say what to do with the scene, for example --clean")
     if options.out.suffix.lower() != ".ply":
         raise ProgdfError(f"{options.out} is not a .ply file; give the new scene a name that ends in .ply")
-    if options.out.exists() and os.path.samefile(options.out, options.scene):
-        raise ProgdfError(f"{options.out} is the scene itself; choose another name for the new one")
+    check_not_an_input(options.out, [options.scene])
     scene = load_scene(options.scene)
     edited = _clean(scene)
     if not len(edited):

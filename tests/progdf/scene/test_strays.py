@@ -178,7 +178,7 @@ def test_an_edit_is_carried_over_to_the_cleaned_scene(
     [
         (("-o", "x.ply"), "nothing was asked for; say what to do with the scene, for example --clean"),
         (("--clean", "-o", "x.splat"), "x.splat is not a .ply file"),
-        (("--clean", "-o", "bear.ply"), "bear.ply is the scene itself; choose another name"),
+        (("--clean", "-o", "bear.ply"), "bear.ply is one of the files to read; choose another name"),
     ],
 )
 def test_an_edit_that_cannot_be_is_one_line(

@@ -79,5 +79,5 @@ def test_regions_have_names_of_their_own_that_files_can_have() -> None:
     assert selection.free_name(state, "a/b\\c:d\n e") == "a_b_c_d e"
     assert selection.free_name(state, "../..") == "_"
     assert selection.free_name(state, "") == "region"
-    assert selection.free_name(state, "con") == "_con"
+    assert selection.free_name(state, "con") == "region con"
     assert selection.free_name(state, "a" * 59 + ". b") == "a" * 59
