@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import ExifTags, Image, ImageDraw, ImageFont
+from PIL.JpegImagePlugin import JpegImageFile, get_sampling
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
@@ -220,6 +222,25 @@ def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
             return None
         found = picture.text.get(key)
         return None if found is None else str(found)
+
+
+def save_as(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
+    """What saving leaves of an image [H,W,3] 0..1, in the way in which a file was saved: a JPEG's quantization
+    tables and subsampling, else 8 bits. Raises ProgdfError as `open_picture` does."""
+    with _open(path) as picture:
+        lossy = isinstance(picture, JpegImageFile) and picture.mode == "RGB"
+        tables = dict(picture.quantization) if lossy else {}  # type: ignore[attr-defined]
+        sampling = get_sampling(picture) if lossy else 0
+
+    def save(image: Tensor) -> Tensor:
+        saved = to_picture(image)
+        if tables:
+            file = io.BytesIO()
+            saved.save(file, "JPEG", qtables=tables, subsampling=max(sampling, 0))
+            saved = Image.open(file)
+        return torch.from_numpy(np.asarray(saved, dtype=np.float32) / 255.0)
+
+    return save
 
 
 @contextmanager

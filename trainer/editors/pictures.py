@@ -11,32 +11,37 @@ undone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from scipy import ndimage
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
-from progdf.io.images import picture_size, read_picture
+from progdf.io.images import picture_size, read_picture, save_as
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import render
 from progdf.region import Region
-from trainer.views.view import BACKGROUND, View
+from trainer.views.view import BACKGROUND, View, seen_colors
 
 from .base import EditKind, EditorSettings
 
 MOST_PICTURES = 32
 """More are a folder of views: what a handful needs would take long."""
 
-_CLEAR, _LEAST_CLEAR = 0.98, 0.002  # transmittance of a pixel of the background; share of those that tell
+STEP = 1 / 255
+"""What 8 bits, rounded on another machine, may differ by."""
+
 _SHIFT = 2  # pixels by which a program may have moved the picture
-_STILL = 0.4  # quantile of the difference that tells how well a shift fits: much of a picture is unchanged
+STILL = 0.4  # quantile of the difference that tells how well a shift fits: much of a picture is unchanged
 _EDGE = 0.02  # of color, from pixel to pixel: the rest fits anywhere
 _BETTER = 0.8  # of the misfit as it is: noise alone makes one shift a little better than another
 _SKEWED = 0.02  # by which a picture may differ in its proportions from its camera
@@ -47,24 +52,30 @@ class PicturesEditor:
     """Reads the changed pictures; see the module's head.
 
     Args:
+        scene: the original
         files: name of the view → strength → picture
-        clear: name of the view → transmittance of the scene there. [H,W]
         stages: the strengths, ascending
     """
 
+    scene: Gaussians
     files: Mapping[str, Mapping[float, Path]]
-    clear: Mapping[str, Tensor]
     stages: tuple[float, ...]
     kind: EditKind = "color"
     confined: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
-        """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
+        """See `ImageEditor.edit`; ProgdfError where the picture is missing or broken.
+
+        What was changed is taken at the picture's own size, then shrunk: a picture shrunk differs from a render
+        that is small wherever the scene is fine.
+        """
         if strength == 0.0:
             return view.image
-        name, camera = view.camera.name, view.camera
-        picture = read_picture(self.files[name][strength], size=(camera.width, camera.height))
-        return lay_over(view.image, mend_background(picture, self.clear[name]))
+        path, camera = self.files[view.camera.name][strength], view.camera
+        original, picture = read_change(self.scene, path, camera.resize(*picture_size(path)))
+        change = (lay_over(original, picture) - original).permute(2, 0, 1)[None]
+        shrunk = interpolate(change, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
+        return (view.image + shrunk).clamp(0.0, 1.0)
 
 
 def pictures(
@@ -79,10 +90,7 @@ def pictures(
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
                 raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
     names = [view.camera.name for view in views]
-    clear = [transmittance(scene, view.camera) for view in views]
-    return PicturesEditor(
-        dict(zip(names, found, strict=True)), dict(zip(names, clear, strict=True)), tuple(stages)
-    )
+    return PicturesEditor(scene, dict(zip(names, found, strict=True)), tuple(stages))
 
 
 def picture_paths(what: str) -> tuple[Path, ...]:
@@ -130,6 +138,15 @@ def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Orig
     Raises:
         ProgdfError: none is found for one, see `find_picture_camera`, or its proportions are another's.
     """
+    sizes = [picture_size(path) for path in paths]
+    cameras = rendered_cameras(paths, given, origin)
+    return [camera.resize(*size) for camera, size in zip(cameras, sizes, strict=True)]
+
+
+def rendered_cameras(
+    paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO
+) -> list[Camera]:
+    """`picture_cameras`, at the size at which each was rendered."""
     cameras = []
     for path in paths:
         camera = find_picture_camera(path, given, origin)
@@ -139,28 +156,85 @@ def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Orig
                 f"{path} is {width}x{height} pixels, it was rendered with {camera.width}x{camera.height}; "
                 "keep the proportions, and crop nothing"
             )
-        cameras.append(camera.resize(width, height))
+        cameras.append(camera)
     return cameras
 
 
-def transmittance(scene: Gaussians, camera: Camera) -> Tensor:
-    """How much of the background shines through each pixel. [H,W] 0..1"""
+def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, Tensor]:
+    """A changed picture, and the render that it was before, over the picture's own background.
+
+    Args:
+        scene: the original
+        path: the picture
+        camera: from which it was rendered, at the size at which it was
+
+    Returns:
+        original; picture. [H,W,3] each, of the picture's own size
+
+    Raises:
+        ProgdfError: it is missing or broken.
+    """
+    picture, run = read_picture(path), torch.tensor(BACKGROUND)
+    size = (picture.shape[1], picture.shape[0])
     with torch.no_grad():
-        return render(scene, camera, BACKGROUND).transmittance
+        drawn = render(scene, camera, BACKGROUND, colors=seen_colors(scene, camera))
+    clear = drawn.transmittance[..., None]
+    background = background_of(
+        picture, resize_image(drawn.image, size), resize_image(clear, size)[..., 0], save_as(path)
+    )
+    original = resize_image((drawn.image + clear * (background - run)).clamp(0.0, 1.0), size)
+    return original, picture
 
 
-def mend_background(picture: Tensor, clear: Tensor) -> Tensor:
-    """The picture with the run's background in place of its own, which is the color of what is clear.
+def background_of(
+    picture: Tensor, original: Tensor, clear: Tensor, save: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The color behind a picture: the one that leaves least of what tells it from the render.
 
     Args:
         picture: [H,W,3]
-        clear: see `transmittance`. [H,W]
+        original: the render over the run's background, not clamped. [H,W,3]
+        clear: transmittance of the scene. [H,W]
+        save: what saving makes of an image, see `save_as`
+
+    Returns:
+        rgb. [3]; the run's own background, unless another leaves half as much where the scene is clear
     """
-    empty = clear > _CLEAR
-    if float(empty.float().mean()) < _LEAST_CLEAR:
-        return picture
-    own = picture[empty].median(dim=0).values
-    return (picture + clear[..., None] * (torch.tensor(BACKGROUND) - own)).clamp(0.0, 1.0)
+    run, weight = torch.tensor(BACKGROUND), clear.double()
+    apart = picture - original
+    shades = ((run + apart / clear[..., None].clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
+    # least Σ clear·|apart − clear·(color − run)| is the median with weights clear²
+    colors = []
+    for channel in range(3):
+        counts = torch.bincount(shades[..., channel].flatten(), weight.square().flatten(), 256).cumsum(0)
+        colors.append(int(torch.searchsorted(counts, 0.5 * counts[-1])) / 255.0)
+    color = torch.tensor(colors)
+
+    def misfit(background: Tensor) -> float:
+        left = (apart - clear[..., None] * (background - run)).abs()
+        return float((weight[..., None] * left).sum())
+
+    if misfit(color) >= 0.5 * misfit(run):
+        return run
+    # a JPEG has another color by a step, and so may have several
+    near = [color + STEP * torch.tensor(step) for step in product((0, -1, 1), repeat=3)]
+    errors = [float((save(before.expand(16, 16, 3)) - color).abs().amax()) for before in near]
+    likely = [before for before, error in zip(near, errors, strict=True) if error <= min(errors)]
+
+    def replayed(before: Tensor) -> float:
+        over = (original + clear[..., None] * (before - run)).clamp(0.0, 1.0)
+        return float((save(over) - picture).abs().mean())
+
+    return min(likely, key=replayed) if len(likely) > 1 else likely[0]
+
+
+def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Scaled to width and height as painting programs do it, by Lanczos. [H,W,C] -> [h,w,C]"""
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    channels = [Image.fromarray(channel.numpy()) for channel in image.float().unbind(2)]
+    scaled = [np.asarray(channel.resize(size, Image.Resampling.LANCZOS)) for channel in channels]
+    return torch.from_numpy(np.stack(scaled, axis=2))
 
 
 def lay_over(original: Tensor, picture: Tensor) -> Tensor:
@@ -178,8 +252,10 @@ def lay_over(original: Tensor, picture: Tensor) -> Tensor:
 
     def misfit(shift: tuple[int, int]) -> float:
         found = b[(rows - shift[0]).clip(0, height - 1), (columns - shift[1]).clip(0, width - 1)]
-        return float(np.quantile(np.abs(found - expected).max(axis=1), _STILL))
+        return float(np.quantile(np.abs(found - expected).max(axis=1), STILL))
 
+    if misfit((0, 0)) <= STEP:  # it lies where it lay
+        return picture
     errors = [misfit(shift) for shift in shifts]
     best = int(np.argmin(errors))
     if errors[best] >= _BETTER * errors[0]:

@@ -1,8 +1,8 @@
 """The region that changed pictures tell of by themselves: the Gaussians that show where they differ.
 
 A program that saves a picture changes all of it a little: JPEG's blocks, another rounding, a model that moves
-everything by a pixel. So a pixel has changed where no pixel near it in the render has its color, once the
-picture is laid over the render; specks and the gaps between them go. What is left is lifted as masks are, by
+everything by a pixel. So the render is made at the picture's own size and saved as the picture was, what else
+differs all over is measured, and a pixel has changed where it differs by more. What is left is lifted as masks are, by
 the weights with which Gaussians show there, which know what lies before what; and what the pictures leave
 open is as its own surface is.
 """
@@ -17,17 +17,19 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
-from progdf.io.images import read_picture
+from progdf.io.images import save_as
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
-from trainer.editors.pictures import lay_over, mend_background, move_image, transmittance
-from trainer.views.view import BACKGROUND, fit_size, render_view, with_near_plane
+from trainer.editors.pictures import STEP, STILL, lay_over, move_image, read_change
+from trainer.setup.training_setup import quantize_image
+from trainer.views.view import fit_size, with_near_plane
 
 from .few_masks import FEW, connected_pieces
 from .lift import HIDDEN, Evidence, bare_weight, gather, lift_evidence
@@ -37,7 +39,11 @@ LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
 
 _NEAR = 1  # pixels around a place in which the render may have its color
-_CHANGED = 0.05  # of color: more differs than noise, JPEG and another renderer bring
+_CHANGED = (
+    0.05  # of color: where nothing is known of how a picture was saved, and beside what differs by more
+)
+_BLOCK = 17  # pixels, a JPEG's block with half the colors, and its middle
+_SOFT = 8  # pixels of a soft rim, where masks are lifted
 _SPECK, _GAP = 2, 5  # pixels: what is narrower is none; what is wider than a gap is not closed
 _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
 _LEAST = 0.5  # of a member's visible share lies where the pictures differ
@@ -61,19 +67,19 @@ def changed_region(
     Args:
         scene: the original
         paths: the changed pictures
-        cameras: theirs, at their size
+        cameras: theirs, at the size at which they were rendered
         threshold: least share of a member's visible weight that has to lie there; None: half
         say: hears in a line each what was found
 
     Raises:
         ProgdfError: a picture cannot be read, or they differ nowhere.
     """
-    small = with_near_plane([fit_size(camera, LIFTED_AT) for camera in cameras], scene)
-    masks = []
-    for path, camera in zip(paths, small, strict=True):
-        picture = read_picture(path, size=(camera.width, camera.height))
-        original = render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
-        masks.append(find_change(original, mend_background(picture, transmittance(scene, camera))))
+    cameras = with_near_plane(cameras, scene)
+    masks, small = [], []
+    for path, camera in zip(paths, cameras, strict=True):
+        change = find_change(*read_change(scene, path, camera), save_as(path))
+        small.append(fit_size(camera.resize(change.shape[1], change.shape[0]), LIFTED_AT))
+        masks.append(_close_gaps(_shrink_mask(change, small[-1])))
     if not any(bool(mask.any()) for mask in masks):
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
@@ -99,24 +105,96 @@ def changed_region(
     return region
 
 
-def find_change(original: Tensor, picture: Tensor) -> Tensor:
-    """Where a picture differs from the render, cleaned of noise. [H,W,3], [H,W,3] -> [H,W] bool"""
-    a, b = (
-        ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, lay_over(original, picture))
-    )
-    around = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]
-    apart = np.min([np.abs(move_image(a, shift) - b).max(axis=2) for shift in around], axis=0)
-    changed = ndimage.binary_opening(apart > _CHANGED, np.ones((_SPECK, _SPECK)))
-    changed = ndimage.binary_closing(changed, np.ones((_GAP, _GAP)), border_value=0) | changed
-    holes = ndimage.binary_fill_holes(changed) & ~changed
+def find_change(
+    original: Tensor, picture: Tensor, save: Callable[[Tensor], Tensor] = quantize_image
+) -> Tensor:
+    """Where a picture was painted on: where it differs by more than it does unpainted.
+
+    What saving does is known: the render is saved in the same way, and with what was painted laid on it, and a
+    pixel has changed that differs by more than is so lost within a block. A picture to which more happened,
+    which is measured, is compared with what is near each pixel.
+
+    Args:
+        original: the render. [H,W,3]
+        picture: [H,W,3]
+        save: what saving makes of an image, see `save_as`
+
+    Returns:
+        [H,W] bool
+    """
+    a, b, saved = original.numpy(), lay_over(original, picture).numpy(), save(original).numpy()
+    exact = quantize_image(original).numpy()
+    # what saving does within a block of it, and what else came
+    bound = np.maximum(_around(np.abs(_smooth(saved - exact))), STEP)
+    apart = np.abs(_smooth(b - exact))
+    over = apart > bound
+    if not over.any():
+        return torch.zeros(over.shape[:2], dtype=torch.bool)
+    # paint brings noise of its own: half of what differs most nearby is paint, less may be what it rings with
+    painted = (over & (apart >= 0.5 * _around(apart))).any(axis=2)[..., None]
+    laid_on = np.where(painted, b, exact)
+    bound = np.maximum(bound, _around(np.abs(_smooth(save(torch.from_numpy(laid_on)).numpy() - laid_on))))
+    # beside strong paint what differs a little is its soft rim
+    scale = max(1.0, max(over.shape[:2]) / LIFTED_AT)
+    rim, speck = 1 + 2 * round(_SOFT * scale), np.ones((round(_SPECK * scale),) * 2)
+    bound = np.maximum(bound, np.minimum(_CHANGED, 0.5 * _around(apart.max(axis=2, keepdims=True), rim)))
+    changed = (apart > bound).any(axis=2) & (np.abs(b - exact) > STEP).any(axis=2)
+    if _moved_or_noisy(b - saved, a):
+        smooth_a, smooth_b = _smooth(a), _smooth(b)
+        shifts = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]
+        apart = np.min([np.abs(move_image(smooth_a, shift) - smooth_b) for shift in shifts], axis=0)
+        changed = ndimage.binary_opening((apart > np.maximum(bound, _CHANGED)).any(axis=2), speck)
+        # what is compared with its surroundings ends a pixel early
+        return torch.from_numpy(ndimage.binary_dilation(changed, np.ones((3, 3))))
+    pieces, count = ndimage.label(ndimage.binary_opening(changed, speck))
+    numbers = np.arange(count + 1)
+    # another engine, or another program's JPEG, is off by a little in a place or two of a block's size
+    large = np.bincount(pieces.ravel(), minlength=count + 1) > _BLOCK**2
+    kept = large | (np.asarray(ndimage.maximum(apart.max(axis=2), pieces, numbers)) > _CHANGED)
+    kept[0] = False
+    return torch.from_numpy(kept[pieces])
+
+
+def _moved_or_noisy(apart: np.ndarray, original: np.ndarray) -> bool:
+    """Whether more happened to a picture than was painted: its noise, what pixels differ by from their
+    neighbors, is more than a step in most of what is busy. [H,W,3] each"""
+    busy = (_around(original) + _around(-original)).max(axis=2)
+    fine = np.abs(apart - _smooth(apart)).max(axis=2)
+    rows = busy > STEP
+    rows &= busy >= np.median(busy[rows], axis=None) if rows.any() else False
+    return bool(rows.any() and np.quantile(fine[rows], STILL) > STEP)
+
+
+def _smooth(image: np.ndarray) -> np.ndarray:
+    """The mean of 3×3 pixels. [H,W,3]"""
+    smooth: np.ndarray = ndimage.uniform_filter(image, (3, 3, 1))
+    return smooth
+
+
+def _around(apart: np.ndarray, pixels: int = _BLOCK) -> np.ndarray:
+    """The largest of so many pixels around. [H,W,C]"""
+    largest: np.ndarray = ndimage.maximum_filter(apart, (pixels, pixels, 1))
+    return largest
+
+
+def _shrink_mask(changed: Tensor, camera: Camera) -> Tensor:
+    """Which of a camera's pixels have changed by half or more. [H,W] bool -> [h,w] bool"""
+    share = interpolate(changed[None, None].float(), size=(camera.height, camera.width), mode="area")[0, 0]
+    return share >= 0.5
+
+
+def _close_gaps(changed: Tensor) -> Tensor:
+    """What has changed without its gaps and small holes. [H,W] bool"""
+    mask = changed.numpy()
+    mask = ndimage.binary_closing(mask, np.ones((_GAP, _GAP)), border_value=0) | mask
+    holes = ndimage.binary_fill_holes(mask) & ~mask
     pieces, count = ndimage.label(holes)
     if count:
         sizes = np.bincount(pieces.ravel())
-        small = sizes <= _HOLE * changed.size
+        small = sizes <= _HOLE * mask.size
         small[0] = False
-        changed |= small[pieces]
-    # what is compared with its surroundings ends a pixel early
-    return torch.from_numpy(ndimage.binary_dilation(changed, np.ones((3, 3))))
+        mask |= small[pieces]
+    return torch.from_numpy(mask)
 
 
 def _drop_strays(scene: Gaussians, region: Region, evidence: Evidence, inner: Tensor, least: float) -> Region:

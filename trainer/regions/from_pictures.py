@@ -23,7 +23,7 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import Check, Kind
 from progdf.scene.up_axis import UpChoice, find_up
 from trainer.editors.cache import KeptPictures, Recipe
-from trainer.editors.pictures import picture_cameras, picture_paths
+from trainer.editors.pictures import picture_paths, rendered_cameras
 from trainer.options import LiftRule
 from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
 from trainer.segmenters.folder import read_masks
@@ -151,7 +151,7 @@ def _changed_pictures(
                 "without them, or name the region with --region"
             )
     given = [] if settings.cameras is None else load_cameras(settings.cameras, origin)
-    return paths, picture_cameras(paths, given, origin)
+    return paths, rendered_cameras(paths, given, origin)
 
 
 def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, Path]:

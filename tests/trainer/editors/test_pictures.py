@@ -14,11 +14,13 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk
+from progdf.rasterize import render
 from progdf.region import whole_scene
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import ball
 from trainer.editors import EditorSettings, check_new_editor, make_editor
-from trainer.editors.pictures import mend_background, picture_cameras, picture_paths, transmittance
+from trainer.editors.pictures import background_of, picture_cameras, picture_paths
+from trainer.setup.training_setup import quantize_image
 from trainer.views.view import View, make_view, render_view
 
 WHITE = torch.ones(3)
@@ -52,19 +54,19 @@ def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
     assert float((editor.edit(view, 1.0) - expected)[inside].abs().max()) < 0.01
 
 
-def test_a_background_of_another_color_is_taken_for_the_run_s() -> None:
-    scene = ball()
-    camera = looking(scene)[0]
-    clear = transmittance(scene, camera)
-    for color in ([0.0, 0.0, 0.0], [0.1, 0.3, 0.8]):
-        picture = render_view(scene, camera, torch.tensor(color)).clamp(0, 1)
-        white = render_view(scene, camera, WHITE).clamp(0, 1)
-        assert float((mend_background(picture, clear) - white).abs().max()) < 0.01
+@pytest.mark.parametrize("color", [[0.0, 0.0, 0.0], [0.1, 0.3, 0.8]])
+def test_a_background_of_another_color_is_found(color: list[float]) -> None:
+    scene, background = ball(), torch.tensor(color)
+    drawn = render(scene, looking(scene)[0])
+    picture = quantize_image(drawn.image + drawn.transmittance[..., None] * (background - 1))
+    picture[:12] = torch.tensor([0.9, 0.1, 0.2])  # a quarter of it painted over
+    found = background_of(picture, drawn.image, drawn.transmittance, quantize_image)
+    assert float((found - background).abs().max()) <= 0.51 / 255
 
 
-def test_a_picture_without_any_background_stays_as_it_is() -> None:
-    picture = torch.rand(8, 8, 3)
-    assert torch.equal(mend_background(picture, torch.zeros(8, 8)), picture)
+def test_a_picture_without_any_background_has_the_run_s() -> None:
+    picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(background_of(picture, picture.flip(0), torch.zeros(8, 8), quantize_image), WHITE)
 
 
 def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
