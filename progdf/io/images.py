@@ -225,8 +225,8 @@ def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
 
 
 def save_as(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
-    """What saving leaves of an image [H,W,3] 0..1, in the way in which a file was saved: a JPEG's quantization
-    tables and subsampling, else 8 bits. Raises ProgdfError as `open_picture` does."""
+    """What saving leaves of an image [H,W,3] 0..1, in the way in which a file was saved: by a JPEG's tables
+    and subsampling, else in 8 bits. Raises ProgdfError as `open_picture` does."""
     with _open(path) as picture:
         lossy = isinstance(picture, JpegImageFile) and picture.mode == "RGB"
         tables = dict(picture.quantization) if lossy else {}  # type: ignore[attr-defined]

@@ -66,8 +66,8 @@ class PicturesEditor:
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`; ProgdfError where the picture is missing or broken.
 
-        What was changed is taken at the picture's own size, then shrunk: a picture shrunk differs from a render
-        that is small wherever the scene is fine.
+        What was changed is taken at the picture's own size, then shrunk: a picture that is shrunk differs
+        from a small render wherever the scene is fine.
         """
         if strength == 0.0:
             return view.image

@@ -27,7 +27,7 @@ from progdf.rasterize.color_maps import ColorMap
 from progdf.sh import C0, sh0_to_rgb
 from progdf.torch_threads import one_thread
 from trainer.regions.lift import HIDDEN, bare_weight
-from trainer.regions.surface import surface_likeness
+from trainer.regions.surface import covered_rows, surface_likeness
 from trainer.views.crops import CropScene
 
 from .color_solver import ColorView, color_columns, color_view
@@ -270,7 +270,8 @@ def make_picture_solver(
     return PictureSolver(
         views,
         shown,
-        _laplacian(scene[members]) * (_TIES * typical),
+        _laplacian(scene[members], covered_rows(scene, [crop.camera for crop in crops])[members])
+        * (_TIES * typical),
         max(_RIDGE * typical, 1e-12),
         sh0_to_rgb(region.sh0).double(),
         region.shN[:, :bands].double(),
@@ -353,12 +354,13 @@ def _weights_of(weighed: ColorMap) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(squares), torch.from_numpy(mean)
 
 
-def _laplacian(region: Gaussians) -> csr_matrix:
-    """Of the graph of neighbors on one surface, each with ties of 1 on the mean. [M,M]"""
+def _laplacian(region: Gaussians, covered: Tensor) -> csr_matrix:
+    """Of the graph of neighbors on one surface, each with ties of 1 on the mean, none through what covers a
+    member. [M,M]"""
     count = len(region)
     if count < 3:
         return csr_matrix((count, count))
-    near, likeness = surface_likeness(region, torch.arange(count))
+    near, likeness = surface_likeness(region, torch.arange(count), covered)
     kept = (likeness >= _WEAKEST_TIE).numpy()
     rows = np.repeat(np.arange(count), kept.sum(axis=1))
     ties = csr_matrix((likeness.double().numpy()[kept], (rows, near.numpy()[kept])), (count, count))

@@ -2,9 +2,9 @@
 
 A program that saves a picture changes all of it a little: JPEG's blocks, another rounding, a model that moves
 everything by a pixel. So the render is made at the picture's own size and saved as the picture was, what else
-differs all over is measured, and a pixel has changed where it differs by more. What is left is lifted as masks are, by
-the weights with which Gaussians show there, which know what lies before what; and what the pictures leave
-open is as its own surface is.
+differs all over is measured, and a pixel has changed where it differs by more. What is left is lifted as
+masks are, by the weights with which Gaussians show there, which know what lies before what; and what the
+pictures leave open is as its own surface is, never as what covers it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from trainer.views.view import fit_size, with_near_plane
 
 from .few_masks import FEW, connected_pieces
 from .lift import HIDDEN, Evidence, bare_weight, gather, lift_evidence
-from .surface import SurfaceVote
+from .surface import SurfaceVote, covered_rows
 
 LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted: smaller shows less of small Gaussians."""
@@ -47,6 +47,7 @@ _SOFT = 8  # pixels of a soft rim, where masks are lifted
 _SPECK, _GAP = 2, 5  # pixels: what is narrower is none; what is wider than a gap is not closed
 _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
 _LEAST = 0.5  # of a member's visible share lies where the pictures differ
+_BARELY = 0.5  # clearness: more than half of what shows there is what covers it
 _RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thinner
 _INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
 _AT_RIM = 0.3  # of a member's visible share lies along the rim: its surface decides
@@ -83,13 +84,15 @@ def changed_region(
     if not any(bool(mask.any()) for mask in masks):
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
-    evidence, surface_vote = gather(scene, small, masks), SurfaceVote(scene)
+    covered = covered_rows(scene, small)
+    evidence, surface_vote = gather(scene, small, masks), SurfaceVote(scene, covered)
+    covered &= evidence.clearness < _BARELY
     inner = torch.zeros(len(scene), dtype=torch.float64)  # of a member's contribution, what lies off the rims
     for camera, mask in zip(small, masks, strict=True):
         inner += alpha_weights(scene, camera, _within_rim(mask))[:, 0]
     few = 2 <= len(masks) <= FEW
     found = lift_evidence(scene, evidence, surface_vote, "changed", "share", least, few)
-    found = _vote_on_rim(found, evidence, inner, surface_vote, least)
+    found = _vote_on_rim(found, evidence, inner, covered, surface_vote, least)
     region = _drop_strays(scene, found, evidence, inner, least)
     if not len(region):
         raise ProgdfError(
@@ -110,8 +113,8 @@ def find_change(
 ) -> Tensor:
     """Where a picture was painted on: where it differs by more than it does unpainted.
 
-    What saving does is known: the render is saved in the same way, and with what was painted laid on it, and a
-    pixel has changed that differs by more than is so lost within a block. A picture to which more happened,
+    What saving does is known: the render is saved in the same way, and with what was painted laid on it; a
+    pixel has changed that differs by more than is lost so within a block. A picture to which more happened,
     which is measured, is compared with what is near each pixel.
 
     Args:
@@ -178,9 +181,9 @@ def _around(apart: np.ndarray, pixels: int = _BLOCK) -> np.ndarray:
 
 
 def _shrink_mask(changed: Tensor, camera: Camera) -> Tensor:
-    """Which of a camera's pixels have changed by half or more. [H,W] bool -> [h,w] bool"""
+    """Which of a camera's pixels have changed anywhere: a rim is expected, see `_RIM`. [H,W] -> [h,w] bool"""
     share = interpolate(changed[None, None].float(), size=(camera.height, camera.width), mode="area")[0, 0]
-    return share >= 0.5
+    return share > 0.0
 
 
 def _close_gaps(changed: Tensor) -> Tensor:
@@ -221,16 +224,22 @@ def _drop_strays(scene: Gaussians, region: Region, evidence: Evidence, inner: Te
 
 
 def _vote_on_rim(
-    region: Region, evidence: Evidence, inner: Tensor, surface_vote: SurfaceVote, least: float
+    region: Region,
+    evidence: Evidence,
+    inner: Tensor,
+    covered: Tensor,
+    surface_vote: SurfaceVote,
+    least: float,
 ) -> Region:
-    """The region, with what shows along the rim of a change, or not at all, as its own surface is inside it.
+    """The region, with what shows along the rim of a change, through what covers it, or not at all, as its
+    own surface is inside it.
 
     A mask is a pixel or two too wide, and a Gaussian that something changed all but hides shows there alone:
     it would hand its membership on to all that is hidden of its surface.
     """
     member = torch.zeros_like(inner, dtype=torch.bool).index_fill(0, region.members, True)
     at_rim = evidence.inside - inner > _AT_RIM * evidence.weight
-    doubtful = _hidden(evidence) | member & at_rim
+    doubtful = _hidden(evidence) | covered | member & at_rim
     if not bool((member & ~doubtful).any()):
         return region
     rows = doubtful.nonzero()[:, 0]

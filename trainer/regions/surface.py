@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.rasterize import render
 from progdf.rasterize.cpu.parallel import threads
-from progdf.scene.bounds import normals_of
+from progdf.rasterize.reference import rotation_matrices
+from progdf.scene.bounds import normals_of, scene_sphere
 from progdf.scene.neighbors import nearest_rows
 from progdf.sh import sh0_to_rgb
 
@@ -25,6 +30,8 @@ _NEAR = 8  # the distance to this neighbor is the unit of the next two
 _ALONG, _OFF_PLANE = 2.0, 0.5
 _TURN = 0.18  # radians between the normals
 _COLOR = 0.16  # sRGB, length of the difference
+_FLOAT32 = 1e-6  # of squares of about 1, summed over a pixel
+_THICK = 3.0  # standard deviations: nearly all of a surface
 _SIZE = 0.25  # natural logarithm of the three scales, length of the difference
 
 
@@ -40,10 +47,11 @@ class SurfaceVote:
 
     Args:
         scene: N Gaussians
+        covered: see `covered_rows`; through what covers them these have no neighbors
     """
 
-    def __init__(self, scene: Gaussians) -> None:
-        self._scene = scene
+    def __init__(self, scene: Gaussians, covered: Tensor | None = None) -> None:
+        self._scene, self._covered = scene, covered
         self._known = torch.zeros(len(scene), dtype=torch.bool)
         self._ties = csr_matrix((len(scene), len(scene)), dtype=np.float32)
 
@@ -58,7 +66,7 @@ class SurfaceVote:
             −1 none does .. 1 all do, 0 where no decided Gaussian is in reach. [U]
         """
         for rows in torch.split(undecided[~self._known[undecided]], _AT_ONCE):
-            near, likeness = surface_likeness(self._scene, rows)
+            near, likeness = surface_likeness(self._scene, rows, self._covered)
             kept = (likeness >= _WEAKEST).numpy()
             of = np.repeat(rows.numpy(), kept.sum(axis=1))
             self._ties += csr_matrix((likeness.numpy()[kept], (of, near.numpy()[kept])), self._ties.shape)
@@ -70,26 +78,84 @@ class SurfaceVote:
         return torch.from_numpy(vote[open_])
 
 
-def surface_likeness(scene: Gaussians, rows: Tensor) -> tuple[Tensor, Tensor]:
+def surface_likeness(scene: Gaussians, rows: Tensor, covered: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The nearest others of some Gaussians [Q,k] int64, and how likely each lies on the same surface [Q,k].
 
-    The likelihoods of each add up to 1; see `SurfaceVote` for what they go by.
+    The likelihoods of each add up to 1, or less where it is cut off from others; see `SurfaceVote` for what
+    they go by. `covered`: see `covered_rows`. [N] bool
     """
     near, distances = nearest_rows(scene.means, rows, _NEIGHBORS, threads())
-    return near, _likeness(scene, rows, near, distances.float())
+    likeness = _likeness(scene, rows, near, distances.float())
+    if covered is not None and bool(covered.any()):
+        across = covered[rows, None] != covered[near]
+        likeness = likeness.masked_fill(across & ~_goes_on(scene, rows, near, distances.float()), 0.0)
+    return near, likeness
+
+
+def covered_rows(scene: Gaussians, cameras: Sequence[Camera]) -> Tensor:
+    """Which Gaussians lie behind a surface in every picture in which they would be. [N] bool
+
+    Behind is what lies deeper than the surface is thick: farther off what its pixel shows than three standard
+    deviations of the centers of that, and of the Gaussian itself, in that direction.
+    """
+    covered, uncovered = torch.zeros(len(scene), dtype=torch.bool), torch.zeros(len(scene), dtype=torch.bool)
+    center, radius = scene_sphere(scene)
+    means = (scene.means - center) / radius  # of about 1, so that float32 can tell squares apart
+    axes = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :] / radius
+    pairs = torch.tensor([[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+    squares = means[:, pairs[0]] * means[:, pairs[1]]
+    for camera in cameras:
+        points = scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        x, y, depth = (points @ camera.K.T).unbind(1)
+        x, y = (x / depth).floor(), (y / depth).floor()
+        framed = (depth > camera.near) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        rows = framed.nonzero()[:, 0]
+        at = (y[rows].long(), x[rows].long())
+        with torch.no_grad():
+            drawn = [
+                render(scene, camera, (0.0, 0.0, 0.0), colors=colors.contiguous())
+                for colors in (means, squares[:, :3], squares[:, 3:])
+            ]
+        alpha = 1.0 - drawn[0].transmittance[at]
+        shown, *products = (found.image[at] / alpha.clamp_min(1e-6)[:, None] for found in drawn)
+        moments = means.new_zeros(len(rows), 3, 3)
+        moments[:, pairs[0], pairs[1]] = torch.cat(products, dim=1)
+        moments[:, pairs[1], pairs[0]] = torch.cat(products, dim=1)
+        spread = moments - shown[:, :, None] * shown[:, None, :] + axes[rows] @ axes[rows].transpose(1, 2)
+        spread += _FLOAT32 * torch.eye(3)
+        off = means[rows] - shown
+        deviations = (off * torch.linalg.solve(spread, off)).sum(dim=1)  # squared
+        behind = (deviations > _THICK**2) & (off @ camera.viewmat[2, :3] > 0) & (alpha > 0.5)
+        covered[rows[behind]] = True
+        uncovered[rows[~behind]] = True
+    return covered & ~uncovered
+
+
+def _goes_on(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
+    """Whether a surface may lead from one to the other: they lie off each other's planes by no more than an
+    arc does that turns as they do, and than they are thick. [Q,k] bool"""
+    off_plane, cosine = _off_plane(scene, rows, near)
+    thick = scene.scales.amin(dim=1)
+    arc = distances * ((1 - cosine) / 2).clamp_min(0.0).sqrt()  # of a chord: times the sine of half the turn
+    return off_plane <= arc + _THICK * torch.maximum(thick[rows, None], thick[near])
+
+
+def _off_plane(scene: Gaussians, rows: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """How far neighbors lie off each other's planes, world units, and the cosine between these. [Q,k] each"""
+    normals = normals_of(scene)
+    across = scene.means[near] - scene.means[rows, None]
+    off_plane = torch.maximum(
+        (across * normals[rows, None]).sum(dim=2).abs(), (across * normals[near]).sum(dim=2).abs()
+    )
+    return off_plane, (normals[rows, None] * normals[near]).sum(dim=2).abs()
 
 
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
     """How likely each neighbor is of the same surface; sums to 1. [Q,k]"""
     unit = distances[:, min(_NEAR, distances.shape[1]) - 1, None].clamp_min(1e-12)
-    normals, colors = normals_of(scene), sh0_to_rgb(scene.sh0)
-    sizes = scene.log_scales.sort(dim=1).values
-    across = scene.means[near] - scene.means[rows, None]
-    off_plane = torch.maximum(
-        (across * normals[rows, None]).sum(dim=2).abs(), (across * normals[near]).sum(dim=2).abs()
-    )
-    # 1 − cos is half the angle squared
-    turned = (2 - 2 * (normals[rows, None] * normals[near]).sum(dim=2).abs()).clamp_min(0.0)
+    colors, sizes = sh0_to_rgb(scene.sh0), scene.log_scales.sort(dim=1).values
+    off_plane, cosine = _off_plane(scene, rows, near)
+    turned = (2 - 2 * cosine).clamp_min(0.0)  # 1 − cos is half the angle squared
     unlike = (
         (distances / (_ALONG * unit)) ** 2
         + (off_plane / (_OFF_PLANE * unit)) ** 2

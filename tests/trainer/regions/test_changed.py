@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,20 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians, pack
 from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.region_spec import check_region, parse_region
+from progdf.sh import rgb_to_sh0
 from tests.helpers.trained import small
 from trainer.editors import make_editor
+from trainer.optimize.picture_solver import make_picture_solver
 from trainer.regions.changed import find_change
 from trainer.regions.from_pictures import RegionSettings, region_checks, region_kinds
+from trainer.views.crops import crop_scene
+from trainer.views.view import crop, make_view, render_view
 
 
 def settings(pictures: list[Path], folder: Path) -> RegionSettings:
@@ -109,3 +116,55 @@ def test_noise_and_a_shift_are_no_change(how: str) -> None:
     truth[35:50, 40:60] = True
     assert float((found & truth).sum() / (found | truth).sum()) > 0.45  # rims of a pixel or two
     assert bool(found[36:49, 41:59].all())
+
+
+def two_sheets(gap: float, side: int = 26) -> Gaussians:
+    """A square sheet of thin splats of one color across z = 0, and the same `gap` behind it; radius 1."""
+    rng = np.random.default_rng(0)
+    line = np.linspace(-0.75, 0.75, side)
+    plan = np.stack(np.meshgrid(line, line), axis=2).reshape(-1, 2) + rng.normal(0, 0.004, (side**2, 2))
+    means = np.concatenate([np.insert(plan, 2, z, axis=1) for z in (0.0, gap)])
+    colors = np.array([0.6, 0.5, 0.4]) + rng.normal(0, 0.02, means.shape)
+    count = len(means)
+    return Gaussians(
+        torch.from_numpy(means).float(),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        torch.tensor([0.06, 0.06, 0.001]).log().repeat(count, 1),
+        torch.full((count,), 6.0),
+        rgb_to_sh0(torch.from_numpy(colors).float()),
+        torch.zeros(count, 0, 3),
+    )
+
+
+def seen_from(z: float, size: int = 160) -> Camera:
+    viewmat = look_at(torch.tensor([0.3, -0.2, z]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
+    return Camera(viewmat, intrinsics(0.6, size, size), size, size)
+
+
+@pytest.mark.parametrize("region", ["changed", "all"])
+@pytest.mark.parametrize("gap", [0.01, 0.05, 0.2])
+def test_what_is_painted_on_a_thin_thing_s_front_does_not_show_from_behind(
+    tmp_path: Path, gap: float, region: str
+) -> None:
+    scene, camera = two_sheets(gap), seen_from(-3.0)
+    painted = render_view(scene, camera, torch.ones(3)).clamp(0, 1)
+    rows, columns = np.mgrid[:160, :160]
+    patch = (abs(rows - 80) < 30) & (abs(columns - 80) < 30)
+    painted[torch.from_numpy(patch & ((rows // 20 + columns // 20) % 2 == 0))] *= torch.tensor(
+        [0.2, 0.4, 1.0]
+    )
+    path = tmp_path / "A.png"
+    to_picture(painted).save(path, pnginfo=camera_chunk(camera))
+    found = parse_region(region, scene, kinds=region_kinds(settings([path], tmp_path)))
+    members, view = found.members, make_view(scene, found, camera, torch.ones(3))
+    crops = [crop_scene(scene, members, camera, view.box, torch.ones(3), still=True)]
+    solver = make_picture_solver(scene, members, crops, pack(scene[members], with_shN=False), True)
+    offsets = solver.solve([crop(painted, view.box)], torch.zeros(len(members), 1, 3))
+    edited = replace(scene, sh0=scene.sh0.index_add(0, members, offsets[:, 0]))
+
+    def change(z: float) -> float:
+        before, after = (render_view(some, seen_from(z), torch.ones(3)) for some in (scene, edited))
+        return float((after - before)[40:120, 40:120].abs().max())  # the front shows past the back's soft rim
+
+    assert change(-3.0) > 0.2
+    assert change(3.0) < 1 / 255
