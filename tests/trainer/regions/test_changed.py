@@ -137,7 +137,8 @@ def two_sheets(gap: float, side: int = 26) -> Gaussians:
 
 
 def seen_from(z: float, size: int = 160) -> Camera:
-    viewmat = look_at(torch.tensor([0.3, -0.2, z]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
+    # straight: splats are drawn by the depth of their centers, which mixes near sheets that are seen aslant
+    viewmat = look_at(torch.tensor([0.0, 0.0, z]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     return Camera(viewmat, intrinsics(0.6, size, size), size, size)
 
 
@@ -164,7 +165,7 @@ def test_what_is_painted_on_a_thin_thing_s_front_does_not_show_from_behind(
 
     def change(z: float) -> float:
         before, after = (render_view(some, seen_from(z), torch.ones(3)) for some in (scene, edited))
-        return float((after - before)[40:120, 40:120].abs().max())  # the front shows past the back's soft rim
+        return float((after - before).abs()[40:120, 40:120].max())  # the rims are soft
 
     assert change(-3.0) > 0.2
     assert change(3.0) < 1 / 255
