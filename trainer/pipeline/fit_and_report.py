@@ -26,7 +26,7 @@ from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
 from trainer.optimize.settings import resolve_slider
 from trainer.pipeline.record import RunRecord
-from trainer.report.measures import clip_curve, expected_measures, figures, measure
+from trainer.report.measures import clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.progress import RunLog
@@ -142,6 +142,10 @@ def finish_run(
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{plan.name}: {editor}"
         picture = report_picture(evaluator, measured, record.losses, title, len(setup.held_out))
+    paint = None
+    if plan.views.pictures:
+        pictures = read_views(folder, "edited", [view.camera.name for view in setup.train], 1.0)
+        paint = measure_paint(setup, pictures, end_rows(setup, trajectory))
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -168,6 +172,7 @@ def finish_run(
         "kind_trial": record.kind_trial,
         "agreement": record.agreement,
         "followed": record.followed,
+        "paint": paint.figures() if paint is not None else None,
         "up": record.up,
         "time": {**(_earlier_figures(folder, "time") if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.memory.peak(),
@@ -197,6 +202,8 @@ def finish_run(
         f"wrote {folder.gdf(plan.name)}: {file_size(size)}, "
         f"{size / max(1, len(region)):.0f} bytes per Gaussian with all that is in it"
     )
+    if paint is not None and paint.warning:
+        log.say(f"warning: {paint.warning}")
     return RunResult(folder, folder.gdf(plan.name), report, shown)
 
 

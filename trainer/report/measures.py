@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -13,12 +13,15 @@ from progdf.field import BakedField
 from progdf.field.evaluate import sample_strengths
 from progdf.field.remap import SliderRemap
 from progdf.field.trajectory import Trajectory
+from progdf.formats.load_report import format_count, group_digits
 from progdf.metrics.slider import SliderStatistics, slider_statistics
+from progdf.rasterize import alpha_weights
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
 from trainer.report.curves import ErrorCurve, against_editor, error_curves
-from trainer.views.view import View
+from trainer.setup.training_setup import TrainingSetup
+from trainer.views.view import View, render_view
 
 from .clip import CLIP_MODEL, Clip, Texts, direction, load_clip, same_features
 
@@ -26,6 +29,7 @@ COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
 
 _EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
+_ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
 _NODES = 6  # recordings at which the field is looked at
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
 
@@ -238,3 +242,65 @@ def _to_lists(course: ErrorCurve) -> dict[str, list[float]]:
 
 def _four(value: float) -> float:
     return round(value, 4)
+
+
+@dataclass(frozen=True)
+class PaintTaken:
+    """How much of what was painted on pictures is in the edit."""
+
+    reached: float  # share of the painted change's energy, 0..1
+    pixels: int  # that were painted
+    members: int  # that mostly show in these
+    removes: bool  # whether the scene without the members is nearer to the picture than the edit is
+
+    @property
+    def warning(self) -> str:
+        """One line that says how little it is, and why; "" where at least half of the contrast is there.
+
+        Half of the contrast is three quarters of the energy.
+        """
+        if self.reached >= 0.75 or not self.pixels:
+            return ""
+        reasons = []
+        if self.removes:
+            reasons.append(
+                "the painting covers things with what lies behind them: nothing is removed by painting"
+            )
+        if self.members < self.pixels:
+            stand = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"
+            reasons.append(f"{stand}; the detail is finer than they are")
+        share = f"{100 * self.reached:.0f} % of what was painted is in the edit"
+        return f"{share}: {'; '.join(reasons)}" if reasons else share
+
+    def figures(self) -> dict[str, Any]:
+        """What report.json says of it."""
+        return {**asdict(self), "reached": _four(self.reached), "warning": self.warning}
+
+
+def measure_paint(setup: TrainingSetup, painted: Sequence[Tensor], rows: Tensor) -> PaintTaken:
+    """Compare the edit with the pictures that it was made of.
+
+    Args:
+        setup: scene, region, and the pictures' views
+        painted: the views as they were painted. [H,W,3] each
+        rows: raw member rows of the edit, packed. [M,C]
+    """
+    scene, members = setup.scene, setup.region.members
+    edited = scene.replace_rows(members, rows)
+    others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, members, False)
+    without = scene[others.nonzero()[:, 0]]
+    change = missing = behind = 0.0
+    pixels, weights = 0, torch.zeros(len(scene), 2, dtype=torch.float64)
+    for view, target in zip(setup.train, painted, strict=True):
+        touched = (target - view.image).abs().amax(dim=2) > _ROUNDED
+        made, gone = (
+            render_view(some, view.camera, setup.background).clamp(0.0, 1.0) for some in (edited, without)
+        )
+        change += float((target - view.image)[touched].square().sum())
+        missing += float((target - made)[touched].square().sum())
+        behind += float((target - gone)[touched].square().sum())
+        pixels += int(touched.sum())
+        weights += alpha_weights(scene, view.camera, touched)[:, (0, 2)]
+    inside, weight = weights[members].unbind(1)
+    shown = int((inside > 0.5 * weight).sum())
+    return PaintTaken(max(0.0, 1.0 - missing / max(change, 1e-12)), pixels, shown, behind < missing)

@@ -24,7 +24,7 @@ from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.io.atomic import atomic_write, make_folder
+from progdf.io.atomic import atomic_write, make_folder, read_file
 from progdf.io.json_values import read_json
 from progdf.io.locks import LOCK, LockedError, hold_lock, is_locked
 from progdf.io.tensors import read_tensors
@@ -46,6 +46,18 @@ class _Said(msgspec.Struct):
     seconds: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # of all sessions of the run
 
 
+class _Paint(msgspec.Struct):
+    """Of a run on painted pictures: why little of the paint is in the edit, "" if enough is."""
+
+    warning: str = ""
+
+
+class _Report(msgspec.Struct):
+    """What a finished run says of itself, RUN/report.json."""
+
+    paint: _Paint | None = None
+
+
 class _Order(msgspec.Struct):
     """`NAME.train.json`"""
 
@@ -55,6 +67,15 @@ class _Order(msgspec.Struct):
     editor: str
     quick: bool
     threads: int = 0
+
+
+def warning_of(order: EditOrder) -> str:
+    """What a finished run warns of, "" if of nothing."""
+    try:
+        report = msgspec.json.decode(read_file(order.out / "report.json", 1 << 24), type=_Report)
+    except (ProgdfError, OSError, ValueError, RecursionError):
+        return ""
+    return report.paint.warning if report.paint is not None else ""
 
 
 def edits_folder(scene: Path, memory: Path | None = None) -> Path:

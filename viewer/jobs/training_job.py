@@ -107,6 +107,7 @@ class TrainingJob:
         progress: how far it is
         seconds: that it has run, in this session of it
         error: the one line of a failure
+        warning: the one line of a run that came out poor
         resumes: whether it goes on with what was stopped
         began_at: share that was done when this session of it began
         starved: other programs keep the processor
@@ -119,6 +120,7 @@ class TrainingJob:
     progress: Progress = field(default_factory=Progress)
     seconds: float = 0.0
     error: str = ""
+    warning: str = ""
     resumes: bool = False
     began_at: float = 0.0
     starved: bool = False

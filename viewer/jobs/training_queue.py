@@ -190,7 +190,8 @@ class TrainingQueue:
         if stopped or job.status != "stopping":  # else it is discarded first
             self._release(job)
         if status == 0 and job.order.gdf.is_file():
-            return self._change(replace(job, status="done", progress=Progress(1.0)))
+            warning = run_files.warning_of(job.order)
+            return self._change(replace(job, status="done", progress=Progress(1.0), warning=warning))
         if job.status == "stopping":
             if not stopped:  # nothing was done yet
                 with suppress(ProgdfError):

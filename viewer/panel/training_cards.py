@@ -21,7 +21,7 @@ def draw(jobs: Sequence[TrainingJob], ui: UiContext) -> list[str]:
     """One card a run, the next one at the bottom; the actions that were asked for."""
     actions: list[str] = []
     for job in jobs:
-        if job.status != "done":
+        if job.status != "done" or job.warning:
             imgui.push_id(job.number)
             actions += _card(_job_row(job), job.number, ui)
             imgui.pop_id()
@@ -71,9 +71,9 @@ class _Row:
 
 
 def _job_row(job: TrainingJob) -> _Row:
-    order, failed = job.order, job.status == "failed"
+    order, failed = job.order, job.status == "failed" or bool(job.warning)
     about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
-    said = job.error if failed else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
+    said = (job.error or job.warning) if failed else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
     row = _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
@@ -108,6 +108,8 @@ def _status(job: TrainingJob) -> str:
             return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
         case "failed":
             return "Failed"
+        case "done":
+            return "Done"
     return ""
 
 
@@ -199,4 +201,6 @@ def _buttons(job: TrainingJob) -> tuple[tuple[str, str, str], ...]:
             return (("Resume", "resume_run", "Go on where it was stopped"),)
         case "failed":
             return (("Retry", "resume_run", "Try again"),)
+        case "done":
+            return (("Close", "close_run", "Takes the card away; the edit stays"),)
     return ()

@@ -12,6 +12,7 @@ import torch
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
+from progdf.gaussians import pack
 from progdf.gdf.file import load_gdf
 from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk, find_picture_camera
@@ -23,6 +24,7 @@ from trainer.editors import make_editor
 from trainer.evaluate.command import evaluate_folder
 from trainer.evaluate.options import EvaluateOptions
 from trainer.pipeline.run import RunResult
+from trainer.report.measures import PaintTaken, measure_paint
 from trainer.setup.resolution import ViewSettings
 from trainer.setup.training_setup import make_training_setup
 from trainer.views.view import View, render_view
@@ -79,6 +81,34 @@ def test_the_report_says_that_nothing_was_held_out(done: RunResult) -> None:
     assert "no view is held out: all figures are of the views that were trained on" in log
     assert "the views trained on: " in log
     assert json.loads(done.folder.report.read_text())["trajectory"]["slider"] == "even"
+
+
+def test_a_fill_that_took_is_reported_without_a_warning(done: RunResult) -> None:
+    assert done.report["paint"]["reached"] > 0.9
+    assert done.report["paint"]["warning"] == ""
+    assert "warning:" not in done.folder.log.read_text()
+
+
+def test_painting_a_thing_away_is_said_to_remove_nothing(folder: Path, tmp_path: Path) -> None:
+    scene, region = bear(folder)
+    setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
+    others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, region.members, False)
+    without = scene[others.nonzero()[:, 0]]
+    painted = [render_view(without, view.camera, setup.background).clamp(0, 1) for view in setup.train]
+    found = measure_paint(setup, painted, pack(scene[region.members], with_shN=True))
+    assert found.reached == pytest.approx(0.0, abs=0.01)
+    assert found.warning.startswith("0 % of what was painted is in the edit: the painting covers things")
+    assert "nothing is removed by painting" in found.warning
+    originals = [view.image for view in setup.train]
+    kept = measure_paint(setup, originals, pack(scene[region.members], with_shN=True))
+    assert (kept.pixels, kept.warning) == (0, "")
+
+
+def test_detail_finer_than_the_splats_is_said_with_both_counts(done: RunResult) -> None:
+    assert PaintTaken(0.37, 2074, 457, False).warning == (
+        "37 % of what was painted is in the edit: 457 Gaussians stand for 2 074 painted pixels; "
+        "the detail is finer than they are"
+    )
 
 
 def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:

@@ -75,6 +75,8 @@ class TrainingActions:
                 self._ask_discard(int(argument))
             case "discard_run":
                 self._try(lambda: self.queue.discard(int(argument)))
+            case "close_run":
+                self.queue.dismiss(int(argument))
             case "run_log":
                 self._show_log(int(argument))
             case "quit" if self.queue.busy and not self._leaves:
@@ -179,7 +181,8 @@ class TrainingActions:
             main_view.show_message(f"{job.order.name} was trained in another window: {job.order.gdf}")
         if job.status != "done":
             return
-        self.queue.dismiss(job.number)
+        if not job.warning:
+            self.queue.dismiss(job.number)
         if comes:
             self._live = None
             self._app.open(job.order.gdf)
