@@ -30,6 +30,7 @@ COMPARED = "keyframes2"
 
 _EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
 _ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
+_MISSED = 1 / 9  # of the energy of a painted change: a third of its contrast
 _NODES = 6  # recordings at which the field is looked at
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
 
@@ -251,22 +252,20 @@ class PaintTaken:
     reached: float  # share of the painted change's energy, 0..1
     pixels: int  # that were painted
     members: int  # that mostly show in these
-    removes: bool  # whether the scene without the members is nearer to the picture than the edit is
+    removes: bool  # whether the scene without the members explains as much of it as is asked of the edit
 
     @property
     def warning(self) -> str:
-        """One line that says how little it is, and why; "" where at least half of the contrast is there.
-
-        Half of the contrast is three quarters of the energy.
-        """
-        if self.reached >= 0.75 or not self.pixels:
+        """One line that says how little it is, and why; "" where two thirds of the contrast are there, which
+        leaves a ninth of the energy, and nothing was to be removed."""
+        if not self.pixels or self.reached >= 1 - _MISSED and not self.removes:
             return ""
         reasons = []
         if self.removes:
             reasons.append(
                 "the painting covers things with what lies behind them: nothing is removed by painting"
             )
-        if self.members < self.pixels:
+        if self.reached < 1 - _MISSED and self.members < self.pixels:
             stand = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"
             reasons.append(f"{stand}; the detail is finer than they are")
         share = f"{100 * self.reached:.0f} % of what was painted is in the edit"
@@ -303,4 +302,4 @@ def measure_paint(setup: TrainingSetup, painted: Sequence[Tensor], rows: Tensor)
         weights += alpha_weights(scene, view.camera, touched)[:, (0, 2)]
     inside, weight = weights[members].unbind(1)
     shown = int((inside > 0.5 * weight).sum())
-    return PaintTaken(max(0.0, 1.0 - missing / max(change, 1e-12)), pixels, shown, behind < missing)
+    return PaintTaken(max(0.0, 1.0 - missing / max(change, 1e-12)), pixels, shown, behind < _MISSED * change)

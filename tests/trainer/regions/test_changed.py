@@ -15,12 +15,16 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, pack
-from progdf.io.images import to_picture
+from progdf.io.images import save_as, to_picture
 from progdf.io.picture_camera import camera_chunk
+from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import check_region, parse_region
 from progdf.sh import rgb_to_sh0
+from tests.helpers.demo_scenes import bear
+from tests.helpers.scenes import random_gaussians
 from tests.helpers.trained import small
 from trainer.editors import make_editor
+from trainer.editors.pictures import read_change
 from trainer.optimize.picture_solver import make_picture_solver
 from trainer.regions.changed import find_change
 from trainer.regions.from_pictures import RegionSettings, region_checks, region_kinds
@@ -116,6 +120,47 @@ def test_noise_and_a_shift_are_no_change(how: str) -> None:
     truth[35:50, 40:60] = True
     assert float((found & truth).sum() / (found | truth).sum()) > 0.45  # rims of a pixel or two
     assert bool(found[36:49, 41:59].all())
+
+
+SIZES = ((256, 256), (511, 383), (980, 800), (1619, 1080), (2040, 1530))
+
+
+def fine_scene(kind: str) -> Gaussians:
+    """Busy at every size: splats of a pixel and less, soft ones, and an object of many parts."""
+    if kind == "bear":
+        return bear(4000).gaussians
+    return random_gaussians(6000, seed=3, sh_degree=2, spread=0.4, scale=0.004 if kind == "dots" else 0.04)
+
+
+@pytest.mark.parametrize("background", [(255, 255, 255), (32, 64, 96)])
+@pytest.mark.parametrize("kind", ["bear", "dots", "blobs"])
+@pytest.mark.parametrize(
+    "size",
+    [size if size in SIZES[1:2] else pytest.param(size, marks=pytest.mark.slow) for size in SIZES],
+)
+def test_an_untouched_picture_has_no_change(
+    tmp_path: Path, kind: str, size: tuple[int, int], background: tuple[int, int, int]
+) -> None:
+    scene = fine_scene(kind)
+    camera = orbit_rig(scene, 5, *size, up=torch.tensor([0.0, 1.0, 0.0]))[1]
+    rendered = to_picture(render_view(scene, camera, torch.tensor(background) / 255))
+    for name, how in (("A.png", {}), ("A.jpg", {"quality": 90})):
+        rendered.save(tmp_path / name, **how)
+        original, picture = read_change(scene, tmp_path / name, camera)
+        assert not bool(find_change(original, picture, save_as(tmp_path / name)).any()), name
+
+
+def test_a_faint_tint_of_a_png_is_found(tmp_path: Path) -> None:
+    scene = fine_scene("bear")
+    camera = orbit_rig(scene, 5, 700, 600, up=torch.tensor([0.0, 1.0, 0.0]))[1]
+    rendered = np.asarray(to_picture(render_view(scene, camera, torch.ones(3)))).copy()
+    truth = np.zeros(rendered.shape[:2], bool)
+    truth[150:350, 250:450] = True
+    truth &= (rendered > 4).all(axis=2)
+    rendered[truth] -= 4
+    Image.fromarray(rendered).save(tmp_path / "A.png")
+    found = find_change(*read_change(scene, tmp_path / "A.png", camera), save_as(tmp_path / "A.png")).numpy()
+    assert (found & truth).sum() > 0.95 * (found | truth).sum()
 
 
 def two_sheets(gap: float, side: int = 26) -> Gaussians:
