@@ -258,7 +258,7 @@ class PaintTaken:
     def warning(self) -> str:
         """One line that says how little it is, and why; "" where two thirds of the contrast are there, which
         leaves a ninth of the energy, and nothing was to be removed."""
-        if not self.pixels or self.reached >= 1 - _MISSED and not self.removes:
+        if not self.pixels or (self.reached >= 1 - _MISSED and not self.removes):
             return ""
         reasons = []
         if self.removes:
