@@ -249,6 +249,7 @@ ORIGIN_AT = {
     "camera_chunk": 2,
     "find_picture_camera": 2,
     "picture_cameras": 2,
+    "rendered_cameras": 2,
 }
 
 

@@ -143,9 +143,7 @@ def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Orig
     return [camera.resize(*size) for camera, size in zip(cameras, sizes, strict=True)]
 
 
-def rendered_cameras(
-    paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO
-) -> list[Camera]:
+def rendered_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
     """`picture_cameras`, at the size at which each was rendered."""
     cameras = []
     for path in paths:

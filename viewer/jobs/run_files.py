@@ -24,7 +24,7 @@ from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.io.atomic import atomic_write, make_folder, read_file
+from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.json_values import read_json
 from progdf.io.locks import LOCK, LockedError, hold_lock, is_locked
 from progdf.io.tensors import read_tensors
@@ -72,8 +72,8 @@ class _Order(msgspec.Struct):
 def warning_of(order: EditOrder) -> str:
     """What a finished run warns of, "" if of nothing."""
     try:
-        report = msgspec.json.decode(read_file(order.out / "report.json", 1 << 24), type=_Report)
-    except (ProgdfError, OSError, ValueError, RecursionError):
+        report = read_json(order.out / "report.json", _Report)
+    except ProgdfError:
         return ""
     return report.paint.warning if report.paint is not None else ""
 

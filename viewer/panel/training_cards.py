@@ -73,7 +73,11 @@ class _Row:
 def _job_row(job: TrainingJob) -> _Row:
     order, failed = job.order, job.status == "failed" or bool(job.warning)
     about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
-    said = (job.error or job.warning) if failed else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
+    said = (
+        (job.error or job.warning)
+        if failed
+        else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
+    )
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
     row = _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
