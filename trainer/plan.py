@@ -232,6 +232,7 @@ def make_plan(options: TrainOptions) -> Plan:
             options.image_size or None,
             dense=not quick and family not in VIEW_BY_VIEW,
             pictures=picture_paths(what) if family == "pictures" else (),
+            scene=options.scene,
         ),
         OptimizationPlan(
             None if options.kind == "auto" else options.kind,

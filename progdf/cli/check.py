@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse_options(CheckOptions, argv, "progdf check")
     scene, report = load_scene_with_report(options.scene)
     cameras = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
-    up = find_up(scene, cameras, options.up)
+    up = find_up(scene, cameras, options.up, options.scene)
     for line in report.lines() + survey(scene, up).lines():
         print_line(line)
     strays = find_strays(scene)

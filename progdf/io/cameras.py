@@ -102,6 +102,21 @@ def read_camera(text: str, origin: Origin = ZERO) -> Camera:
     return cameras[number]
 
 
+def cameras_beside(path: Path, origin: Origin = ZERO) -> list[Camera]:
+    """The cameras in a scene's folder or, of an Inria model's point_cloud/iteration_N, in the model's.
+
+    They are relative to `origin`, as of `load_cameras`. None where there are none, or they cannot be told
+    apart or read.
+    """
+    folder = path.resolve().parent
+    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
+        folder = folder.parent.parent
+    try:
+        return [_enter(camera, origin, os.fspath(folder)) for camera in _from_folder(folder)]
+    except (ProgdfError, OSError):
+        return []
+
+
 def _from_folder(folder: Path) -> list[Camera]:
     """The one thing in a folder that holds cameras."""
     found = [folder / name for name in _FILES if (folder / name).is_file()]

@@ -6,6 +6,8 @@ drops it, or writes another format, a file beside the picture or the camera of t
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,16 +21,26 @@ from progdf.gaussians import ZERO, Origin
 
 from .cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras
 from .images import picture_text
+from .json_values import decode_json
 
+UP_KEY = "progdf:up"
 EDITS_KEY = "progdf:edits"
 """Of the text in a .png that names the edits which it shows."""
 
 
-def camera_chunk(camera: Camera, edits: Sequence[str] = (), origin: Origin = ZERO) -> PngInfo:
-    """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered, and the
-    names of the edits that it shows. `origin`: of the scene, which the camera is relative to."""
+def camera_chunk(
+    camera: Camera,
+    edits: Sequence[str] = (),
+    origin: Origin = ZERO,
+    up: tuple[float, float, float] | None = None,
+) -> PngInfo:
+    """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered, the
+    names of the edits that it shows, and which direction counted as up. `origin`: of the scene, which the
+    camera is relative to."""
     info = PngInfo()
     info.add_text(PICTURE_KEY, cameras_to_json([camera], origin=origin))
+    if up is not None:
+        info.add_text(UP_KEY, json.dumps({"direction": up}))
     if edits:
         info.add_itxt(EDITS_KEY, ", ".join(edits))
     return info
@@ -37,6 +49,17 @@ def camera_chunk(camera: Camera, edits: Sequence[str] = (), origin: Origin = ZER
 def edits_in_picture(path: str | os.PathLike[str]) -> str:
     """The edits that a .png says it shows, "" for none. Raises ProgdfError: it is no picture."""
     return picture_text(path, EDITS_KEY) or ""
+
+
+def up_in_picture(path: str | os.PathLike[str]) -> object:
+    """What a picture says was up when it was rendered, for `up_from_json`; None where it says nothing.
+
+    Raises ProgdfError: it is no picture.
+    """
+    text = picture_text(path, UP_KEY)
+    with contextlib.suppress(ValueError):
+        return decode_json(text) if text is not None and len(text) < 1000 else None
+    return None
 
 
 def find_picture_camera(

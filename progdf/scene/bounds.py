@@ -16,6 +16,8 @@ _SAMPLE = 100_000
 
 _LONG_TAIL = 5.0
 _CEILING_COVER = 0.8
+_DENSER = 2.0
+"""Times as many Gaussians as under it has a ceiling: five where a room's walls go on below, one in a head."""
 _LEAST_CELLS = 16
 _ENOUGH = 64
 """Fewer Gaussians tell nothing about the shape of a scene."""
@@ -69,9 +71,13 @@ def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
     far 3 % begin more than five times as far out as the middle, as in outdoor captures with a background).
     """
     sample = _sample(scene)
-    center, radius = scene_sphere(sample)
-    typical = float((sample.means - center).norm(dim=1).median())
-    return len(sample) >= _ENOUGH and (radius > _LONG_TAIL * typical or has_ceiling(sample, up))
+    return len(sample) >= _ENOUGH and (has_long_tail(sample.means) or has_ceiling(sample, up))
+
+
+def has_long_tail(means: Tensor) -> bool:
+    """Whether the far 3 % begin more than five times as far out as the middle. [N,3], N ≥ 1"""
+    distances = (means - means.median(dim=0).values).norm(dim=1)
+    return float(_quantile(distances, 0.97)) > _LONG_TAIL * float(distances.median())
 
 
 def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
@@ -83,8 +89,12 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
     low, high = (_quantile(height, q) for q in (0.02, 0.98))
     cells = plan_cells(sample, up)
     covered = len(torch.unique(cells))
-    ceiling = len(torch.unique(cells[height > high - 0.06 * (high - low)]))
-    return covered >= _LEAST_CELLS and ceiling >= _CEILING_COVER * covered
+    slab = 0.06 * (high - low)
+    top, next_to_top = height > high - slab, (height <= high - slab) & (height > high - 2 * slab)
+    # thin and dense, as the top of a head is not
+    dense = int(top.sum()) >= _DENSER * int(next_to_top.sum())
+    ceiling = len(torch.unique(cells[top]))
+    return dense and covered >= _LEAST_CELLS and ceiling >= _CEILING_COVER * covered
 
 
 def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
@@ -106,18 +116,6 @@ def drop_background(scene: Gaussians) -> Gaussians | None:
     return sample[(distances <= _CORE * distances.median()).nonzero()[:, 0]]
 
 
-def plane_facing(scene: Gaussians, axis: int) -> tuple[Tensor, Tensor]:
-    """How high each Gaussian lies along a world axis, and how much flat area it turns that way.
-
-    Returns:
-        height over the center, in radii of the bulk, −1.5..1.5 [N]; share of the scene's flat area [N]
-    """
-    center, radius = scene_sphere(scene)
-    flat = _flatness(scene)
-    facing = flat * normals_of(scene)[:, axis].abs() ** 4 / flat.sum().clamp_min(1e-30)
-    return ((scene.means[:, axis] - center[axis]) / radius).clamp(-1.5, 1.5), facing
-
-
 def _quantile(values: Tensor, share: float) -> Tensor:
     return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values
 
@@ -126,23 +124,19 @@ def _sample(scene: Gaussians) -> Gaussians:
     return scene[:: -(-len(scene) // _SAMPLE)] if len(scene) > _SAMPLE else scene
 
 
-def _areas(scene: Gaussians) -> Tensor:
-    """Area of each Gaussian's two longer axes, the largest per cent cut off so that no giant decides. [N]"""
-    areas = scene.log_scales.sort(dim=1).values[:, 1:].sum(dim=1).exp()
-    return areas.clamp_max(float(_quantile(areas, 0.99)))
-
-
-def _flatness(scene: Gaussians) -> Tensor:
-    """Visible flat area of each Gaussian: nothing for needles and balls. [N]"""
-    ordered = scene.log_scales.sort(dim=1).values
-    flat = 1 - (ordered[:, 0] - ordered[:, 1]).exp()
-    return _areas(scene) * scene.opacities * flat
-
-
 def normals_of(scene: Gaussians) -> Tensor:
     """The shortest axis of each Gaussian in the world, of either sign. [N,3], unit length"""
-    axes = torch.eye(3)[scene.log_scales.argmin(dim=1)]
+    return _turned_axes(scene, scene.log_scales.argmin(dim=1))
+
+
+def long_axes(scene: Gaussians) -> Tensor:
+    """The longest axis of each Gaussian in the world, of either sign. [N,3], unit length"""
+    return _turned_axes(scene, scene.log_scales.argmax(dim=1))
+
+
+def _turned_axes(scene: Gaussians, which: Tensor) -> Tensor:
+    axes = torch.eye(3)[which]
     w, xyz = scene.unit_quats[:, :1], scene.unit_quats[:, 1:]
     twice = 2 * torch.linalg.cross(xyz, axes)
-    normals: Tensor = axes + w * twice + torch.linalg.cross(xyz, twice)
-    return normals
+    turned: Tensor = axes + w * twice + torch.linalg.cross(xyz, twice)
+    return turned

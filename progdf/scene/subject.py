@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 
-from .bounds import front_direction, has_ceiling
+from .bounds import front_direction, has_ceiling, has_long_tail
 
 _SAMPLE = 60_000
 _ENOUGH = 64
@@ -35,6 +35,13 @@ covers no more of them."""
 
 _FEET = 0.01
 """Share of a scene that lies under its ground: strays, and the far side of what is soft."""
+
+_LOOKED_AT = 8_000
+"""Gaussians of which is asked what hides them."""
+
+_FREE, _RICHER = 0.2, 1.5
+"""One stands no nearer to anything than a fifth of the room's half width; and a first picture leaves the
+front where another side shows half as much again."""
 
 _ACROSS = 32
 _LEAST = 0.06
@@ -61,6 +68,9 @@ def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
     standing = _rows_above_ground(height, plan)
     if standing is not None:
         rows, height, plan = rows[standing], height[standing], plan[standing]
+    elif len(rows) < len(solid) and not has_long_tail(scene.means[solid]):
+        rows = solid  # what is far out is no background, but a guitar's neck
+        height, plan = _heights_and_plan(scene.means[rows], up)
     return rows[_rows_of_large_things(torch.cat([plan, height[:, None]], dim=1))]
 
 
@@ -91,7 +101,7 @@ def is_room(scene: Gaussians, up: Tensor) -> bool:
 
 
 def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Where to stand inside a room, and what to look at: across it, from where the least is in the way.
+    """Where to stand inside a room, and what to look at: from free space, at the height of eyes, at the most.
 
     Returns:
         eye [3], target [3]
@@ -99,24 +109,71 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     means = scene.means[_sample(scene)]
     ahead = front_direction(up)
     axes = torch.stack([ahead, torch.linalg.cross(up, ahead), up])
-    inside = means @ axes.T
+    middle = means.median(dim=0).values
+    inside = (means - middle) @ axes.T
     low, high = (torch.stack([_quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    target = (middle - half * torch.tensor([0.0, 0.0, 0.2])) @ axes
-    best, eye = -1.0, target
-    for turn in range(8):  # the corners and the middles of the walls, at the height of eyes
-        angle = math.radians(45 * turn)
-        level = torch.tensor([math.cos(angle), math.sin(angle)])
-        aside = 0.75 * level / level.abs().max()
-        stand = (middle + half * torch.tensor([*aside.tolist(), 0.2])) @ axes
-        offsets = means - stand
-        apart = offsets.norm(dim=1).clamp_min(1e-12)
-        ray = torch.nn.functional.normalize(target - stand, dim=0)
-        shown = apart[(offsets @ ray) > 0.8 * apart]
-        clear = float(_quantile(shown, 0.02)) if len(shown) else 0.0
-        if clear > best:
-            best, eye = clear, stand
-    return eye, target
+    center, half = 0.5 * (low + high), 0.5 * (high - low)
+    some = inside[:: -(-len(inside) // _LOOKED_AT)]
+    near = _FREE * float(half[:2].min())
+    most, view = -1.0, (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
+    for place in torch.cartesian_prod(*[torch.linspace(-0.75, 0.75, 5)] * 2):
+        stand = center + half * torch.cat([place, torch.tensor([0.2])])
+        free = float((some - stand).norm(dim=1).min()) > near
+        for turn in range(12):
+            angle = math.radians(30 * turn)
+            back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+            seen = _visible(some - stand, back, wide=1.0).sum() / len(some) + float(free)
+            if float(seen) > most:
+                most, view = float(seen), (stand, stand - float(half[:2].min()) * back)
+    eye, target = view
+    return middle + eye @ axes, middle + (target - torch.tensor([0.0, 0.0, 0.1 * float(half[2])])) @ axes
+
+
+def richest_turn(scene: Gaussians, up: Tensor, azimuth: float, elevation: float) -> float:
+    """By how many degrees to turn from an azimuth to where much more of the subject is seen: of what is open
+    or solid on one side only, as an alcove or a face; 0 where no side shows half as much again.
+
+    Args:
+        scene: what the picture is to be filled by
+        up: [3]
+        azimuth, elevation: of the eye, degrees, see `front_direction`
+    """
+    if len(scene) < _ENOUGH:
+        return 0.0
+    means = scene.means[:: -(-len(scene) // _LOOKED_AT)]
+    ahead = front_direction(up)
+    places = (means - means.median(dim=0).values) @ torch.stack([ahead, torch.linalg.cross(up, ahead), up]).T
+    above = math.radians(elevation)
+    shares = []
+    for turn in range(8):
+        around = math.radians(azimuth + 45 * turn)
+        level = math.cos(above)
+        back = torch.tensor([level * math.cos(around), level * math.sin(around), math.sin(above)])
+        shares.append(float(_visible(places, back).float().mean()))
+    best = max(range(8), key=lambda turn: shares[turn])
+    return 45.0 * ((best + 4) % 8 - 4) if shares[best] >= _RICHER * shares[0] else 0.0
+
+
+def _visible(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
+    """Which places nothing hides in a picture of 24 x 24 cells. [P,3] -> [P] bool
+
+    Args:
+        places: about the eye, or of a picture from infinitely far about the middle; z up
+        back: from what is seen to the eye, unit length, not straight up. [3]
+        wide: tangent of half the angle that is seen; 0 of a picture from infinitely far
+    """
+    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back), dim=0)
+    x, y, depth = (places @ torch.stack([right, torch.linalg.cross(back, right), -back]).T).unbind(1)
+    size = float(_quantile(places.norm(dim=1), 0.95).clamp_min(1e-12))
+    unit = wide * depth.clamp_min(1e-6 * size) if wide else torch.full_like(depth, size)
+    cells = [((c / unit + 1) * 12).floor() for c in (x, y)]
+    within = (depth > 0) if wide else torch.ones_like(depth, dtype=torch.bool)
+    for cell in cells:
+        within &= (cell >= 0) & (cell < 24)
+    place = (cells[0] * 24 + cells[1]).clamp(0, 575).long()
+    far = torch.where(within, depth, math.inf)
+    nearest = torch.full((576,), math.inf).scatter_reduce(0, place, far, "amin")
+    return within & (depth <= nearest[place] + 0.08 * size)
 
 
 def ground_height(scene: Gaussians, up: Tensor) -> float:

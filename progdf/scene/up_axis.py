@@ -1,18 +1,22 @@
-"""Which way is up in a scene: as the user says, cameras are held, a ground lies, or COLMAP has it."""
+"""Which way is up in a scene: as a person says, cameras are held, or the scene's own shape tells."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
+from progdf.io.cameras import cameras_beside
 
-from .bounds import drop_background, has_ceiling, plan_cells, plane_facing
+from . import known_ups
+from .bounds import drop_background, front_direction, long_axes, normals_of, scene_sphere
 
 if TYPE_CHECKING:
     from progdf.camera import Camera
@@ -27,37 +31,48 @@ CONVENTION: Axis = "-y"
 _LEVEL = math.cos(math.radians(2.0))
 """Cameras' up within two degrees of an axis is that axis: nobody holds a camera straighter."""
 
-_GROUND, _COVER, _UNDER, _STANDING, _COVERED, _WALL = 0.2, 0.75, 0.12, 0.05, 0.6, 0.1
-"""A ground is a slab that holds a fifth of all flat area, all of it facing up, shows in three quarters of the
-plan's cells, has at most 12 % of the scene under it and 5 % or more above. What is above covers at most 60 %
-of the cells, unless there are walls (a tenth of the flat area each) and a ceiling. Slabs of 20 scenes: bear
-.34, room .23, toy robot .58, all of them floors; flat backs and sides of things .27, .20, mostly under .1."""
+_SHARES = {"-y": 0.66, "+y": 0.12, "+z": 0.10}
+"""Of 43 public captures, how many have which axis up; the other three have a fortieth each."""
 
-_STRONGER = 3.0
-"""Times as much flat area as a slab across the convention's axis: two slabs alike decide nothing."""
+_ODDS = 6.0
+"""Times as likely as the next direction (45° or more away) has to be what is taken without a question: more
+than the convention makes it alone."""
+
+_WEIGHTS = {
+    "vertical edges": 2.6,
+    "symmetry": 2.0,
+    "wider foot": 1.55,
+    "blurred underside": 1.0,
+    "faint strays below": 0.7,
+    "ground plane": 20.0,
+}
+"""Of each kind of evidence in `_Shape.evidence`, in nats: a logistic regression over 21 public captures
+and the two demo scenes, in which a direction is told from the five others."""
+
+_WALLED = 0.04
+"""Ground planes of at least so much across all six directions are a room: what edges, foot and underside tell
+of a thing seen from outside says nothing there."""
+
+_ROWS = 20_000
+"""Gaussians that are looked at: an even sample, the same each time."""
+
+_SNAP = math.cos(math.radians(5.0))
+"""A ground within five degrees of an axis is level: a captured floor is bent by as much."""
 
 
 @dataclass(frozen=True)
 class UpAxis:
-    """Which way is up, and how that was decided.
+    """Which way is up, and how that was decided."""
 
-    Args:
-        direction: in the world, unit length. [3] float32
-        reason: for a person, as "the cameras"
-        certain: something in the scene or a person tells; else it is only what most scenes have
-    """
-
-    direction: Tensor
-    reason: str
-    certain: bool = True
+    direction: Tensor  # in the world, unit length. [3] float32
+    reason: str  # for a person, as "as the cameras are held"
+    certain: bool = True  # a person or cameras said, or the shape tells clearly
+    candidates: tuple[Tensor, ...] = ()  # where the shape decided: all directions, the likeliest first
 
     @property
     def name(self) -> str:
         """The axis, as "-y"; of another direction its three numbers."""
-        axis = int(self.direction.abs().argmax())
-        if float(self.direction.abs()[axis]) > 0.99999:
-            return ("-" if float(self.direction[axis]) < 0 else "+") + "xyz"[axis]
-        return " ".join(f"{round(float(x), 3) + 0.0:g}" for x in self.direction)  # + 0.0: not -0
+        return direction_name(self.direction)
 
     def to_json(self) -> dict[str, object]:
         """As JSON values, for reports and .gdf files."""
@@ -71,33 +86,258 @@ def axis_direction(axis: str) -> Tensor:
     return direction
 
 
-def find_up(scene: Gaussians, cameras: Sequence[Camera] = (), asked: str = "auto") -> UpAxis:
+def direction_name(direction: Tensor) -> str:
+    """The axis that a unit vector lies along, as "-y"; else its three numbers. [3]"""
+    axis = int(direction.abs().argmax())
+    if float(direction.abs()[axis]) > 0.99999:
+        return ("-" if float(direction[axis]) < 0 else "+") + "xyz"[axis]
+    return " ".join(f"{round(float(x), 3) + 0.0:g}" for x in direction)  # + 0.0: not -0
+
+
+def find_up(
+    scene: Gaussians, cameras: Sequence[Camera] = (), asked: str = "auto", path: Path | None = None
+) -> UpAxis:
     """The world direction that is up.
 
     Args:
         scene: N Gaussians
         cameras: given with the scene; people hold them level, so their mean up is the scene's, if they agree
-        asked: an axis decides all; "auto" leaves it to what follows
+        asked: an axis decides all; "auto" leaves it to the cameras, to what was chosen for this scene before
+            (`known_ups`), to cameras beside its file, and to the scene's shape
+        path: the scene's file
     """
     if asked != "auto":
         return UpAxis(axis_direction(asked), "as --up says")
-    if cameras:
-        mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
-        if float(mean.norm()) > 0.5:
-            direction = torch.nn.functional.normalize(mean, dim=0)
-            axis = direction.abs().argmax()
-            if float(direction.abs()[axis]) > _LEVEL:
-                direction = torch.zeros(3).index_fill(0, axis, math.copysign(1.0, float(direction[axis])))
-            return UpAxis(direction, "as the cameras are held")
-    if (ground := _ground_axis(scene, CONVENTION)) is not None:
-        return UpAxis(axis_direction(ground), "a ground lies across it")
-    why = "by convention, as no ground tells; --up says otherwise"
-    return UpAxis(axis_direction(CONVENTION), why, certain=False)
+    if (held := _held_up(cameras)) is not None:
+        return UpAxis(held, "as the cameras are held")
+    if (chosen := known_ups.find(scene)) is not None:
+        return UpAxis(chosen, "as was chosen for this scene before")
+    beside = (
+        []
+        if path is None
+        else [camera for camera in cameras_beside(path, scene.origin) if _sees(camera, scene)]
+    )
+    if (held := _held_up(beside)) is not None:
+        return UpAxis(held, f"as the {len(beside)} cameras beside the scene's file are held")
+    return _weigh(scene)
 
 
 def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
     """The direction of `find_up`. [3] float32, unit length"""
     return find_up(scene, cameras).direction
+
+
+def _held_up(cameras: Sequence[Camera]) -> Tensor | None:
+    """The mean up of cameras; None where there are none, or they disagree. [3]"""
+    if not cameras:
+        return None
+    mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
+    return _snap(torch.nn.functional.normalize(mean, dim=0), _LEVEL) if float(mean.norm()) > 0.5 else None
+
+
+def _sees(camera: Camera, scene: Gaussians) -> bool:
+    """Whether the scene's middle is in the picture, as where cameras belong to it."""
+    place = camera.viewmat[:3, :3] @ scene_sphere(scene)[0] + camera.viewmat[:3, 3]
+    x, y, depth = (float(c) for c in camera.K @ place)
+    return depth > 0 and 0 <= x <= camera.width * depth and 0 <= y <= camera.height * depth
+
+
+def _snap(direction: Tensor, cosine: float) -> Tensor:
+    """The axis that is as near as this; else the direction itself. [3]"""
+    axis = direction.abs().argmax()
+    if float(direction.abs()[axis]) <= cosine:
+        return direction
+    return torch.zeros(3).index_fill(0, axis, math.copysign(1.0, float(direction[axis])))
+
+
+def _weigh(scene: Gaussians) -> UpAxis:
+    """What the shape and the convention together make likeliest."""
+    shape = _shape_of(scene)
+    if shape is None:
+        why = "by convention, as too little is there to tell; --up says otherwise"
+        return UpAxis(axis_direction(CONVENTION), why, certain=False)
+    directions = [axis_direction(axis) for axis in AXES]
+    found = [shape.evidence(direction) for direction in directions]
+    walled = min(evidence["ground plane"] for evidence in found) >= _WALLED
+    if (normal := _ground_normal(shape.places)) is not None:
+        both = [shape.evidence(normal), shape.evidence(-normal)]
+        planes = [evidence["ground plane"] for evidence in [*found, *both]]
+        if planes[6] - planes[7] > max(abs(planes[i] - planes[i + 1]) for i in (0, 2, 4)):
+            directions, found = [*directions, normal, -normal], [*found, *both]
+    counted = ["ground plane"] if walled else [*_WEIGHTS]
+    terms = []
+    for i, direction in enumerate(directions):
+        own = found[i] | {"ground plane": found[i]["ground plane"] - found[i ^ 1]["ground plane"]}
+        term = {name: _WEIGHTS[name] * own[name] for name in counted}
+        terms.append(term | {"convention": _convention(direction)})
+    totals = torch.tensor([sum(term.values()) for term in terms])
+    likely = torch.softmax(totals, 0)
+    order = likely.argsort(descending=True, stable=True).tolist()
+    best = order[0]
+    rival = next(i for i in order if float(directions[i] @ directions[best]) < math.sqrt(0.5))
+    against = {name: value - terms[rival][name] for name, value in terms[best].items()}
+    told = sorted((name for name in against if abs(against[name]) >= 0.3), key=lambda n: -abs(against[n]))
+    reasons = ", ".join(f"{name} {against[name]:+.1f}" for name in told)
+    other = direction_name(directions[rival])
+    odds = float(likely[best] / likely[rival])
+    why = f"{100 * float(likely[best]):.0f} % likely; against {other}: {reasons}"
+    if odds < _ODDS:
+        why += f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: look, and choose with --up"
+    candidates = tuple(directions[i] for i in order)
+    return UpAxis(directions[best], why, odds >= _ODDS, candidates)
+
+
+def _convention(direction: Tensor) -> float:
+    """How usual a direction is, in nats: as its nearest axis, but few scenes are slanted. [3]"""
+    nearest = direction_name(_snap(direction, 0.0))
+    return math.log(_SHARES.get(nearest, 0.04)) - (float(direction.abs().max()) < _SNAP)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """The solid bulk of a scene about its middle, in units of its radius."""
+
+    places: Tensor  # [Q,3]
+    normals: Tensor  # shortest axes. [Q,3], unit length
+    flatness: Tensor  # 1 of a disk, 0 of a ball and of a needle. [Q]
+    edges: Tensor  # longest axes. [Q,3], unit length
+    edge_weights: Tensor  # visible elongated area, together 1. [Q]
+    sizes: Tensor  # log of the longest axes. [Q]
+    strays: (
+        Tensor  # where the big and faint Gaussians of the whole scene lie, at most 5 from the middle. [S,3]
+    )
+    stray_weights: Tensor  # visible area, together 1 or, of few, less. [S]
+
+    def evidence(self, up: Tensor) -> dict[str, float]:
+        """What speaks for a direction, by the names of `_WEIGHTS`. [3]"""
+        ahead = front_direction(up)
+        side = torch.linalg.cross(up, ahead)
+        height, plan = self.places @ up, self.places @ torch.stack([ahead, side], dim=1)
+        order = height.argsort()
+        count = len(order)
+        low, high = float(height[order[count // 200]]), float(height[order[-1 - count // 200]])
+        wide = (_quantiles(plan, 0.995) - _quantiles(plan, 0.005)).clamp_min(1e-6)
+        band = 0.04 * max(high - low, 1e-6)
+        foot = _extent(plan[height < low + band]) - _extent(plan[height > high - band])
+        tenth = max(count // 10, 1)
+        blur = float(self.sizes[order[:tenth]].median() - self.sizes[order[-tenth:]].median())
+        along = float(self.edge_weights[(self.edges @ up).abs() > 0.97].sum())
+        turns = [math.pi * k / 6 for k in range(6)]
+        level = max(self._symmetry(math.cos(turn) * ahead + math.sin(turn) * side) for turn in turns)
+        return {
+            "vertical edges": math.log(along + 0.02),
+            "symmetry": level - self._symmetry(up),
+            "wider foot": foot / float(wide.prod().sqrt()),
+            "blurred underside": min(max(blur, -1.5), 1.5),
+            "faint strays below": -float((self.strays @ up) @ self.stray_weights),
+            # on a ground something stands; a sheet is none
+            "ground plane": _ground_plane(
+                height,
+                (plan - _quantiles(plan, 0.02)) / wide,
+                self.flatness * (self.normals @ up) ** 4 + 0.2 * (1 - self.flatness),
+            )
+            * min(1.0, 2 * (high - low) / float(wide.prod().sqrt())),
+        }
+
+    def _symmetry(self, normal: Tensor) -> float:
+        """How much of the bulk lies where its mirror image across the middle plane does, 0..1."""
+        along = self.places @ normal
+        ordered = along.sort().values
+        middle = 0.5 * (ordered[len(along) // 50] + ordered[-1 - len(along) // 50])
+        own, mirrored = (
+            _cell_counts(places).sqrt()
+            for places in (self.places, self.places - 2 * (along - middle)[:, None] * normal)
+        )
+        return float(own @ mirrored / (own.norm() * mirrored.norm()))
+
+
+def _shape_of(scene: Gaussians) -> _Shape | None:
+    """None where too few are solid."""
+    solid = drop_background(scene)
+    if solid is None:
+        return None
+    solid = solid[:: -(-len(solid) // _ROWS)]
+    middle = solid.means.median(dim=0).values
+    places = solid.means - middle
+    distances = places.norm(dim=1)
+    radius = float(distances.sort().values[int(0.9 * len(distances))].clamp_min(1e-12))
+    axes = solid.log_scales.sort(dim=1).values
+    areas = axes[:, 1:].sum(dim=1).exp()
+    areas = areas.clamp_max(float(areas.sort().values[int(0.9 * len(areas))]))
+    elongated = solid.opacities * areas * (1 - (axes[:, 1] - axes[:, 2]).exp())
+    every = scene[:: -(-len(scene) // (3 * _ROWS))]
+    sizes = every.log_scales.amax(dim=1).exp()
+    stray = (sizes > 8 * sizes.median()) & (every.opacities < 0.5)
+    weights = (every.opacities * sizes**2)[stray]
+    return _Shape(
+        places / radius,
+        normals_of(solid),
+        1 - (axes[:, 0] - axes[:, 1]).exp(),
+        long_axes(solid),
+        elongated / elongated.sum().clamp_min(1e-30),
+        axes[:, 2] - math.log(radius),
+        ((every.means[stray] - middle) / radius).clamp(-5.0, 5.0),
+        weights / weights.sum().clamp_min(1e-30) * len(weights) / (len(weights) + 100),
+    )
+
+
+def _ground_plane(height: Tensor, plan: Tensor, facing: Tensor) -> float:
+    """The best slab across a direction: its share of the bulk, of the plan's cells, and how much more of the
+    rest lies above it than below, multiplied. [Q], [Q,2] 0..1 -> 0..1
+    """
+    slabs, cells = 60, 10
+    row = ((height + 1.5) / 0.05).long().clamp(0, slabs - 1)
+    place = (plan * cells).long().clamp(0, cells - 1)
+    cell = (row * cells + place[:, 0]) * cells + place[:, 1]
+    table = torch.bincount(cell, minlength=slabs * cells**2).view(slabs, cells**2).float() / len(height)
+    faced = torch.bincount(row, facing, minlength=slabs) / len(height)
+    within = faced[:-1] + faced[1:]
+    shown = table[:-1] + table[1:] > 0
+    total = table.sum(dim=1).cumsum(0)
+    below = torch.cat([torch.zeros(2), total[:-3]])  # a row apart from the slab's two
+    above = 1 - torch.cat([total[2:], torch.ones(1)])
+    side = (above - below) / (above + below).clamp_min(0.02)
+    cover = shown.float().sum(dim=1) / (table.sum(dim=0) > 0).float().sum()
+    return max(0.0, float((within * cover * side).max()))
+
+
+def _ground_normal(places: Tensor) -> Tensor | None:
+    """The upper side of the plane that has most of the bulk in it and the rest on one side; None where that
+    is across an axis already. [Q,3] -> [3]
+    """
+    some = places[:: max(1, len(places) // 2000)].double()
+    draws = torch.from_numpy(np.random.default_rng(0).integers(0, len(some), (400, 3)))
+    a, b, c = some[draws].unbind(1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    for _ in range(2):
+        apart = some @ normals.T - (a * normals).sum(dim=1)
+        within = (apart.abs() < 0.04).double().mean(dim=0)
+        above, below = ((side > 0.08).double().mean(dim=0) for side in (apart, -apart))
+        worth = within * (above - below).abs() / (above + below).clamp_min(0.02)
+        best = int(worth.argmax())
+        inside = some[apart[:, best].abs() < 0.04]
+        a = inside.mean(dim=0)[None]
+        normals = torch.linalg.svd(inside - a, full_matrices=False).Vh[2][None]
+    up = normals[0].float() * (1.0 if float(above[best]) > float(below[best]) else -1.0)
+    return None if float(up.abs().max()) > _SNAP else up
+
+
+def _quantiles(columns: Tensor, share: float) -> Tensor:
+    ordered = columns.sort(dim=0).values
+    return ordered[min(int(share * len(ordered)), len(ordered) - 1)]
+
+
+def _extent(plan: Tensor) -> float:
+    """The side of a square as large as what these fill but for strays. [P,2]"""
+    if len(plan) < 6:
+        return 0.0
+    return float((_quantiles(plan, 0.95) - _quantiles(plan, 0.05)).prod().sqrt())
+
+
+def _cell_counts(places: Tensor) -> Tensor:
+    """How many lie in each cell of a cube of 20 a side about the middle. [Q,3] -> [8000]"""
+    cell = ((places + 2.5) * 4).long().clamp(0, 19)
+    return torch.bincount((cell[:, 0] * 20 + cell[:, 1]) * 20 + cell[:, 2], minlength=8000).float()
 
 
 def up_from_json(saved: object) -> Tensor | None:
@@ -109,65 +349,3 @@ def up_from_json(saved: object) -> Tensor | None:
         return None
     direction = torch.tensor([float(x) for x in numbers])
     return direction / direction.norm() if float(direction.norm()) > 1e-6 else None
-
-
-def _ground_axis(scene: Gaussians, convention: Axis) -> Axis | None:
-    """The axis that stands on a ground, if one clearly does."""
-    sample = drop_background(scene)
-    if sample is None:
-        return None
-    slabs = [_slab(sample, axis) for axis in range(3)]
-    walled = min(slab.share for slab in slabs) >= _WALL
-    shares = {}
-    for axis in AXES:
-        slab = slabs["xyz".index(axis[1])]
-        fits = _could_be_ground(sample, axis, slab, walled, axis == convention)
-        shares[axis] = slab.share if fits else 0.0
-    best = max(AXES, key=lambda axis: shares[axis])
-    needed = _GROUND if best == convention else max(_GROUND, _STRONGER * shares[convention])
-    return best if shares[best] >= needed else None
-
-
-@dataclass(frozen=True)
-class _Slab:
-    """The plane across an axis with the most flat area in it.
-
-    Args:
-        above: height of each Gaussian over it along the axis, over the scene's radius. [Q]
-        share: of the scene's flat area, what lies in it and faces along the axis. 0..1
-    """
-
-    above: Tensor
-    share: float
-
-    @property
-    def held(self) -> Tensor:
-        """Which Gaussians lie in it. [Q] bool"""
-        return self.above.abs() < 0.06
-
-
-def _slab(sample: Gaussians, axis: int) -> _Slab:
-    height, facing = plane_facing(sample, axis)
-    counts, edges = torch.histogram(height, bins=60, range=(-1.5, 1.5), weight=facing)
-    above = height - float(edges[int(counts.argmax())]) - 0.025
-    return _Slab(above, float(facing[above.abs() < 0.06].sum()))
-
-
-def _could_be_ground(sample: Gaussians, axis: Axis, slab: _Slab, walled: bool, usual: bool) -> bool:
-    """Whether the slab lies under the scene like a ground, where `axis` is up.
-
-    Args:
-        sample: Q Gaussians
-        axis: that would be up
-        slab: across it
-        walled: there are slabs across all axes, as in a room
-        usual: it is the convention's axis, of which it is not asked that the ground is the wider
-    """
-    up, above = axis_direction(axis), slab.above if axis[0] == "+" else -slab.above
-    cells = plan_cells(sample, up, per_side=12)
-    taken = len(torch.unique(cells))
-    under, standing = (float((side > 0.08).float().mean()) for side in (-above, above))
-    if len(torch.unique(cells[slab.held])) < _COVER * taken or under > _UNDER or standing < _STANDING:
-        return False
-    covered = len(torch.unique(cells[above > 0.12])) / taken
-    return usual or covered <= _COVERED or (walled and has_ceiling(sample, up))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, normalize_quats
 
 
 def random_gaussians(
@@ -213,3 +215,51 @@ def _stack(layer: Gaussians, count: int) -> Gaussians:
         means=torch.stack([torch.zeros(count), torch.zeros(count), depth], dim=1),
         sh0=torch.randn(count, 3, generator=rng),
     )
+
+
+def high_chair(count: int = 4000) -> Gaussians:
+    """A chair without a ground, y up: legs that stand apart, a seat, a narrower back with upright bars."""
+    draw = np.random.default_rng(5)
+    part = draw.integers(0, 3, count)
+    x, y, z = draw.uniform(-1.0, 1.0, (3, count))
+    side_x, side_z = draw.choice([-1.0, 1.0], (2, count))
+    legs, back = part == 0, part == 2
+    x = np.where(legs, 0.5 * side_x, np.where(back, 0.1 * np.round(3 * x), 0.5 * x))
+    z = np.where(legs, 0.5 * side_z, np.where(back, -0.45, 0.5 * z))
+    y = np.where(legs, 0.5 * y - 0.5, np.where(back, 0.6 * y + 0.6, 0.02 * y))
+    means = np.stack([x, y, z], axis=1) + draw.normal(0.0, 0.01, (count, 3))
+    upright = [0.01, 0.06, 0.01]
+    scales = np.where((legs | back)[:, None], upright, [0.03, 0.008, 0.03])
+    return replace(
+        random_gaussians(count, seed=5),
+        means=torch.from_numpy(means).float(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.from_numpy(scales).float().log(),
+        logit_opacities=torch.full((count,), 2.0),
+    )
+
+
+def _quat_of(rotation: Tensor) -> Tensor:
+    """The quaternion wxyz of a rotation matrix of a quarter or half turn. [3,3] -> [4]"""
+    w = 0.5 * math.sqrt(max(0.0, 1 + float(rotation.trace())))
+    xyz = torch.stack(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    if w > 0.1:
+        return torch.cat([torch.tensor([w]), xyz / (4 * w)])
+    axis = (rotation + torch.eye(3))[:, int(rotation.diagonal().argmax())]
+    return torch.cat([torch.zeros(1), axis / axis.norm()])
+
+
+def turned(scene: Gaussians, rotation: Tensor) -> Gaussians:
+    """The scene rotated about the origin, its Gaussians with it."""
+    w, x, y, z = _quat_of(rotation)
+    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return replace(scene, means=scene.means @ rotation.T, quats=normalize_quats(scene.quats) @ left.T)
+
+
+def upright_turn(up: Tensor) -> Tensor:
+    """The quarter turns that bring y to an axis. [3] -> [3,3]"""
+    second = torch.eye(3)[(int(up.abs().argmax()) + 1) % 3]
+    # y -> up, z -> second, x -> their cross product
+    return torch.stack([torch.linalg.cross(up, second), up, second], dim=1)

@@ -66,7 +66,7 @@ def show(options: RegionOptions) -> list[str]:
         save_npy(options.out, region.members.numpy())
     else:
         given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
-        up = find_up(scene, given, options.up).direction
+        up = find_up(scene, given, options.up, options.scene).direction
         cameras = with_near_plane(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
     share = 100 * len(region) / max(1, len(scene))

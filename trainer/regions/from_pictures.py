@@ -73,7 +73,7 @@ class RegionSettings:
 
     def up_of(self, scene: Gaussians) -> Tensor:
         """The direction that is up in a scene without cameras. [3]"""
-        return find_up(scene, (), self.up).direction
+        return find_up(scene, (), self.up, self.scene).direction
 
 
 def region_kinds(settings: RegionSettings) -> dict[str, Kind]:

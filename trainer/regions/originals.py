@@ -43,10 +43,12 @@ def write(options: ViewsOptions) -> str:
         raise ProgdfError(f"{out / 'cameras.json'} already exists; give --out another folder")
     scene = load_scene(options.scene)
     given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
-    up = find_up(scene, given, options.up).direction
+    up = find_up(scene, given, options.up, options.scene).direction
     region = None
     if options.region is not None:
-        settings = RegionSettings(options.cameras, options.views, lambda: out / "segmented", up=options.up)
+        settings = RegionSettings(
+            options.cameras, options.views, lambda: out / "segmented", up=options.up, scene=options.scene
+        )
         region = parse_region(options.region, scene, kinds=region_kinds(settings))
     if given:
         # what is drawn is straight, and so are the masks: no lens

@@ -40,6 +40,7 @@ class ViewSettings:
         pictures: changed pictures, whose cameras are the views, all of them to train on
         dense: dense members get more and larger views; what is painted or given picture by picture stays as
             small as can be, as does a draft
+        scene: its file, beside which there may be cameras that tell which way is up
     """
 
     cameras: Path | None = None
@@ -48,6 +49,7 @@ class ViewSettings:
     image_size: int | None = None
     dense: bool = True
     pictures: tuple[Path, ...] = ()
+    scene: Path | None = None
 
 
 def unresolved_share(

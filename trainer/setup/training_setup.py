@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -14,10 +15,11 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
+from progdf.io.picture_camera import up_in_picture
 from progdf.rasterize.cpu.parallel import threads
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
-from progdf.scene.up_axis import UpAxis, find_up
+from progdf.scene.up_axis import UpAxis, find_up, up_from_json
 from trainer.editors.base import EditKind, ImageEditor
 from trainer.editors.pictures import picture_cameras
 from trainer.editors.procedural import ColorEditor
@@ -93,8 +95,10 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
     """
     background = torch.tensor(BACKGROUND)
     given = [] if settings.cameras is None else load_cameras(settings.cameras, scene.origin)
-    up = find_up(scene, given, settings.up)
+    up = find_up(scene, given, settings.up, settings.scene)
     if settings.pictures:
+        if settings.up == "auto" and (shown := _up_of_pictures(settings.pictures)) is not None:
+            up = shown
         return _picture_setup(settings, scene, region, given, up)
     if settings.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
@@ -118,6 +122,13 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
             "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
         )
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
+
+
+def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:
+    """What the first picture that says anything was rendered with as up."""
+    directions = (up_from_json(up_in_picture(path)) for path in paths)
+    found = next((up for up in directions if up is not None), None)
+    return None if found is None else UpAxis(found, "as in the window that the picture is from")
 
 
 def _picture_setup(

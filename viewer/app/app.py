@@ -109,7 +109,7 @@ class App:
         self.training = TrainingActions(self, memory)
         self.deliver = DeliverActions(self)
         self.start = StartActions(self, self.context, self.deliver.deliveries, memory)
-        self.up = UpActions(self, self.context, memory)
+        self.up = UpActions(self, self.context)
         self.preview = PreviewActions(
             self, self.context, lambda form, folder: self.training.region_spec(form, folder, "preview")
         )

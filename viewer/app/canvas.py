@@ -151,7 +151,8 @@ class Canvas:
         if view.compare.mode != "off":  # which is no view that could be edited and trained on
             return exports.picture(folder, title, pixels)
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
-        chunk = camera_chunk(camera, shown_edits(view), self.comparer.engine.scene.origin)
+        origin = self.comparer.engine.scene.origin
+        chunk = camera_chunk(camera, shown_edits(view), origin, view.camera.up)
         said = exports.picture(folder, title, pixels, chunk)
         return f"{said}; change it in any program, and drop it here" if to_change else said
 

@@ -14,7 +14,7 @@ from progdf.errors import ProgdfError
 from viewer.camera.view_camera import first_camera
 from viewer.files import autosave as autosaves
 from viewer.files import document as documents
-from viewer.files import known_ups, recent, regions, session
+from viewer.files import recent, regions, session
 from viewer.files.autosave import SessionAutosave
 from viewer.files.session import WindowSession
 from viewer.files.typed_paths import parse_path, session_file
@@ -234,7 +234,7 @@ class FileActions:
 
     def _open_scene(self, path: Path) -> None:
         opened = documents.load(path)
-        camera = first_camera(opened.scene, up=known_ups.up_of(opened, self._memory))
+        camera = first_camera(opened.scene, up=opened.found_up.direction)
         self._app.open_document(opened, on_another_scene(self._app.main_view.work.view, camera))
         self.session_autosave.drop()
         self.path = None

@@ -19,7 +19,7 @@ from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians
 from progdf.io.json_values import one_of
 from progdf.scene.bounds import scene_sphere
-from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
+from progdf.scene.subject import fit_eye, is_room, richest_turn, standpoint, subject_rows
 
 from .up_axis import Vec3, up_of
 
@@ -296,7 +296,9 @@ def first_camera(
     if is_room(scene, axis):
         eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, axis))
         return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
-    return fit_subject(camera, scene, aspect)
+    shown = scene[subject_rows(scene, axis)]
+    azimuth = camera.azimuth + richest_turn(shown, axis, camera.azimuth, camera.elevation)
+    return fit(replace(camera, azimuth=azimuth), shown, aspect)
 
 
 def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:

@@ -16,7 +16,6 @@ from progdf.io.atomic import check_not_an_input
 from progdf.terminal import print_line
 from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
-from viewer.files import known_ups
 from viewer.files.document import empty
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
@@ -39,8 +38,7 @@ def view(argv: Sequence[str]) -> int:
 
     state = found.view if found.session is not None else replace(found.view, grid=True)
     if found.session is None and options.scene != NO_SCENE:
-        up = known_ups.up_of(found.document) if options.up == "auto" else found.up
-        state = replace(state, camera=first_camera(found.document.scene, up=up))
+        state = replace(state, camera=first_camera(found.document.scene, up=found.up))
     return run(
         found.document,
         state,

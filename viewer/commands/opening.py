@@ -49,6 +49,8 @@ class OpenStack:
     def up(self) -> Vec3:
         """The direction that is up in the scene."""
         opened = self.document
+        if self.asked_up == "auto":
+            return opened.found_up.direction
         return up_of(opened.scene, opened.gdfs, self.asked_up)
 
     @property

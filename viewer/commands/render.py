@@ -77,6 +77,13 @@ def render(argv: Sequence[str]) -> int:
     print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by}){strengths}")
     if told:
         print_line(told)
+    if (
+        options.camera is None
+        and saved is None
+        and options.up == "auto"
+        and not found.document.found_up.certain
+    ):
+        print_line(f"up is {found.document.found_up.reason}")
     if view.layers and not swept and not any(layer.strength for layer in view.layers):
         print_line(
             f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit"
@@ -111,7 +118,7 @@ def _render_still(
     if options.alpha:
         picture = Image.fromarray(transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
-            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin))
+            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin, found.up))
         return ""
     where = found.document.recordings()
     missing = recordings.obstacle(where)
@@ -125,7 +132,8 @@ def _render_still(
     try:
         image = comparer.image(view, camera=camera)
         # a comparison is no view that could be edited and trained on
-        carried = camera_chunk(camera, shown_edits(view), origin) if view.compare.mode == "off" else None
+        single = view.compare.mode == "off"
+        carried = camera_chunk(camera, shown_edits(view), origin, found.up) if single else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)

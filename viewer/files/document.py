@@ -44,7 +44,7 @@ class Document:
     @cached_property
     def found_up(self) -> SceneUp:
         """Which way is up, as the scene and its edits tell."""
-        return find_scene_up(self.scene, self.gdfs)
+        return find_scene_up(self.scene, self.gdfs, path=self.path)
 
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""

@@ -2,41 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from progdf.gaussians import Gaussians, normalize_quats
+from progdf.gaussians import Gaussians
 from progdf.rasterize.reference import rotation_matrices
 from progdf.scene.bounds import front_direction, is_surrounding, normals_of
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up
 from tests.helpers.demo_scenes import bear
-from tests.helpers.scenes import ball, random_gaussians
+from tests.helpers.scenes import ball, random_gaussians, turned, upright_turn
 
 Y_UP = torch.tensor([0.0, 1.0, 0.0])
-
-
-def quat_of(rotation: Tensor) -> Tensor:
-    """The quaternion wxyz of a rotation matrix of a quarter or half turn. [3,3] -> [4]"""
-    w = 0.5 * math.sqrt(max(0.0, 1 + float(rotation.trace())))
-    xyz = torch.stack(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    if w > 0.1:
-        return torch.cat([torch.tensor([w]), xyz / (4 * w)])
-    axis = (rotation + torch.eye(3))[:, int(rotation.diagonal().argmax())]
-    return torch.cat([torch.zeros(1), axis / axis.norm()])
-
-
-def turned(scene: Gaussians, rotation: Tensor) -> Gaussians:
-    """The scene rotated about the origin, its Gaussians with it."""
-    w, x, y, z = quat_of(rotation)
-    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return replace(scene, means=scene.means @ rotation.T, quats=normalize_quats(scene.quats) @ left.T)
 
 
 AXES = [torch.eye(3)[i] * sign for i in range(3) for sign in (1.0, -1.0)]
@@ -49,11 +29,7 @@ def small_bear() -> Gaussians:
 
 @pytest.mark.parametrize("up", AXES, ids=["+x", "-x", "+y", "-y", "+z", "-z"])
 def test_up_is_found_however_the_bear_lies(up: Tensor, small_bear: Gaussians) -> None:
-    axis = int(up.abs().argmax())
-    second = torch.eye(3)[(axis + 1) % 3]
-    # y -> up, z -> second, x -> their cross product: a rotation by quarter turns
-    rotation = torch.stack([torch.linalg.cross(up, second), up, second], dim=1)
-    assert torch.equal(guess_up(turned(small_bear, rotation)), up)
+    assert torch.equal(guess_up(turned(small_bear, upright_turn(up))), up)
 
 
 def test_normals_are_the_shortest_axes() -> None:

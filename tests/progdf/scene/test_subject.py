@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +14,13 @@ from torch import Tensor
 from progdf.demo_scenes import DemoScene
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.scene.bounds import front_direction, is_surrounding
 from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
-from progdf.scene.up_axis import guess_up
+from progdf.scene.up_axis import AXES, axis_direction, guess_up
 from tests.helpers.demo_scenes import bear, room
 from tests.helpers.paths import SHARED_DATA
-from tests.helpers.scenes import random_gaussians
+from tests.helpers.scenes import high_chair, random_gaussians, turned
+from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import FILL, first_camera, fit, to_camera
 
 DATA = SHARED_DATA
@@ -164,3 +167,77 @@ def test_a_room_is_met_inside_past_what_stands_in_it() -> None:
 
 def test_a_bear_under_the_sky_is_no_room(demo: DemoScene) -> None:
     assert not is_room(demo.gaussians, UP)
+
+
+def seen_in_first_picture(scene: Gaussians, size: float = 1.0, up: Vec3 | None = None) -> Tensor:
+    """Where each Gaussian is in the first picture's own axes, in units of `size`. [N,3]"""
+    camera = to_camera(first_camera(scene, up=up), 600, 400)
+    return (scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) / size
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_a_scene_opens_the_same_however_it_lies_in_its_file(up: str) -> None:
+    scene = high_chair()
+    front = front_direction(axis_direction(up))
+    side = torch.linalg.cross(axis_direction(up), front)
+    lying = turned(scene, torch.stack([side, axis_direction(up), front], dim=1))
+    torch.testing.assert_close(seen_in_first_picture(lying), seen_in_first_picture(scene), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize(("factor", "moved"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 100.0)])
+def test_a_scaled_or_moved_scene_opens_the_same(factor: float, moved: float) -> None:
+    scene = high_chair()
+    other = replace(scene, means=factor * scene.means + moved, log_scales=scene.log_scales + math.log(factor))
+    expected = seen_in_first_picture(scene)
+    torch.testing.assert_close(seen_in_first_picture(other, factor), expected, atol=0.01, rtol=0)
+
+
+def test_strays_do_not_move_the_first_view() -> None:
+    scene = high_chair()
+    strays = shell(scene, 40, 8.0, 40.0, 0.5)
+    strays = replace(strays, logit_opacities=torch.full((40,), -1.0), shN=scene.shN[:40])
+    y_up = (0.0, 1.0, 0.0)
+    seen = seen_in_first_picture(joined(scene, strays), up=y_up)[: len(scene)]
+    torch.testing.assert_close(seen, seen_in_first_picture(scene, up=y_up), atol=0.05, rtol=0)
+
+
+def guitar(count: int = 4000) -> Gaussians:
+    """A body of most of the Gaussians, and a neck five times as long, y up."""
+    draw = np.random.default_rng(2)
+    means = draw.normal(0.0, 0.1, (count, 3))
+    neck = np.arange(count) % 8 == 0
+    means[neck] *= 0.1
+    means[neck, 1] += draw.uniform(0.0, 1.0, int(neck.sum()))
+    small = random_gaussians(count, seed=2, scale=0.01)
+    return replace(small, means=torch.from_numpy(means).float(), logit_opacities=torch.full((count,), 2.0))
+
+
+@pytest.mark.parametrize("make", [guitar, high_chair])
+def test_all_of_the_core_is_in_the_first_picture_with_a_margin(make: Callable[[], Gaussians]) -> None:
+    scene = make()
+    camera = to_camera(first_camera(scene, up=(0.0, 1.0, 0.0)), 600, 400)
+    seen = scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    across = (seen[:, :2] / seen[:, 2:] * camera.K.diagonal()[:2] / camera.K[:2, 2]).abs()
+    assert float((across.amax(dim=1) < 0.9).float().mean()) > 0.999, "5 % of each side are free"
+
+
+def test_a_head_is_no_room() -> None:
+    scene = random_gaussians(6000, seed=1, scale=0.005)
+    inside = torch.from_numpy(np.random.default_rng(1).uniform(-0.5, 0.5, (6000, 3))).float()
+    head = replace(scene, means=inside * torch.tensor([0.28, 0.38, 0.15]))
+    assert not is_room(head, UP)
+    assert not is_surrounding(head, UP)
+
+
+@pytest.mark.parametrize("open_side", [1.0, -1.0])
+def test_an_alcove_is_met_from_its_open_side(open_side: float) -> None:
+    draw = np.random.default_rng(0)
+    spots = torch.from_numpy(draw.uniform(-0.5, 0.5, (6000, 3))).float()
+    side = torch.arange(6000) % 7
+    for face, (axis, place) in enumerate([(0, -0.5), (0, 0.5), (1, -0.5), (2, -0.5 * open_side)]):
+        spots[side == face, axis] = place
+    shelves = side > 3  # along the wall at the back
+    spots[shelves, 2] = (0.05 * (20 * spots[shelves, 1]).sin() - 0.3) * open_side
+    scene = replace(random_gaussians(6000, scale=0.02), means=spots, logit_opacities=torch.full((6000,), 2.0))
+    camera = first_camera(scene, up=(0.0, 1.0, 0.0))
+    assert math.cos(math.radians(camera.azimuth)) * open_side > 0.3

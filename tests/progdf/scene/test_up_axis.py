@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from progdf.__main__ import main
@@ -15,11 +16,15 @@ from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
+from progdf.io.picture_camera import camera_chunk
 from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.region_spec import parse_region
 from progdf.scene.up_axis import AXES, axis_direction, find_up, guess_up, up_from_json
 from tests.helpers.demo_scenes import bear, room
-from tests.helpers.scenes import ball, random_gaussians
+from tests.helpers.scenes import ball, high_chair, random_gaussians, turned, upright_turn
 from tests.helpers.stacks import bear_stack
+from trainer.setup.resolution import ViewSettings
+from trainer.setup.training_setup import make_training_setup
 from viewer.camera.view_camera import first_camera
 from viewer.commands import opening
 from viewer.commands.options import RenderOptions
@@ -50,6 +55,55 @@ def test_a_picture_that_lies_flat_is_no_ground() -> None:
     flat = statue()
     flat = replace(flat, means=flat.means * torch.tensor([0.001, 1.0, 1.0]))
     assert guess_up(flat).tolist() == MINUS_Y
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_a_thing_that_stands_on_its_feet_is_upright_however_it_lies_in_its_file(up: str) -> None:
+    found = find_up(turned(high_chair(), upright_turn(axis_direction(up))))
+    assert found.name == up
+    assert "wider foot" in found.reason
+
+
+def test_a_slanted_ground_tells_its_own_normal() -> None:
+    slant = torch.nn.functional.normalize(torch.tensor([0.0, 0.94, 0.34]), dim=0)
+    side = torch.tensor([1.0, 0.0, 0.0])
+    demo = bear(3000).gaussians
+    rotation = torch.stack([side, slant, torch.linalg.cross(side, slant)], dim=1)
+    found = find_up(replace(demo, means=demo.means @ rotation.T))
+    assert float(found.direction @ slant) > 0.998, "within 3.6 degrees"
+
+
+def test_the_convention_alone_is_no_certainty_and_the_runner_up_is_named() -> None:
+    found = find_up(ball())
+    assert found.direction.tolist() == MINUS_Y
+    assert not found.certain
+    assert "not certain" in found.reason
+    assert len(found.candidates) >= 6
+
+
+def test_cameras_beside_a_scene_tell_if_they_look_at_it(tmp_path: Path) -> None:
+    (tmp_path / "point_cloud" / "iteration_7").mkdir(parents=True)
+    path = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    level = orbit_rig(ball(), 6, 64, 64, up=torch.tensor([1.0, 0.0, 0.0]), elevations=(0.0, 0.0))
+    save_cameras(tmp_path / "cameras.json", level)
+    assert find_up(ball(), path=path).reason == "as the 6 cameras beside the scene's file are held"
+    assert find_up(ball(), path=path).name == "+x"
+    far = replace(ball(), means=ball().means + 1000.0)
+    assert find_up(far, path=path).name == "-y", "cameras of another scene"
+    save_cameras(tmp_path / "cameras.json", level, (1e6, 0.0, 0.0))
+    assert find_up(ball(), path=path).name == "-y"
+    assert find_up(replace(ball(), origin=(1e6, 0.0, 0.0)), path=path).name == "+x", "far from 0 in the file"
+
+
+def test_a_training_from_a_picture_has_the_up_axis_of_the_window_that_it_is_from(tmp_path: Path) -> None:
+    scene = ball()
+    camera = orbit_rig(scene, 1, 32, 32)[0]
+    image = Image.new("RGB", (32, 32))
+    image.save(tmp_path / "a.png", pnginfo=camera_chunk(camera, up=(0.0, 0.0, 1.0)))
+    settings = ViewSettings(pictures=(tmp_path / "a.png",))
+    setup = make_training_setup(settings, scene, parse_region("all", scene))
+    assert setup.up is not None
+    assert setup.up.name == "+z"
 
 
 @pytest.mark.parametrize("make", [bear, room])
@@ -111,10 +165,8 @@ def test_check_prints_boxes_to_paste_and_the_up_axis(
         assert main(["check", str(tmp_path / "a.ply"), *options]) == 0
         return capsys.readouterr().out.splitlines()
 
-    from progdf.scene.region_spec import parse_region
-
     lines = said()
-    assert "up: -y, by convention, as no ground tells; --up says otherwise" in lines
+    assert any(line.startswith("up: ") and "not certain" in line and "--up" in line for line in lines)
     read = load_ply(tmp_path / "a.ply")
     boxes = [line.partition("--region ")[2] for line in lines if "--region box:" in line]
     bulk, whole = (parse_region(box, read) for box in boxes)

@@ -1,4 +1,4 @@
-"""Which way is up, asked once of a scene that does not tell."""
+"""Which way is up: asked of a scene that does not tell clearly, and remembered when a person chooses it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import moderngl
+import torch
 
+from progdf.scene import known_ups
+from progdf.scene.up_axis import direction_name
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import first_camera
-from viewer.files import known_ups
 from viewer.gl.present import picture_texture
 from viewer.panel.panel import UPS
 from viewer.pictures.film import to_pixels
@@ -20,6 +22,9 @@ from viewer.state.view_state import ViewState
 from .training_actions import StudioApplication
 from .up_strip import SIZE, UpChoice, UpStrip
 
+MOST = 4
+"""Directions that are offered, the likeliest first."""
+
 
 class UpActions:
     """Asks, draws the pictures one by one, and remembers the answer. `close` it with the window.
@@ -27,14 +32,14 @@ class UpActions:
     Args:
         app: the window
         context: the GL context
-        memory: folder of the program's state; the user's own if None
     """
 
-    def __init__(self, app: StudioApplication, context: moderngl.Context, memory: Path | None = None) -> None:
-        self._app, self._context, self._memory = app, context, memory
+    def __init__(self, app: StudioApplication, context: moderngl.Context) -> None:
+        self._app, self._context = app, context
         self._textures: list[moderngl.Texture] = []
         self._looked = False  # at the scene
         self._path: Path | None = None  # its file
+        self._up: Vec3 | None = None  # and what a person had set as up at the last look
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
@@ -54,26 +59,32 @@ class UpActions:
         return True
 
     def poll(self, session: Path | None, engine: ViewEngine) -> float | None:
-        """Ask where a scene was opened that does not tell; seconds until the next look, None for ever.
+        """Ask where a scene was opened that does not tell, and remember what is chosen, in the panel too.
+
+        Returns:
+            Seconds until the next look, None for ever.
 
         Args:
             session: that is open, which knows
             engine: draws the pictures
         """
         main_view, document = self._app.main_view, self._app.document
+        # what a person sets, also by undo; not where a film, a picture or a snapshot leads the camera
+        up, before = main_view.work.past.present.look.up, self._up
+        self._up = up
         if not self._looked:
             self._looked, self._path = True, document.path
-            if document.path is None or session is not None or known_ups.find(document.path, self._memory):
+            if document.path is None or session is not None:
                 return None
             found = document.found_up
-            if found.certain or main_view.work.view.camera.up != found.direction:
+            if found.certain or up != found.direction:
                 return None  # it tells, or somebody said
             main_view.up_strip = self._question()
+        elif up != before:
+            self._answer(up)  # as the panel was told
+            return None
         strip = main_view.up_strip
         if strip is None:
-            return None
-        if main_view.work.view.camera.up != next(c.camera.up for c in strip.choices if c.name == strip.now):
-            self._answer(main_view.work.view.camera.up)  # as the panel was told
             return None
         missing = next((i for i, choice in enumerate(strip.choices) if not choice.texture), None)
         if missing is None:
@@ -86,7 +97,8 @@ class UpActions:
 
     def _answer(self, up: Vec3) -> None:
         if self._path is not None:
-            known_ups.remember(self._path, up, self._memory)
+            known_ups.remember(self._app.document.scene, up)
+            self._up = up
         self.close()
         self._app.main_view.wake()
 
@@ -104,11 +116,15 @@ class UpActions:
 
     def _question(self) -> UpStrip:
         scene, camera = self._app.document.scene, self._app.main_view.work.view.camera
+        ups = self._app.document.found_up.candidates or tuple(up for _, up in UPS)
+        names = [direction_name(torch.tensor(up)).upper().replace("-", "−") for up in ups]
         choices = tuple(
             UpChoice(name, first_camera(scene, aspect=SIZE[0] / SIZE[1], fov_y=camera.fov_y, up=up))
-            for name, up in UPS
+            for name, up in zip(names[:MOST], ups[:MOST], strict=True)
         )
-        return UpStrip(choices, next((name for name, up in UPS if up == camera.up), ""))
+        return UpStrip(
+            choices, next((choice.name for choice in choices if choice.camera.up == camera.up), "")
+        )
 
     def _draw(self, choice: UpChoice, engine: ViewEngine) -> int:
         background = self._app.main_view.work.view.background
