@@ -25,8 +25,6 @@ Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 UpChoice = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
 
 AXES: tuple[Axis, ...] = get_args(Axis)
-CONVENTION: Axis = "-y"
-"""COLMAP's, and so that of most trained scenes: the first camera is level, and y points down in a picture."""
 
 _LEVEL = math.cos(math.radians(2.0))
 """Cameras' up within two degrees of an axis is that axis: nobody holds a camera straighter."""
@@ -155,7 +153,8 @@ def _weigh(scene: Gaussians) -> UpAxis:
     shape = _shape_of(scene)
     if shape is None:
         why = "by convention, as too little is there to tell; --up says otherwise"
-        return UpAxis(axis_direction(CONVENTION), why, certain=False)
+        usual = sorted((axis_direction(axis) for axis in AXES), key=_convention, reverse=True)
+        return UpAxis(usual[0], why, certain=False, candidates=tuple(usual))
     directions = [axis_direction(axis) for axis in AXES]
     found = [shape.evidence(direction) for direction in directions]
     walled = min(evidence["ground plane"] for evidence in found) >= _WALLED

@@ -48,6 +48,8 @@ from .snapshot_cards import SnapshotCard, SnapshotSlider
 WIDTH_PX = 300.0  # at 1×
 
 UPS: tuple[tuple[str, Vec3], ...] = (
+    ("+X", (1.0, 0.0, 0.0)),
+    ("−X", (-1.0, 0.0, 0.0)),
     ("+Y", (0.0, 1.0, 0.0)),
     ("−Y", (0.0, -1.0, 0.0)),
     ("+Z", (0.0, 0.0, 1.0)),

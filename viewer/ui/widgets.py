@@ -274,7 +274,11 @@ def choice(
 ) -> int | None:
     """A row of joined buttons, `off` those that cannot be pressed; the index that was, or None."""
     gap = 2.0 * ui.scale
-    each = (imgui.get_content_region_avail().x - gap * (len(options) - 1)) / len(options)
+    room = imgui.get_content_region_avail().x - gap * (len(options) - 1)
+    widths = [room / len(options)] * len(options)
+    texts = [imgui.calc_text_size(option).x for option in options]
+    if max(texts) > widths[0]:  # the same margin for each instead of the same width
+        widths = [text + (room - sum(texts)) / len(options) for text in texts]
     pressed = None
     imgui.begin_group()
     imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
@@ -284,7 +288,7 @@ def choice(
         for slot in _BUTTON_COLORS if i == current else ():
             imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.accent_dark))
         imgui.begin_disabled(i in off)
-        if imgui.button(f"{option}##{name}", imgui.ImVec2(each, 0.0)):
+        if imgui.button(f"{option}##{name}", imgui.ImVec2(widths[i], 0.0)):
             pressed = i
         imgui.end_disabled()
         imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)

@@ -13,7 +13,6 @@ from progdf.scene.up_axis import direction_name
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import first_camera
 from viewer.gl.present import picture_texture
-from viewer.panel.panel import UPS
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
 from viewer.state import workspace
@@ -116,7 +115,7 @@ class UpActions:
 
     def _question(self) -> UpStrip:
         scene, camera = self._app.document.scene, self._app.main_view.work.view.camera
-        ups = self._app.document.found_up.candidates or tuple(up for _, up in UPS)
+        ups = self._app.document.found_up.candidates
         names = [direction_name(torch.tensor(up)).upper().replace("-", "−") for up in ups]
         choices = tuple(
             UpChoice(name, first_camera(scene, aspect=SIZE[0] / SIZE[1], fov_y=camera.fov_y, up=up))
