@@ -139,7 +139,7 @@ def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
     scene, mask = bear().scene, np.arange(len(bear().scene)) % 3 == 0
     engine = ViewEngine(ctx, scene, bear().gdfs, draw)
     clean = shown(engine, view(0.6), ctx).copy()
-    some = replace(view(0.6), selection=selection.hide(selection.select(SelectionState(), mask), len(mask)))
+    some = replace(view(0.6), selection=selection.hide(SelectionState(), mask))
     found = shown(engine, some, ctx).copy()
     kept = torch.from_numpy(~mask)
     less = ViewEngine(ctx, engine.gaussians(some)[kept.nonzero()[:, 0]], (), draw)

@@ -97,7 +97,9 @@ CHANGES: dict[str, Callable[[ViewState], ViewState]] = {
     "replace hand": lambda view: replace(view, layers=(view.layers[0], LayerState(2, "hand"))),
     "layer order": lambda view: replace(view, layers=view.layers[::-1]),
     "selection": selected,
-    "hidden splats": lambda view: replace(view, selection=selection.hide(selected(view).selection, 9)),
+    "hidden splats": lambda view: replace(
+        view, selection=selection.hide(selected(view).selection, np.arange(9) < 3)
+    ),
     "blend rule": lambda view: replace(view, blend="over"),
     "timeline": lambda view: replace(view, timeline=Timeline((Keyframe(0),))),
 }
