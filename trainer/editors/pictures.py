@@ -174,14 +174,23 @@ def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, T
     """
     picture, run = read_picture(path), torch.tensor(BACKGROUND)
     size = (picture.shape[1], picture.shape[0])
+    drawn, clear = _draw(scene, camera)
+    background = background_of(picture, resize_image(drawn, size), resize_image(clear, size), save_as(path))
+    original = resize_image((drawn + clear * (background - run)).clamp(0.0, 1.0), size)
+    return original, picture
+
+
+def picture_background(scene: Gaussians, path: Path, camera: Camera) -> Tensor:
+    """The color behind a picture, rgb [3], found at the camera's size; see `read_change`."""
+    picture = resize_image(read_picture(path), (camera.width, camera.height))
+    return background_of(picture, *_draw(scene, camera), save_as(path))
+
+
+def _draw(scene: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The scene over the run's background, not clamped [H,W,3], and its transmittance [H,W,1]."""
     with torch.no_grad():
         drawn = render(scene, camera, BACKGROUND, colors=seen_colors(scene, camera))
-    clear = drawn.transmittance[..., None]
-    background = background_of(
-        picture, resize_image(drawn.image, size), resize_image(clear, size)[..., 0], save_as(path)
-    )
-    original = resize_image((drawn.image + clear * (background - run)).clamp(0.0, 1.0), size)
-    return original, picture
+    return drawn.image, drawn.transmittance[..., None]
 
 
 def background_of(
@@ -192,15 +201,15 @@ def background_of(
     Args:
         picture: [H,W,3]
         original: the render over the run's background, not clamped. [H,W,3]
-        clear: transmittance of the scene. [H,W]
+        clear: transmittance of the scene. [H,W,1]
         save: what saving makes of an image, see `save_as`
 
     Returns:
         rgb. [3]; the run's own background, unless another leaves half as much where the scene is clear
     """
-    run, weight = torch.tensor(BACKGROUND), clear.double()
+    run, weight = torch.tensor(BACKGROUND), clear[..., 0].double()
     apart = picture - original
-    shades = ((run + apart / clear[..., None].clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
+    shades = ((run + apart / clear.clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
     # least Σ clear·|apart − clear·(color − run)| is the median with weights clear²
     colors = []
     for channel in range(3):
@@ -209,7 +218,7 @@ def background_of(
     color = torch.tensor(colors)
 
     def misfit(background: Tensor) -> float:
-        left = (apart - clear[..., None] * (background - run)).abs()
+        left = (apart - clear * (background - run)).abs()
         return float((weight[..., None] * left).sum())
 
     if misfit(color) >= 0.5 * misfit(run):
@@ -220,7 +229,7 @@ def background_of(
     likely = [before for before, error in zip(near, errors, strict=True) if error <= min(errors)]
 
     def replayed(before: Tensor) -> float:
-        over = (original + clear[..., None] * (before - run)).clamp(0.0, 1.0)
+        over = (original + clear * (before - run)).clamp(0.0, 1.0)
         return float((save(over) - picture).abs().mean())
 
     return min(likely, key=replayed) if len(likely) > 1 else likely[0]

@@ -19,6 +19,7 @@ from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, plain
+from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility
 from trainer.fit.network import fit_network
@@ -145,7 +146,12 @@ def finish_run(
     paint = None
     if plan.views.pictures:
         pictures = read_views(folder, "edited", [view.camera.name for view in setup.train], 1.0)
-        paint = measure_paint(setup, pictures, end_rows(setup, trajectory))
+        files = zip(plan.views.pictures, setup.train, strict=True)
+        backgrounds = [  # a run may be fitted again when its pictures are gone
+            picture_background(scene, path, view.camera) if path.is_file() else setup.background
+            for path, view in files
+        ]
+        paint = measure_paint(setup, pictures, backgrounds, end_rows(setup, trajectory))
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -202,8 +208,8 @@ def finish_run(
         f"wrote {folder.gdf(plan.name)}: {file_size(size)}, "
         f"{size / max(1, len(region)):.0f} bytes per Gaussian with all that is in it"
     )
-    if paint is not None and paint.warning:
-        log.say(f"warning: {paint.warning}")
+    if paint is not None:
+        log.say(f"warning: {paint.warning}" if paint.warning else paint.share)
     return RunResult(folder, folder.gdf(plan.name), report, shown)
 
 

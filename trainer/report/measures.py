@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -15,8 +17,9 @@ from progdf.field.evaluate import sample_strengths
 from progdf.field.remap import SliderRemap
 from progdf.field.trajectory import Trajectory
 from progdf.formats.load_report import format_count, group_digits
+from progdf.gaussians import Gaussians
 from progdf.metrics.slider import SliderStatistics, slider_statistics
-from progdf.rasterize import alpha_weights
+from progdf.rasterize import alpha_weights, render
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
@@ -31,7 +34,7 @@ COMPARED = "keyframes2"
 
 _EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
 _ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
-_MISSED = 1 / 9  # of the energy of a painted change: a third of its contrast
+_ALIKE = 0.05  # of color, by which `changed` tells a painted pixel where it knows nothing of how it was saved
 _NODES = 6  # recordings at which the field is looked at
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
 
@@ -251,38 +254,51 @@ class PaintTaken:
     """How much of what was painted on pictures is in the edit."""
 
     reached: float  # share of the painted change's energy, 0..1
+    missing: float  # what of it is not there, of color, root of the mean square over the painted pixels
     pixels: int  # that were painted
     members: int  # that mostly show in these
-    removes: bool  # whether the scene without the members explains as much of it as is asked of the edit
+    removes: bool  # whether most of the change's energy shows what lies behind the members
+
+    @property
+    def share(self) -> str:
+        """How much it is, in a line."""
+        return f"{100 * self.reached:.0f} % of what was painted is in the edit"
 
     @property
     def warning(self) -> str:
-        """One line that says how little it is, and why; "" where two thirds of the contrast are there, which
-        leaves a ninth of the energy, and nothing was to be removed."""
-        if not self.pixels or (self.reached >= 1 - _MISSED and not self.removes):
+        """One line that says how little it is, and why; "" where it does not show, and nothing was removed.
+
+        What is missing shows where it is as strong as a change that would be told from none, or, of a
+        fainter one, the larger part of it.
+        """
+        shows = self.missing > _ALIKE or self.reached < 0.5
+        if not self.pixels or not (shows or self.removes):
             return ""
         reasons = []
         if self.removes:
             reasons.append(
                 "the painting covers things with what lies behind them: nothing is removed by painting"
             )
-        if self.reached < 1 - _MISSED and self.members < self.pixels:
+        if shows and self.members < self.pixels:
             stand = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"
             reasons.append(f"{stand}; the detail is finer than they are")
-        share = f"{100 * self.reached:.0f} % of what was painted is in the edit"
-        return f"{share}: {'; '.join(reasons)}" if reasons else share
+        return f"{self.share}: {'; '.join(reasons)}" if reasons else self.share
 
     def figures(self) -> dict[str, Any]:
         """What report.json says of it."""
-        return {**asdict(self), "reached": _four(self.reached), "warning": self.warning}
+        rounded = {"reached": _four(self.reached), "missing": _four(self.missing)}
+        return {**asdict(self), **rounded, "warning": self.warning}
 
 
-def measure_paint(setup: TrainingSetup, painted: Sequence[Tensor], rows: Tensor) -> PaintTaken:
+def measure_paint(
+    setup: TrainingSetup, painted: Sequence[Tensor], backgrounds: Sequence[Tensor], rows: Tensor
+) -> PaintTaken:
     """Compare the edit with the pictures that it was made of.
 
     Args:
         setup: scene, region, and the pictures' views
         painted: the views as they were painted. [H,W,3] each
+        backgrounds: what shows through the scene in each picture, rgb. [3] each
         rows: raw member rows of the edit, packed. [M,C]
     """
     scene, members = setup.scene, setup.region.members
@@ -291,16 +307,33 @@ def measure_paint(setup: TrainingSetup, painted: Sequence[Tensor], rows: Tensor)
     without = scene[others.nonzero()[:, 0]]
     change = missing = behind = 0.0
     pixels, weights = 0, torch.zeros(len(scene), 2, dtype=torch.float64)
-    for view, target in zip(setup.train, painted, strict=True):
+    for view, target, background in zip(setup.train, painted, backgrounds, strict=True):
+        energy = (target - view.image).square().sum(dim=2)
         touched = (target - view.image).abs().amax(dim=2) > _ROUNDED
-        made, gone = (
-            render_view(some, view.camera, setup.background).clamp(0.0, 1.0) for some in (edited, without)
-        )
-        change += float((target - view.image)[touched].square().sum())
+        made = render_view(edited, view.camera, setup.background).clamp(0.0, 1.0)
+        change += float(energy[touched].sum())
         missing += float((target - made)[touched].square().sum())
-        behind += float((target - gone)[touched].square().sum())
+        behind += float(energy[touched & _shows_behind(scene, without, view, target, background)].sum())
         pixels += int(touched.sum())
         weights += alpha_weights(scene, view.camera, touched)[:, (0, 2)]
     inside, weight = weights[members].unbind(1)
     shown = int((inside > 0.5 * weight).sum())
-    return PaintTaken(max(0.0, 1.0 - missing / max(change, 1e-12)), pixels, shown, behind < _MISSED * change)
+    strength = (missing / max(1, 3 * pixels)) ** 0.5
+    reached = max(0.0, 1.0 - missing / max(change, 1e-12))
+    return PaintTaken(reached, strength, pixels, shown, behind > 0.5 * change)
+
+
+def _shows_behind(
+    scene: Gaussians, without: Gaussians, view: View, target: Tensor, background: Tensor
+) -> Tensor:
+    """Where a picture shows what lies behind the members, or its background in one piece with where nothing
+    else was: what the members hid was painted away with them. [H,W] bool"""
+    original, gone = (render_view(some, view.camera, background).clamp(0, 1) for some in (scene, without))
+    picture = target + original - view.image  # over its own background
+    bare = (picture - background).abs().amax(dim=2) < _ALIKE
+    clear = render(scene, view.camera, (0.0, 0.0, 0.0)).transmittance > 0.5
+    # a soft rim is a pixel wide on either side
+    pieces, count = ndimage.label(ndimage.binary_dilation(bare.numpy(), np.ones((3, 3))))
+    open_ = np.zeros(count + 1, dtype=bool)
+    open_[pieces[(bare & clear).numpy()]] = True
+    return bare & torch.from_numpy(open_[pieces]) | ((picture - gone).abs().amax(dim=2) < _ALIKE)

@@ -60,13 +60,13 @@ def test_a_background_of_another_color_is_found(color: list[float]) -> None:
     drawn = render(scene, looking(scene)[0])
     picture = quantize_image(drawn.image + drawn.transmittance[..., None] * (background - 1))
     picture[:12] = torch.tensor([0.9, 0.1, 0.2])  # a quarter of it painted over
-    found = background_of(picture, drawn.image, drawn.transmittance, quantize_image)
+    found = background_of(picture, drawn.image, drawn.transmittance[..., None], quantize_image)
     assert float((found - background).abs().max()) <= 0.51 / 255
 
 
 def test_a_picture_without_any_background_has_the_run_s() -> None:
     picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(background_of(picture, picture.flip(0), torch.zeros(8, 8), quantize_image), WHITE)
+    assert torch.equal(background_of(picture, picture.flip(0), torch.zeros(8, 8, 1), quantize_image), WHITE)
 
 
 def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:

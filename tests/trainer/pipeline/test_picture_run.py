@@ -89,26 +89,56 @@ def test_a_fill_that_took_is_reported_without_a_warning(done: RunResult) -> None
     assert "warning:" not in done.folder.log.read_text()
 
 
-def test_painting_a_thing_away_is_said_to_remove_nothing(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.1, 0.2, 0.4)])
+@pytest.mark.parametrize("all_of_it", [False, True])
+def test_painting_a_thing_away_is_said_to_remove_nothing(
+    folder: Path, background: tuple[float, float, float], all_of_it: bool
+) -> None:
     scene, region = bear(folder)
     setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
     others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, region.members, False)
-    without = scene[others.nonzero()[:, 0]]
-    painted = [render_view(without, view.camera, setup.background).clamp(0, 1) for view in setup.train]
-    found = measure_paint(setup, painted, pack(scene[region.members], with_shN=True))
+    # all of it: with what the members hide, which are then less than was painted away
+    left = scene[:0] if all_of_it else scene[others.nonzero()[:, 0]]
+    behind = torch.tensor(background)
+    painted = [
+        view.image
+        + render_view(left, view.camera, behind).clamp(0, 1)
+        - render_view(scene, view.camera, behind).clamp(0, 1)
+        for view in setup.train
+    ]
+    rows = pack(scene[region.members], with_shN=True)
+    found = measure_paint(setup, painted, [behind] * len(painted), rows)
     assert found.reached == pytest.approx(0.0, abs=0.01)
     assert found.warning.startswith("0 % of what was painted is in the edit: the painting covers things")
     assert "nothing is removed by painting" in found.warning
     originals = [view.image for view in setup.train]
-    kept = measure_paint(setup, originals, pack(scene[region.members], with_shN=True))
+    kept = measure_paint(setup, originals, [behind] * len(painted), rows)
     assert (kept.pixels, kept.warning) == (0, "")
 
 
-def test_detail_finer_than_the_splats_is_said_with_both_counts(done: RunResult) -> None:
-    assert PaintTaken(0.37, 2074, 457, False).warning == (
+@pytest.mark.parametrize("color", [(0.9, 0.9, 0.9), (0.8, 0.1, 0.1)])
+def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
+    folder: Path, color: tuple[float, float, float]
+) -> None:
+    scene, region = bear(folder)
+    setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
+    painted = [
+        torch.where(view.mask[..., None] > 0.5, torch.tensor(color), view.image) for view in setup.train
+    ]
+    rows = pack(scene[region.members], with_shN=True)
+    assert not measure_paint(setup, painted, [setup.background] * len(painted), rows).removes
+
+
+def test_detail_finer_than_the_splats_is_said_with_both_counts() -> None:
+    assert PaintTaken(0.37, 0.2, 2074, 457, False).warning == (
         "37 % of what was painted is in the edit: 457 Gaussians stand for 2 074 painted pixels; "
         "the detail is finer than they are"
     )
+
+
+def test_a_faint_paint_warns_where_the_larger_part_is_missing() -> None:
+    assert PaintTaken(0.49, 0.01, 100, 90, False).warning
+    assert not PaintTaken(0.51, 0.01, 100, 90, False).warning
 
 
 def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
