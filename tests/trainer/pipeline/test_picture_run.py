@@ -131,6 +131,15 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
     assert not measure_paint(setup, painted, [setup.background] * len(painted), rows).removes
 
 
+def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: Path) -> None:
+    scene, region = bear(folder)
+    setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
+    noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0)) * 0.04
+    saved = [torch.where(view.mask[..., None] > 0.5, view.image, view.image - noise) for view in setup.train]
+    rows = pack(scene[region.members], with_shN=True)
+    assert measure_paint(setup, saved, [setup.background] * len(saved), rows).pixels == 0
+
+
 def test_detail_finer_than_the_splats_is_said_with_both_counts() -> None:
     assert PaintTaken(0.37, 0.2, 2074, 457, False).warning == (
         "37 % of what was painted is in the edit: 457 Gaussians stand for 2 074 painted pixels; "
