@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -290,6 +291,14 @@ def test_no_file_is_longer_than_one_reads_in_a_sitting(sources: dict[Path, str])
     lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
     long = sorted(name for name, lines in lengths.items() if lines > MOST_LINES)
     assert not long, f"more than {MOST_LINES} lines: {long}"
+
+
+def test_builders_draw_what_every_processor_draws_alike() -> None:
+    """torch's normal numbers of one seed differ in their last bits."""
+    drawing = re.compile(r"torch\.(rand|normal)|\.(normal_|uniform_)\(")
+    builders = sorted((ROOT / "tests" / "helpers").glob("*.py"))
+    assert builders
+    assert [path.name for path in builders if drawing.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_the_wheel_holds_what_is_used_and_the_sdist_what_is_read() -> None:

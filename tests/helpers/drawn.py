@@ -11,6 +11,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, Crop, RasterInfo, Rendering, activate, render
+from tests.helpers.draws import Draws
 from tests.helpers.scenes import hard_cases
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
@@ -40,8 +41,7 @@ def draw(
         name: tensor.to(dtype).clone().requires_grad_() for name, tensor in zip(INPUTS, inputs, strict=True)
     }
     image, transmittance, info = render_leaves(leaves, camera, gaussians.antialiased, engine, crop)
-    rng = torch.Generator().manual_seed(11)
-    weights = torch.randn(camera.height, camera.width, 4, generator=rng).to(dtype)
+    weights = Draws(11).normal(camera.height, camera.width, 4).to(dtype)
     if crop is not None:
         weights = weights[crop[1] : crop[3], crop[0] : crop[2]]
     ((image * weights[..., :3]).sum() + (transmittance * weights[..., 3]).sum()).backward()

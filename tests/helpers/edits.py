@@ -12,6 +12,7 @@ from progdf.field.rendered import Render
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.region import Region
+from tests.helpers.draws import Draws
 
 
 def curved_trajectory(
@@ -22,12 +23,12 @@ def curved_trajectory(
     snapshots: int = 9,
 ) -> tuple[Tensor, Tensor]:
     """Strengths [T] and offsets [T,M,C] of members that bend away from the straight way in two manners."""
-    rng = torch.Generator().manual_seed(seed)
+    draws = Draws(seed)
     strengths = torch.linspace(0, 1, snapshots)
     bend, wave = torch.sin(torch.pi * strengths), torch.sin(2 * torch.pi * strengths)
     offsets = torch.zeros(snapshots, members, channels)
     for course, size in ((strengths, 1.0), (bend, 0.5), (wave, 0.2)):
-        offsets += course[:, None, None] * size * torch.randn(members, channels, generator=rng)
+        offsets += course[:, None, None] * size * draws.normal(members, channels)
     for name, columns in attribute_slices(channels).items():
         if name not in moving:
             offsets[:, :, columns] = 0.0
@@ -55,8 +56,8 @@ def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
 
 def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
     """A stand-in for a renderer: shows color well, geometry little, half of the members not at all."""
-    rng = torch.Generator().manual_seed(seed)
-    shown = torch.randn(90, members, channels, generator=rng) / (members * channels) ** 0.5
+    draws = Draws(seed)
+    shown = draws.normal(90, members, channels) / (members * channels) ** 0.5
     shown[:, ::2] = 0.0
     for name, size in (("means", 0.02), ("log_scales", 0.02), ("quats", 0.0), ("sh0", 0.2)):
         shown[:, :, attribute_slices(channels)[name]] *= size
@@ -72,8 +73,7 @@ def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "s
 
 def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:
     """`count` different rows, sorted. [M] int64"""
-    rng = torch.Generator().manual_seed(seed)
-    return torch.randperm(len(scene), generator=rng)[:count].sort().values
+    return Draws(seed).order(len(scene))[:count].sort().values
 
 
 def bits(gaussians: Gaussians) -> dict[str, bytes]:

@@ -12,6 +12,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from progdf.gaussians import ATTRIBUTES, Gaussians
+from tests.helpers.draws import Draws
 from tests.helpers.scenes import random_gaussians
 
 COUNT = 50
@@ -20,7 +21,7 @@ COUNT = 50
 def scene_of(sh_degree: int = 3, count: int = COUNT, seed: int = 1) -> Gaussians:
     """A scene with quaternions of unit length, as a file gives it."""
     scene = random_gaussians(count, seed=seed)
-    higher = torch.randn(count, (sh_degree + 1) ** 2 - 1, 3, generator=torch.Generator().manual_seed(seed))
+    higher = Draws(seed).normal(count, (sh_degree + 1) ** 2 - 1, 3)
     return replace(scene, quats=scene.unit_quats, shN=higher)
 
 

@@ -38,7 +38,8 @@ def test_the_fast_one_keeps_the_plain_ones_gaussians(budget: int, antialiased: b
     # the fast threshold lies between two edges of bins that are a ninth apart: few lots lie between the two
     assert int(both[0].sum()) >= 0.98 * max(len(ours), len(rows)), "the same lots, and the same threshold"
     for fast, plain in zip(found.tensors, expected.tensors, strict=True):
-        torch.testing.assert_close(fast[both[0]], plain[both[1]], rtol=2e-2, atol=1e-3)
+        # 2e-3: a fiftieth of a pixel, which is .1 wide there; a size is a root, steep near 0
+        torch.testing.assert_close(fast[both[0]], plain[both[1]], rtol=2e-2, atol=2e-3)
     assert (len(rows) == pytest.approx(budget, rel=0.1)) == (budget < 4000)
 
 
