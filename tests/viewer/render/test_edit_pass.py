@@ -340,14 +340,17 @@ def test_edits_that_no_texture_can_hold_are_refused(
 
 
 def test_the_sample_sees_a_wrong_texel(edited: Edited) -> None:
+    """By a rule that looks at each member for itself: what "over" hides follows from all members of an edit
+    (their size, a tenth of their changes), of which the sample holds a part.
+    """
     sample = EditSample(edited.scene, edited.gdfs)
     stack = [(0, Layer(edited.gdfs[0], 0.5, weights=painted(400))), (3, Layer(edited.gdfs[3], 0.9))]
-    edited.update(stack, "over")
-    assert sample.error(edited.edit_pass, stack, "over") <= FEW_ULPS
+    edited.update(stack, "sum")
+    assert sample.error(edited.edit_pass, stack, "sum") <= FEW_ULPS
     middle = int(edited.gdfs[0].region.members[200])
     place = (middle % SPLATS_PER_ROW, middle // SPLATS_PER_ROW, 1, 1)
     edited.textures.textures["quat"].write(np.full(4, 7.0, np.float32), viewport=place)
-    assert sample.error(edited.edit_pass, stack, "over") > 0.1
+    assert sample.error(edited.edit_pass, stack, "sum") > 0.1
 
 
 def test_differences_of_numbers_that_are_not_finite() -> None:
