@@ -29,12 +29,14 @@ def test_a_way_that_only_changes_its_pace_needs_no_basis_beside_the_end() -> Non
 
 
 def test_weights_turn_the_joint_bases_to_what_shows() -> None:
+    """Half of the members wave on their way, twice as far as the others bend: one basis has to choose."""
     strengths, offsets = curved_trajectory(40)
+    offsets[:, 20:] += 2 * torch.sin(2 * torch.pi * strengths)[:, None, None] * offsets[-1, 20:]
     weights = torch.ones(40)
     weights[20:] = 1e-4
     fields = [fit_joint(strengths, offsets, 1, given) for given in (None, weights)]
     evenly, weighted = ((at_snapshots(f, strengths) - offsets)[:, :20].square().mean() for f in fields)
-    assert float(weighted) < 0.999 * float(evenly)
+    assert float(weighted) < 0.5 * float(evenly)
 
 
 def test_the_size_of_one_attribute_says_nothing_about_the_others() -> None:

@@ -43,7 +43,8 @@ def views_of(scene: Gaussians, *paths: Path) -> list[View]:
 def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
     scene = ball()
     camera = looking(scene)[0]
-    path = save(tmp_path / "A.png", 1 - 0.5 * render_view(scene, camera, WHITE), camera)
+    shown = render_view(scene, camera, WHITE).clamp(0, 1)  # as a view is: a picture knows nothing above white
+    path = save(tmp_path / "A.png", 1 - 0.5 * shown, camera)
     (view,) = views_of(scene, path)
     editor = make_editor(f"pictures:{path}", scene, whole_scene(scene), [view])
     assert editor.stages == (1.0,)
