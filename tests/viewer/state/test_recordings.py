@@ -298,7 +298,17 @@ def test_equal_pictures_are_told_as_such_and_figures_that_were_not_taken_are_lef
 
 
 def rendered(*options: str) -> np.ndarray:
-    common = ("bear.ply", "scarf/scarf.gdf", "ears/ears.gdf", "--set", f"scarf={AT}", "--set", "ears=0", "--size", "96x72")
+    common = (
+        "bear.ply",
+        "scarf/scarf.gdf",
+        "ears/ears.gdf",
+        "--set",
+        f"scarf={AT}",
+        "--set",
+        "ears=0",
+        "--size",
+        "96x72",
+    )
     assert main(["render", *common, "--engine", "cpu", *options, "-o", "out.png"]) == 0
     return np.asarray(Image.open("out.png")).astype(int)
 
