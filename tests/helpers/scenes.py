@@ -11,6 +11,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, normalize_quats
+from tests.helpers.draws import Draws
 
 
 def random_gaussians(
@@ -25,11 +26,7 @@ def random_gaussians(
         spread: standard deviation of the centers, world units
         scale: median standard deviation of one Gaussian, world units; axes differ by a factor of about 2
     """
-    rng = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=rng)
-
+    normal = Draws(seed).normal
     return Gaussians(
         means=normal(count, 3) * spread,
         quats=normal(count, 4),
@@ -44,7 +41,7 @@ def ball(count: int = 2000, radius: float = 1.0, seed: int = 0) -> Gaussians:
     """Gaussians inside a ball around the origin."""
     scene = random_gaussians(count, seed=seed, scale=0.01)
     places = torch.nn.functional.normalize(scene.means, dim=1)
-    distances = torch.rand(count, 1, generator=torch.Generator().manual_seed(seed)) ** (1 / 3)
+    distances = Draws(seed + 1).uniform(count, 1) ** (1 / 3)
     return replace(scene, means=radius * distances * places)
 
 
@@ -208,12 +205,12 @@ def hard_cases() -> dict[str, HardCase]:
 
 def _stack(layer: Gaussians, count: int) -> Gaussians:
     stack = layer[torch.zeros(count, dtype=torch.int64)]
-    rng = torch.Generator().manual_seed(5)
-    depth = torch.linspace(2.0, 3.0, count)[torch.randperm(count, generator=rng)]
+    draws = Draws(5)
+    depth = torch.linspace(2.0, 3.0, count)[draws.order(count)]
     return replace(
         stack,
         means=torch.stack([torch.zeros(count), torch.zeros(count), depth], dim=1),
-        sh0=torch.randn(count, 3, generator=rng),
+        sh0=draws.normal(count, 3),
     )
 
 
