@@ -36,6 +36,9 @@ _ODDS = 6.0
 """Times as likely as the next direction (45° or more away) has to be what is taken without a question: more
 than the convention makes it alone."""
 
+_TOLD = 0.3
+"""Nats from which a reason is said: a third likelier."""
+
 _WEIGHTS = {
     "vertical edges": 2.6,
     "symmetry": 2.0,
@@ -175,15 +178,17 @@ def _weigh(scene: Gaussians) -> UpAxis:
     best = order[0]
     rival = next(i for i in order if float(directions[i] @ directions[best]) < math.sqrt(0.5))
     against = {name: value - terms[rival][name] for name, value in terms[best].items()}
-    told = sorted((name for name in against if abs(against[name]) >= 0.3), key=lambda n: -abs(against[n]))
+    told = sorted((name for name in against if abs(against[name]) >= _TOLD), key=lambda n: -abs(against[n]))
     reasons = ", ".join(f"{name} {against[name]:+.1f}" for name in told)
     other = direction_name(directions[rival])
     odds = float(likely[best] / likely[rival])
     why = f"{100 * float(likely[best]):.0f} % likely; against {other}: {reasons}"
-    if odds < _ODDS:
+    # the convention decides nothing alone: what is there has to speak for it too, by what is worth a word
+    certain = odds >= _ODDS and sum(against.values()) - against["convention"] >= _TOLD
+    if not certain:
         why += f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: look, and choose with --up"
     candidates = tuple(directions[i] for i in order)
-    return UpAxis(directions[best], why, odds >= _ODDS, candidates)
+    return UpAxis(directions[best], why, certain, candidates)
 
 
 def _convention(direction: Tensor) -> float:

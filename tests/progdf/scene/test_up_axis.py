@@ -220,3 +220,11 @@ def tilted(up: Tensor) -> str:
 def test_a_tilted_up_direction_is_named_by_its_numbers() -> None:
     for rounding in (0.0, 4e-17, -4e-8):
         assert tilted(torch.tensor([rounding, -0.957826, 0.287348])) == "0 -0.958 0.287"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cloud_without_any_direction_is_not_decided_by_the_convention_alone(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert not find_up(random_gaussians(300, seed=seed, scale=0.2)).certain
