@@ -42,18 +42,15 @@ class Way:
         title: in the table
         draw: of `engine.DRAWS`
         whole: draw the whole picture at every step, though only a part of it has changed
-        edit_pass: of `engine.EDIT_PASSES`: what works out the attributes
     """
 
     title: str
     draw: str
     whole: bool = False
-    edit_pass: str = "cpu"
 
 
 WAYS = {
     "gl": Way("OpenGL", "gl"),
-    "gl, gpu": Way("OpenGL, the GPU's edit pass", "gl", edit_pass="gpu"),
     "cpu": Way("CPU", "cpu"),
     "cpu, whole": Way("CPU, whole picture", "cpu", whole=True),
 }
@@ -95,7 +92,6 @@ class SliderTimes:
         parts: what of that the engine took
         psnr_db: against `progdf.render`, the worst of three strengths
         apart: largest difference of a picture that was drawn step by step from the same drawn afresh
-        edit_error: largest difference of an attribute from `progdf.compose` (see `ViewEngine.edit_error`)
     """
 
     case: SliderCase
@@ -105,7 +101,6 @@ class SliderTimes:
     parts: tuple[FrameTimings, ...]
     psnr_db: float
     apart: float
-    edit_error: float
 
     @property
     def rest_ms(self) -> float:
@@ -152,7 +147,7 @@ def rows(
     with ExitStack() as held:
         mice: dict[str, Mouse] = {}
         for name, way in WAYS.items():
-            engine = ViewEngine(ctx, scene, [gdf], way.draw, way.edit_pass)
+            engine = ViewEngine(ctx, scene, [gdf], way.draw)
             held.callback(engine.release)
             mice[name] = held.enter_context(Mouse(ctx, engine, scene, [gdf], view, size))
             mice[name].grip_slider()
@@ -172,7 +167,6 @@ def rows(
                 tuple(parts[name][WARM_UP:]),
                 _psnr(mouse.engine, view, size),
                 _apart(mouse, size),
-                mouse.engine.edit_error(),
             )
             for name, mouse in mice.items()
         ]
@@ -196,7 +190,6 @@ def table(results: Sequence[SliderTimes], renderer: str) -> Table:
             "redrawn",
             "in all p50 / p95",
             "PSNR to the CPU engine, dB",
-            "attributes off by",
         ),
         tuple(_cells(result) for result in results),
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
@@ -218,7 +211,6 @@ def _cells(result: SliderTimes) -> tuple[str, ...]:
         f"{100 * np.median([part.share for part in result.parts]):.0f} %",
         f"**{middle:.1f}** / {late:.1f}",
         "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
-        f"{result.edit_error:.0e}" if result.edit_error else "0",
     )
 
 

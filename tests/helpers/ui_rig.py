@@ -157,7 +157,6 @@ def rig(
     stack: Stack | None = None,
     pictures: Path = Path(),
     draw: str = "cpu",
-    edit_pass: str = "auto",
     gdf_paths: Sequence[Path] = (),
 ) -> Iterator[Rig]:
     """A main view on the bear.
@@ -167,12 +166,12 @@ def rig(
         points: size of the window in its own coordinates
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
-        draw, edit_pass: what draws the splats and what edits them, as for the engine
+        draw: what draws the splats, as for the engine
         gdf_paths: where the edits were opened from, one for each; none is not from files
     """
     stack = stack or bear()
     context = headless_context()
-    engine = ViewEngine(context, stack.scene, stack.gdfs, draw, edit_pass)
+    engine = ViewEngine(context, stack.scene, stack.gdfs, draw)
     facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
     main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
     try:

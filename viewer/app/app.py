@@ -43,7 +43,6 @@ def run(
     session: Path | None = None,
     snapshots: tuple[SliderSnapshot, ...] = (),
     draw: str = "auto",
-    edit_pass: str = "auto",
     warning: str = "",
 ) -> int:
     """Open the window and stay until it is closed.
@@ -54,18 +53,18 @@ def run(
         size: of the window, at 1×
         session: the file it was opened from and is saved to
         snapshots: kept states
-        draw, edit_pass: what draws and what edits, see `ViewEngine`
+        draw: what draws, see `ViewEngine`
         warning: what to say first
 
     Returns:
         The exit status, 0.
 
     Raises:
-        ProgdfError: there is no display, or no OpenGL 3.3 on it; or the GPU shall edit what the CPU draws.
+        ProgdfError: there is no display, or no OpenGL 3.3 on it.
     """
     window = Window(_window_title(document.title), size)
     try:
-        app = App(window, document, state, session, draw=draw, edit_pass=edit_pass)
+        app = App(window, document, state, session, draw=draw)
         app.main_view.restart(state, snapshots)
         if warning:
             app.main_view.show_message(warning, error=True)
@@ -91,11 +90,10 @@ class App:
         session: Path | None = None,
         memory: Path | None = None,
         draw: str = "auto",
-        edit_pass: str = "auto",
     ) -> None:
         self.window, self.document = window, document
         self.context = window.context()
-        self._draw, self._edit_pass = draw, edit_pass
+        self._draw = draw
         self.engine = self._engine(document)
         self.main_view = MainView(
             self.context,
@@ -299,7 +297,7 @@ class App:
 
     def _engine(self, document: Document, live: tuple[Gdf, ...] = ()) -> ViewEngine:
         gdfs = (*document.gdfs, *live)
-        return ViewEngine(self.context, document.scene, gdfs, self._draw, self._edit_pass)
+        return ViewEngine(self.context, document.scene, gdfs, self._draw)
 
     def leave(self) -> None:
         """Close the window, without a question."""

@@ -374,8 +374,7 @@ class MainView:
         """What the overlay shows of the picture on screen."""
         pixels, count, by = self.canvas.pixels, self.facts.count, self.engine.draws_with
         drawn = drawn_size(self._pointer().size, pixels)
-        edits = self.engine.edits()
-        return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels, edits)
+        return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels)
 
     @property
     def picture_size(self) -> tuple[int, int]:

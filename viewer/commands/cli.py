@@ -45,7 +45,6 @@ def view(argv: Sequence[str]) -> int:
         session=found.session,
         snapshots=found.snapshots,
         draw=options.engine,
-        edit_pass=options.edit_pass,
         warning=found.warning,
     )
 

@@ -56,8 +56,6 @@ class PictureOptions(StackOptions):
     """#rrggbb, white or black."""
     engine: Annotated[Literal["auto", "gl", "cpu"], tyro.conf.arg(aliases=["--draw"])] = "auto"
     """What draws: OpenGL or the CPU rasterizer; auto takes OpenGL where a graphics card does the work."""
-    edit_pass: Literal["auto", "gpu", "cpu"] = "auto"
-    """What computes the attributes of a new strength; auto takes the GPU where a graphics card draws."""
 
 
 @dataclass(frozen=True, kw_only=True)

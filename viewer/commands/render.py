@@ -71,7 +71,7 @@ def render(argv: Sequence[str]) -> int:
             told = ""
         else:
             told = _render_still(options, found, view, camera, engine)
-        drawn_by = _describe_engine(engine)
+        drawn_by = engine.draws_with
     each = "each " if options.sheet is not None else ""
     strengths = "" if swept else f": {arguments.describe_strengths(view)}"
     print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by}){strengths}")
@@ -220,19 +220,13 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> It
         except ProgdfError:
             if options.engine == "gl":
                 raise
-    engine = ViewEngine(ctx, scene, gdfs, options.engine, options.edit_pass)
+    engine = ViewEngine(ctx, scene, gdfs, options.engine)
     try:
         yield engine
     finally:
         engine.release()
         if ctx is not None:
             ctx.release()
-
-
-def _describe_engine(engine: ViewEngine) -> str:
-    """The engine in words, with its edit pass if that had a part in the picture, or why it had none."""
-    edits = engine.edits()
-    return engine.draws_with if edits is None else f"{engine.draws_with}, edited by {edits.description}"
 
 
 def _say_frames() -> timeline_film.Advance:

@@ -17,7 +17,7 @@ SH0 = np.dtype([("sh0", "<f4", 3), ("unused", "<f4")])
 SPLAT_TEXTURES = {"mean_logit": MEAN_LOGIT, "log_scale": LOG_SCALE, "quat": QUAT, "sh0": SH0}
 """Sampler in shaders/include/raw_splats.glsl -> one texel of it; raw parameters, 16 bytes each.
 
-Bands 1 to 3 lie in `shN`: rgb32f (rgba32f where the edit pass writes it), K texels a Gaussian.
+Bands 1 to 3 lie in `shN`: rgb32f, K texels a Gaussian.
 """
 
 HIGHLIGHT = np.dtype([("rgb", "u1", 3), ("share", "u1")])
@@ -55,26 +55,3 @@ ORDER = np.dtype("<u4")
 GRID_LINE = np.dtype([("ends", "<f4", 4), ("depths", "<f4", 2), ("cells", "<f4", 4), ("color", "<f4", 4)])
 """A line of the grid on the ground: both ends in pixels of the picture, their depths, where they lie in the
 grid (at 1 it has faded), and its color with the share that it takes; read by shaders/grid.vert."""
-
-TARGETS = (*SPLAT_TEXTURES, "shN")
-"""The textures that the edit pass writes, as include/edit_layers.glsl counts them."""
-
-TEXELS_PER_ROW = 4096
-"""Texels in a row of the lists that the edit pass reads; see `gl.texel_list`."""
-
-EDIT_TARGET = np.dtype([("full", "<i4"), ("rest", "<i4"), ("rank", "<i4"), ("numbers", "<i4")])
-"""What a layer does to one of `TARGETS`; one rgba32i texel, explained in include/edit_layers.glsl."""
-
-EDIT_LAYER = np.dtype(
-    [
-        ("places", "<i4"),
-        ("weights", "<i4"),
-        ("numbers", "<i4"),
-        ("covers", "<i4"),
-        ("targets", EDIT_TARGET, len(TARGETS)),
-    ]
-)
-"""One layer of the stack, LAYER_TEXELS rgba32i texels."""
-
-SPAN = np.dtype([("column", "<i4"), ("row", "<i4"), ("texels", "<i4"), ("slot", "<i4")])
-"""Gaussians that follow each other in one row of the scene's textures; `span` in shaders/edit.vert."""

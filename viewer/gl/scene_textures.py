@@ -23,19 +23,14 @@ class SplatTextures:
         ctx: where they live
         count: N
         sh_coefficients: K of shN that are shown: 0, 3, 8 or 15
-        editable: let the edit pass write shN too: a third larger, as no driver has to draw into rgb32f
     """
 
-    def __init__(
-        self, ctx: moderngl.Context, count: int, sh_coefficients: int, editable: bool = False
-    ) -> None:
+    def __init__(self, ctx: moderngl.Context, count: int, sh_coefficients: int) -> None:
         self.count = count
         self.sh_coefficients = sh_coefficients
-        self.editable = editable
         self.rows = max(1, -(-count // SPLATS_PER_ROW))
         self._channels = dict.fromkeys(SPLAT_TEXTURES, 4)
-        sh_components = 4 if editable else 3
-        self._channels["shN"] = sh_components * max(1, sh_coefficients)
+        self._channels["shN"] = 3 * max(1, sh_coefficients)
         self._memory = {
             name: np.zeros((self.rows * SPLATS_PER_ROW, channels), np.float32)
             for name, channels in self._channels.items()
@@ -47,7 +42,7 @@ class SplatTextures:
             components = 4
             if name == "shN":
                 size = (SPLATS_PER_ROW * sh_coefficients, self.rows) if sh_coefficients else (1, 1)
-                components = sh_components
+                components = 3
             texture = ctx.texture(size, components, dtype="f4")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
             self.textures[name] = texture

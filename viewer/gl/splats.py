@@ -71,19 +71,14 @@ class SplatRenderer:
         assert self._scene is not None, "upload comes first"
         return self._scene
 
-    def upload(self, scene: Gaussians, editable: bool = False) -> int:
-        """Take a whole scene; gives the bytes sent. The order has to be set anew.
-
-        Args:
-            scene: what is drawn
-            editable: see `SplatTextures`
-        """
+    def upload(self, scene: Gaussians) -> int:
+        """Take a whole scene; gives the bytes sent. The order has to be set anew."""
         count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)
-        wanted = (count, coefficients, editable)
+        wanted = (count, coefficients)
         held = self._scene
-        if held is None or (held.count, held.sh_coefficients, held.editable) != wanted:
+        if held is None or (held.count, held.sh_coefficients) != wanted:
             self._release_scene()
-            self._scene = SplatTextures(self.ctx, count, coefficients, editable)
+            self._scene = SplatTextures(self.ctx, count, coefficients)
             self._buffers = self._make_buffers(max(count, 1))
         self._drawn = 0
         self._antialiased = scene.antialiased

@@ -146,8 +146,7 @@ class Comparer:
             if self._other is not None:
                 self._other.release()
             self._against = self.against(view)  # reading a recording may have shown that it is none
-            ways = self.engine.draws_with, self.engine.edits_with
-            self._other = ViewEngine(self._ctx, self.engine.scene, gdfs, *ways)
+            self._other = ViewEngine(self._ctx, self.engine.scene, gdfs, self.engine.draws_with)
         return self._other
 
     def _load_recorded(self) -> tuple[Gdf, ...]:

@@ -16,20 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
-from progdf.compose.layers import Gains
+from progdf.compose.composer import Composer
+from progdf.compose.layers import Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.scene.bounds import near_plane
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import bounds_of, half_camera, to_camera
-from viewer.gl.edit_pass import EditPassError
-from viewer.render.timings import EditsBy, FrameTimings
+from viewer.render.timings import FrameTimings
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
 
-from .attribute_updates import CpuEditing, Editing, GpuEditing, Stack
 from .cpu_renderer import CpuRenderer
 from .depth_sort import back_to_front
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
@@ -38,9 +37,6 @@ from .highlight import Highlight, highlight_colors
 from .renderers import GlRenderer, Image, Renderer
 
 DRAWS = ("auto", "gl", "cpu")
-EDIT_PASSES = ("auto", "gpu", "cpu")
-"""What works out the attributes; "auto" leaves the edit pass to graphics cards: llvmpipe takes 0.6 µs of the
-processor's time a member (places, shapes and colors, three bases), where composing and sending take 0.06."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +67,10 @@ class ViewEngine:
         scene: the original
         gdfs: the edits that `LayerState.gdf` counts
         draw: "gl", "cpu", or "auto": "gl" where OpenGL has hardware behind it
-        edit_pass: what works out the attributes of a new strength: "gpu" (see gl/edit_pass.py), "cpu", or
-            "auto": "gpu" where OpenGL draws with hardware behind it
 
     Raises:
-        ProgdfError: an edit was made for another scene; or "gpu" where the CPU draws.
-        ValueError: `draw` or `edit_pass` is unknown, or `draw` is "gl" without a context.
+        ProgdfError: an edit was made for another scene.
+        ValueError: `draw` is unknown, or "gl" without a context.
     """
 
     def __init__(
@@ -85,12 +79,9 @@ class ViewEngine:
         scene: Gaussians,
         gdfs: Sequence[Gdf] = (),
         draw: str = "auto",
-        edit_pass: str = "auto",
     ) -> None:
         if draw not in DRAWS:
             raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
-        if edit_pass not in EDIT_PASSES:
-            raise ValueError(f"edit_pass is '{edit_pass}', expected one of {', '.join(EDIT_PASSES)}")
         if draw == "gl" and ctx is None:
             raise ValueError("draw is 'gl', which needs a context")
         self.ctx, self.scene = ctx, scene
@@ -110,12 +101,13 @@ class ViewEngine:
         self._grid: tuple[object, Lines] | None = None  # what decides the lines, and they
         self._ground: tuple[Vec3, GroundPlane] | None = None  # the plane that is the ground where this is up
         self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # and its colors. [N,4]
-        if edit_pass == "gpu" and self.draws_with == "cpu":
-            raise ProgdfError("the CPU draws here, so the GPU cannot edit; add --draw gl to --edit-pass gpu")
-        self._edit_obstacle = ""
-        self._edit_error: float | None = None
-        wants_pass = edit_pass == "gpu" or (edit_pass == "auto" and ctx is not None and not is_software(ctx))
-        self.renderer, self.editing = self._create(wants_pass and self.draws_with == "gl")
+        self.composer = Composer(scene, self.gdfs)
+        self.renderer: Renderer
+        if ctx is None or self.draws_with == "cpu":
+            self.renderer = CpuRenderer(ctx)
+        else:
+            self.renderer = GlRenderer(ctx)
+        self.renderer.upload(self.composer.gaussians)
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
@@ -182,26 +174,8 @@ class ViewEngine:
 
     def gaussians(self, view: ViewState) -> Gaussians:
         """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
-        edits = _edits(view)
-        self._compose(edits)
-        return self.editing.gaussians(*self._stack(edits))
-
-    @property
-    def edits_with(self) -> str:
-        """What works out the attributes: "gpu" or "cpu"."""
-        return self.editing.where
-
-    def edit_error(self) -> float:
-        """How far the attributes that are drawn are from `progdf.compose`: see `EditsBy.error`."""
-        if self._edit_error is None:
-            self._edit_error = self.editing.error(*self._stack(self._edits))
-        return self._edit_error
-
-    def edits(self) -> EditsBy | None:
-        """What worked out the attributes that are drawn; None where the CPU did, and nobody wanted more."""
-        if self.edits_with == "gpu":
-            return EditsBy("gpu", self.edit_error())
-        return EditsBy("cpu", obstacle=self._edit_obstacle) if self._edit_obstacle else None
+        self._compose(_edits(view))
+        return self.composer.gaussians
 
     def forget(self) -> None:
         """Draw the next picture as a whole, though only a part of the last one has changed."""
@@ -210,7 +184,6 @@ class ViewEngine:
 
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
-        self.editing.release()
         self.renderer.release()
 
     def _grid_lines(self, view: ViewState, camera: Camera) -> Lines | None:
@@ -224,21 +197,6 @@ class ViewEngine:
         if self._grid is None or self._grid[0] != seen:
             self._grid = seen, grid_lines(self._ground[1], camera, view.background)
         return self._grid[1]
-
-    def _create(self, wants_pass: bool) -> tuple[Renderer, Editing]:
-        """The renderer with the scene in it, and what edits it there."""
-        if self.draws_with == "cpu" or self.ctx is None:
-            renderer: Renderer = CpuRenderer(self.ctx)
-            return renderer, CpuEditing(renderer, self.scene, self.gdfs)
-        if wants_pass:
-            by_gl = GlRenderer(self.ctx, editable=True)
-            try:
-                return by_gl, GpuEditing(by_gl, self.scene, self.gdfs)
-            except EditPassError as error:
-                by_gl.release()
-                self._edit_obstacle = str(error)
-        renderer = GlRenderer(self.ctx)
-        return renderer, CpuEditing(renderer, self.scene, self.gdfs)
 
     def _describe_picture(self, view: ViewState, camera: Camera) -> _Picture:
         return _Picture(
@@ -262,7 +220,7 @@ class ViewEngine:
         started = time.perf_counter()
         camera = replace(camera, near=self.near)
         if self.renderer.wants_order and self._ordered_for != wanted.viewmat:
-            self.order = back_to_front(self.editing.means, camera)
+            self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
         share = self.renderer.draw(camera, view.background, self.order, pixels)
@@ -283,13 +241,13 @@ class ViewEngine:
         if edits == self._edits:
             return 0.0, 0.0, 0
         started = time.perf_counter()
-        stack = self._stack(edits)
-        unpacked_ms = 1e3 * (time.perf_counter() - started)
-        step = self.editing.update(*stack)
-        self._edits, self._picture, self._edit_error = edits, None, None
-        if step.moved:
+        change = self.composer.update(self._stack(edits), edits.blend or "normalized")
+        composed = time.perf_counter()
+        self.renderer.update(self.composer.gaussians, change.attributes, change.rows)
+        self._edits, self._picture = edits, None
+        if change.means_moved:
             self._ordered_for = None
-        return unpacked_ms + step.compose_ms, step.upload_ms, step.changed
+        return 1e3 * (composed - started), 1e3 * (time.perf_counter() - composed), len(change.rows)
 
     def _apply_highlight(self, highlight: Highlight | None) -> float:
         """Bring the highlights up to date, those alone that are others than before; gives the ms it took."""
@@ -305,10 +263,9 @@ class ViewEngine:
             self.renderer.highlight(rows, new[rows])
         return 1e3 * (time.perf_counter() - started)
 
-    def _stack(self, edits: _Edits) -> tuple[Stack, str]:
-        """The layers and the blend rule of what was asked for."""
-        stack = [(layer[0], layer_of(self._gdf(layer[0]), *layer[1:])) for layer in edits.layers]
-        return stack, edits.blend or "normalized"
+    def _stack(self, edits: _Edits) -> list[Layer]:
+        """The layers of what was asked for, the lowest first."""
+        return [layer_of(self._gdf(layer[0]), *layer[1:]) for layer in edits.layers]
 
     def _gdf(self, index: int) -> Gdf:
         if not 0 <= index < len(self.gdfs):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Protocol, TypeVar
 
 import moderngl
@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf
 from viewer.camera.up_axis import Vec3
-from viewer.gl.edit_pass import EditPass
 from viewer.gl.grid_pass import GridPass
 from viewer.gl.present import Presenter
 from viewer.gl.splats import SplatRenderer
@@ -90,37 +88,20 @@ class Renderer(Protocol):
 
 
 class GlRenderer:
-    """Draws with OpenGL (see `SplatRenderer`).
-
-    Args:
-        ctx: to draw in
-        editable: let an edit pass write every attribute (see `SplatTextures`)
-    """
+    """Draws with OpenGL (see `SplatRenderer`)."""
 
     wants_order = True
     begun_ms = 0.0
 
-    def __init__(self, ctx: moderngl.Context, editable: bool = False) -> None:
-        self._ctx, self._editable = ctx, editable
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
         self._renderer = SplatRenderer(ctx)
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
         self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
-        self._renderer.upload(scene, self._editable)
-        self._ctx.finish()
-
-    def edit_pass(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> EditPass:
-        """An edit pass that writes into the scene that is drawn; the caller releases it.
-
-        Raises:
-            ProgdfError: see `EditPass`.
-        """
-        return EditPass(self._ctx, self._renderer.textures, scene, gdfs)
-
-    def finish(self) -> None:
-        """Wait until all that OpenGL was asked for is done."""
+        self._renderer.upload(scene)
         self._ctx.finish()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:

@@ -1,4 +1,4 @@
-"""Where the time of a picture went, and what worked out its attributes."""
+"""Where the time of a picture went."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class FrameTimings:
 
     Args:
         compose_ms: strengths → attributes, by the CPU
-        upload_ms: attributes → where they are drawn from; or the GPU's edit pass, which does both there
+        upload_ms: attributes → where they are drawn from
         sort_ms: depth order (the CPU rasterizer sorts within `draw_ms`)
         draw_ms: the picture
         changed: Gaussians whose attributes were composed anew
@@ -30,24 +30,3 @@ class FrameTimings:
     @property
     def total_ms(self) -> float:
         return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms
-
-
-@dataclass(frozen=True)
-class EditsBy:
-    """What worked out the attributes on screen, and how well.
-
-    Args:
-        where: "gpu" (the edit pass) or "cpu"
-        error: how far the attributes are from `progdf.compose`, in a sample that was read back: the largest
-            difference of a raw number, relative to it where it is larger than 1
-        obstacle: why the CPU does it though the GPU was wanted
-    """
-
-    where: str
-    error: float = 0.0
-    obstacle: str = ""
-
-    @property
-    def description(self) -> str:
-        """In words that fit after "edited by"."""
-        return f"CPU: {self.obstacle}" if self.where == "cpu" else f"GPU ±{self.error:.1g}"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from imgui_bundle import imgui
 
-from viewer.render.timings import EditsBy, FrameTimings
+from viewer.render.timings import FrameTimings
 from viewer.state.workspace import Message
 
 from .context import FONT_PX, PALETTE, SMALL_PX, UiContext, u32
@@ -30,7 +30,6 @@ def figures(
     draws_with: str,
     size: tuple[int, int],
     pixels: int = 1,
-    edits: EditsBy | None = None,
 ) -> list[tuple[str, str]]:
     """Names and figures of a picture.
 
@@ -41,13 +40,11 @@ def figures(
         draws_with: "gl" or "cpu"
         size: of the picture as drawn: width, height
         pixels: of the window that each of its pixels fills, each way; more than 1 while it is coarse
-        edits: where the attributes were worked out; None where the CPU does it as a matter of course
     """
-    by_gpu = edits is not None and edits.where == "gpu"
     lines = [
         ("frame", f"{timings.total_ms:.1f} ms"),
         ("  compose", f"{timings.compose_ms:.1f} ms"),
-        ("  edit pass" if by_gpu else "  upload", f"{timings.upload_ms:.1f} ms"),
+        ("  upload", f"{timings.upload_ms:.1f} ms"),
         ("  sort", f"{timings.sort_ms:.1f} ms"),
         ("  draw", f"{timings.draw_ms:.1f} ms"),
         ("redrawn", f"{100 * timings.share:.0f} %"),
@@ -58,8 +55,6 @@ def figures(
         lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
     lines.append(("splats", f"{group_digits(timings.drawn)} of {group_digits(count)}"))
     lines.append(("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with]))
-    if edits is not None:
-        lines.append(("edited by", edits.description))
     return lines
 
 

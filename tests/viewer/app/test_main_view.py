@@ -15,7 +15,6 @@ from PIL import Image
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from tests.helpers.ui_rig import BACKGROUND, Rig, rig
 from viewer.camera.view_camera import to_camera
-from viewer.gl import edit_pass
 
 pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
@@ -149,23 +148,6 @@ def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
     names = [name.strip() for name, _ in hand.main_view.figures()]
     assert {"frame", "sort", "draw", "slider p50 / p95", "splats"} <= set(names)
     assert hand.main_view.canvas.timings.total_ms > 0.0
-
-
-def test_f10_tells_the_error_of_the_gpus_edit_pass_or_why_the_cpu_does_its_work(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with rig(draw="gl", edit_pass="gpu") as by_gpu:
-        told = {name.strip(): figure for name, figure in by_gpu.main_view.figures()}
-        assert told["edited by"].startswith("GPU ±")
-        assert "edit pass" in told
-        assert "upload" not in told
-    monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
-    with rig(draw="gl", edit_pass="gpu") as stood_back:
-        told = {name.strip(): figure for name, figure in stood_back.main_view.figures()}
-        assert told["edited by"] == "CPU: the edits are too large for a texture of this GPU"
-        assert "upload" in told
-    with rig() as by_cpu:
-        assert "edited by" not in dict(by_cpu.main_view.figures())
 
 
 def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> None:

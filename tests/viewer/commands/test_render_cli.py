@@ -78,18 +78,6 @@ def test_a_comparison_carries_no_camera(run: Run) -> None:
 
 
 @pytest.mark.gl
-def test_the_gpus_edit_pass_writes_the_picture_that_the_cpu_composes(
-    run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = ("bear.ply", "scarf.gdf", "ears.gdf", "--set", "scarf=0.7", "--set", "ears=1", "--draw", "gl")
-    assert run("render", *options, "--edit-pass", "cpu", "-o", "cpu.png") == 0
-    assert "edited" not in capsys.readouterr().out
-    assert run("render", *options, "--edit-pass", "gpu", "-o", "gpu.png") == 0
-    assert "drawn by gl, edited by GPU ±" in capsys.readouterr().out
-    assert np.abs(pixels("cpu.png").astype(int) - pixels("gpu.png")).max() <= 1
-
-
-@pytest.mark.gl
 def test_both_engines_write_the_same_picture(run: Run) -> None:
     options = ("bear.ply", "scarf.gdf", "--set", "scarf=1", "--camera", "cameras.json", "--size", "64x48")
     assert run("render", *options, "--engine", "cpu", "-o", "cpu.png") == 0
@@ -210,10 +198,6 @@ def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: R
         (("--set", "scarf"), "--set scarf is not NAME=S"),
         (("--size", "0x48"), "--size 0x48 cannot be drawn; each side may be 1 to 16384 pixels"),
         (("--size", "99999x48"), "--size 99999x48 cannot be drawn"),
-        (
-            ("--draw", "cpu", "--edit-pass", "gpu"),
-            "the CPU draws here, so the GPU cannot edit; add --draw gl",
-        ),
         (("--size", "big"), "--size big is not a size; write it as WIDTHxHEIGHT"),
         (("--size", f"{'9' * 5000}x1"), "--size 9999"),
         (("--camera", "cameras.json:--1"), "cameras.json:--1 does not exist"),

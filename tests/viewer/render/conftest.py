@@ -16,9 +16,9 @@ def stack() -> Stack:
     return bear_stack(1500)
 
 
-@pytest.fixture(params=["cpu", "gpu"])
-def gl_engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
-    """OpenGL, with what edits."""
-    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=request.param)
+@pytest.fixture
+def gl_engine(ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
+    """Draws with OpenGL."""
+    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
     yield made
     made.release()

@@ -3,43 +3,35 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import moderngl
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from progdf.compose.composer import Composer
-from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
+from progdf.compose.reference import Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 from tests.helpers.count import Count
 from tests.helpers.stacks import EARS, SCARF, Stack, view_of
 from viewer.camera.view_camera import to_camera
-from viewer.gl import edit_pass
 from viewer.gl.present import read_rgb
-from viewer.render import attribute_updates
 from viewer.render import engine as engine_module
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import is_software
 from viewer.render.timings import FrameTimings
-from viewer.state.paint import encode
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (96, 72)
 Compare = Callable[[str, np.ndarray], None]
 
 
-@pytest.fixture(params=["gl", "cpu", "gl, edited by the GPU"])
+@pytest.fixture(params=["gl", "cpu"])
 def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
-    draw, comma, _ = request.param.partition(",")
-    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw, edit_pass="gpu" if comma else "cpu")
+    made = ViewEngine(ctx, stack.scene, stack.gdfs, request.param)
     yield made
     made.release()
 
@@ -75,7 +67,7 @@ def test_the_picture_does_not_depend_on_the_way_to_it(
     for scarf, ears in path:
         gl_engine.image(view_of(stack, scarf, ears), SIZE)
     there = gl_engine.image(view_of(stack, 0.3, 0.6), SIZE).copy()
-    fresh = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=gl_engine.edits_with)
+    fresh = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
     assert np.array_equal(there, fresh.image(view_of(stack, 0.3, 0.6), SIZE))
     fresh.release()
 
@@ -89,94 +81,6 @@ def test_both_ways_to_draw_give_the_same_picture(ctx: moderngl.Context, stack: S
         assert float((difference**2).mean()) <= 1e-7, "70 dB"
     by_gl.release()
     by_cpu.release()
-
-
-@pytest.mark.gl
-@pytest.mark.parametrize("blend", BLENDS)
-def test_the_edit_pass_gives_the_picture_that_the_cpus_composing_gives(
-    ctx: moderngl.Context, stack: Stack, blend: str
-) -> None:
-    by_gpu, by_cpu = (
-        ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass=where) for where in ("gpu", "cpu")
-    )
-    assert (by_gpu.edits_with, by_cpu.edits_with) == ("gpu", "cpu")
-    weights = np.linspace(0.0, 1.0, len(stack.gdfs[EARS].region), dtype=np.float32)
-    for scarf, ears, gains in ((1.0, 0.0, Gains()), (0.3, 1.2, Gains(geometry=0.5)), (0.0, 0.0, Gains())):
-        view = replace(view_of(stack, scarf, ears), blend=blend)
-        painted = replace(view.layers[EARS], paint=encode(weights), gains=gains)
-        view = replace(view, layers=(view.layers[SCARF], painted))
-        apart = np.abs(by_gpu.image(view, SIZE) - by_cpu.image(view, SIZE))
-        assert float((apart**2).mean()) <= 1e-10, "100 dB; on llvmpipe they are the same"
-        found = by_gpu.edits()
-        assert found is not None
-        assert found.where == "gpu"
-        assert found.error <= 1e-6
-        assert by_cpu.edits() is None
-        for name in ATTRIBUTES:
-            assert torch.equal(getattr(by_gpu.gaussians(view), name), getattr(by_cpu.gaussians(view), name))
-    by_gpu.release()
-    by_cpu.release()
-
-
-@pytest.mark.gl
-def test_beside_the_edit_pass_the_cpu_composes_means_only(
-    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[Composer] = []
-
-    def make(scene: Gaussians, gdfs: Sequence[Gdf]) -> Composer:
-        made.append(Composer(scene, gdfs))
-        return made[-1]
-
-    monkeypatch.setattr(attribute_updates, "Composer", make)
-    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
-    engine.image(view_of(stack, 0.4, 0.4), SIZE)
-    engine.image(view_of(stack, 0.7, 0.7), SIZE)
-    (composer,) = made
-    assert torch.equal(composer.gaussians.sh0, stack.scene.sh0)
-    assert not torch.equal(composer.gaussians.means, stack.scene.means)
-    engine.release()
-
-
-@pytest.mark.gl
-def test_the_error_is_measured_once_for_every_stack(
-    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
-    measured = Count(monkeypatch, engine.editing, "error")
-    for strength, calls in ((0.4, 1), (0.4, 1), (0.5, 2)):
-        engine.image(view_of(stack, strength), SIZE)
-        engine.edits()
-        assert measured.calls == calls
-    engine.release()
-
-
-@pytest.mark.gl
-def test_where_the_edit_pass_cannot_run_the_cpu_composes_and_the_engine_says_why(
-    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(edit_pass, "capacity", lambda _: 100)
-    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="gpu")
-    assert engine.edits_with == "cpu"
-    found = engine.edits()
-    assert found is not None
-    assert "too large" in found.obstacle
-    expected = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl", edit_pass="cpu")
-    view = view_of(stack, 0.6, 0.6)
-    assert np.array_equal(engine.image(view, SIZE), expected.image(view, SIZE))
-    engine.release()
-    expected.release()
-
-
-@pytest.mark.gl
-def test_the_edit_pass_is_left_to_hardware_and_needs_opengl(ctx: moderngl.Context, stack: Stack) -> None:
-    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
-    assert engine.edits_with == ("cpu" if is_software(ctx) else "gpu")
-    engine.release()
-    with pytest.raises(ProgdfError, match="the CPU draws here, so the GPU cannot edit"):
-        ViewEngine(ctx, stack.scene, stack.gdfs, draw="cpu", edit_pass="gpu")
-    with pytest.raises(ValueError, match="edit_pass is 'fast'"):
-        ViewEngine(ctx, stack.scene, draw="gl", edit_pass="fast")
 
 
 @pytest.mark.gl
@@ -224,7 +128,7 @@ def test_a_camera_move_composes_nothing(
 ) -> None:
     view = view_of(stack, 0.5)
     engine.image(view, SIZE)
-    composed = Count(monkeypatch, engine.editing, "update")
+    composed = Count(monkeypatch, engine.composer, "update")
     uploaded = Count(monkeypatch, engine.renderer, "update")
     engine.image(replace(view, camera=replace(view.camera, azimuth=50.0)), SIZE)
     assert (composed.calls, uploaded.calls) == (0, 0)

@@ -9,21 +9,15 @@ import moderngl
 import numpy as np
 import pytest
 
-from progdf.compose.layers import BLENDS
 from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import conventions
 from viewer.gl import programs
 from viewer.gl.layout import (
-    EDIT_LAYER,
-    EDIT_TARGET,
     GRID_LINE,
     ORDER,
     PLACES,
     PROJECTED,
-    SPAN,
     SPLAT_TEXTURES,
-    TARGETS,
-    TEXELS_PER_ROW,
 )
 from viewer.gl.programs import ShaderError, load_program, load_source
 from viewer.gl.splats import vertex_format
@@ -36,9 +30,6 @@ STAGES = (
     "present.vert",
     "present.frag",
     "stretch.frag",
-    "edit.vert",
-    "edit.frag",
-    "edit_sh.frag",
 )
 COMPONENTS = {"float": 1, "vec2": 2, "vec3": 3, "vec4": 4}
 
@@ -92,32 +83,13 @@ def test_the_shaders_constants_are_the_rasterizers() -> None:
         assert float(numerator) / float(denominator or 1) == getattr(conventions, name), name
 
 
-def test_the_edit_pass_counts_layers_targets_and_rules_as_the_cpu_does() -> None:
-    source = text_of("include/edit_layers.glsl")
-    numbers = dict(re.findall(r"(\w+) = (\d+)[,;]", source))
-    assert int(numbers["TEXELS_PER_ROW"]) == TEXELS_PER_ROW
-    assert EDIT_LAYER.itemsize == 16 * int(numbers["LAYER_TEXELS"])
-    assert EDIT_LAYER.fields is not None
-    assert EDIT_LAYER.fields["targets"][1] == 16, "the layer's own texel comes first"
-    assert EDIT_TARGET.names == ("full", "rest", "rank", "numbers"), "x, y, z, w in `add`"
-    assert EDIT_LAYER.names[:3] == ("places", "weights", "numbers"), "x, y, z in `part_of`"
-    assert [numbers[rule.upper()] for rule in BLENDS] == ["0", "1", "2"]
-    assert SPAN.names == ("column", "row", "texels", "slot"), "x, y, z, w in edit.vert"
-    assert re.search(r"const int SH_TARGET = (\d);", text_of("edit_sh.frag"))[1] == str(TARGETS.index("shN"))
-
-
-def test_the_edit_pass_writes_the_textures_in_the_order_of_the_targets() -> None:
-    outputs = re.findall(r"^layout\(location = (\d)\) out vec4 (\w+);", text_of("edit.frag"), re.MULTILINE)
-    assert [(int(at), name) for at, name in outputs] == list(enumerate(SPLAT_TEXTURES))
-
-
 def test_every_attribute_has_its_own_components_of_a_texture() -> None:
     assert set(PLACES) == set(ATTRIBUTES)
     taken = [
         (place.texture, place.component + i) for place in PLACES.values() for i in range(place.components)
     ]
     assert len(set(taken)) == len(taken)
-    assert {texture for texture, _ in taken} == set(TARGETS)
+    assert {texture for texture, _ in taken} == {*SPLAT_TEXTURES, "shN"}
 
 
 def test_every_head_says_what_the_stage_reads_and_writes() -> None:
@@ -187,5 +159,3 @@ def test_every_program_compiles_as_gl_3_3_core(ctx: moderngl.Context) -> None:
     load_program(ctx, "splat.vert", "splat.frag").release()
     load_program(ctx, "present.vert", "present.frag").release()
     load_program(ctx, "present.vert", "stretch.frag").release()
-    load_program(ctx, "edit.vert", "edit.frag").release()
-    load_program(ctx, "edit.vert", "edit_sh.frag").release()
