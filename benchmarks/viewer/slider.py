@@ -41,18 +41,15 @@ class Way:
     Args:
         title: in the table
         draw: of `engine.DRAWS`
-        whole: draw the whole picture at every step, though only a part of it has changed
     """
 
     title: str
     draw: str
-    whole: bool = False
 
 
 WAYS = {
     "gl": Way("OpenGL", "gl"),
     "cpu": Way("CPU", "cpu"),
-    "cpu, whole": Way("CPU, whole picture", "cpu", whole=True),
 }
 
 
@@ -91,7 +88,6 @@ class SliderTimes:
         events_ms: from the mouse's event to finished pixels
         parts: what of that the engine took
         psnr_db: against `progdf.render`, the worst of three strengths
-        apart: largest difference of a picture that was drawn step by step from the same drawn afresh
     """
 
     case: SliderCase
@@ -100,7 +96,6 @@ class SliderTimes:
     events_ms: tuple[float, ...]
     parts: tuple[FrameTimings, ...]
     psnr_db: float
-    apart: float
 
     @property
     def rest_ms(self) -> float:
@@ -154,8 +149,6 @@ def rows(
         for step in range(1, WARM_UP + steps + 1):
             place = slider_at(mice["cpu"].pixels[0], 0, 0.05 + 0.9 * step / (WARM_UP + steps))
             for name, mouse in mice.items():
-                if WAYS[name].whole:
-                    mouse.engine.forget()
                 events[name].append(mouse.move(*place))
                 parts[name].append(mouse.main_view.canvas.timings)
         return [
@@ -166,7 +159,6 @@ def rows(
                 tuple(events[name][WARM_UP:]),
                 tuple(parts[name][WARM_UP:]),
                 _psnr(mouse.engine, view, size),
-                _apart(mouse, size),
             )
             for name, mouse in mice.items()
         ]
@@ -187,15 +179,12 @@ def table(results: Sequence[SliderTimes], renderer: str) -> Table:
             "sort",
             "draw",
             "panel, screen",
-            "redrawn",
             "in all p50 / p95",
             "PSNR to the CPU engine, dB",
         ),
         tuple(_cells(result) for result in results),
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
-        "waited for, the parts are medians. The CPU rasterizer sorts as it draws and draws where the slider "
-        "touches the picture. Largest difference between a picture drawn step by step and the same drawn "
-        f"afresh: {max(result.apart for result in results):g}.",
+        "waited for, the parts are medians. The CPU rasterizer sorts as it draws.",
     )
 
 
@@ -208,7 +197,6 @@ def _cells(result: SliderTimes) -> tuple[str, ...]:
         WAYS[result.way].title,
         *(f"{np.median([getattr(part, name) for part in result.parts]):.1f}" for name in PARTS),
         f"{result.rest_ms:.1f}",
-        f"{100 * np.median([part.share for part in result.parts]):.0f} %",
         f"**{middle:.1f}** / {late:.1f}",
         "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
     )
@@ -217,14 +205,6 @@ def _cells(result: SliderTimes) -> tuple[str, ...]:
 def _fitting(scenes: Sequence[Gaussians], members: int) -> Gaussians:
     """The smallest scene with so many Gaussians, or nearly; else the largest."""
     return next((scene for scene in scenes if len(scene) >= 0.9 * members), scenes[-1])
-
-
-def _apart(mouse: Mouse, size: tuple[int, int]) -> float:
-    """How far the picture is from the same one drawn afresh."""
-    view = mouse.main_view.work.view
-    stepped = mouse.engine.image(view, size)
-    mouse.engine.forget()
-    return float(np.abs(stepped - mouse.engine.image(view, size)).max())
 
 
 def _psnr(engine: ViewEngine, view: ViewState, size: tuple[int, int]) -> float:

@@ -14,7 +14,6 @@ from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
 from progdf.rasterize.color_maps import color_map
-from progdf.rasterize.pixel_cells import mark_cells, no_cells
 from progdf.rasterize.simplification import simplify
 from progdf.rasterize.lines import lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows
@@ -33,7 +32,6 @@ lines = numpy.zeros((0, 14), numpy.float32)
 with lines_behind(picture.image.numpy(), picture.transmittance.numpy(), lines, 0.5):
     pass
 rows = some_rows(scene, 20)
-mark_cells(no_cells(camera.width, camera.height), activate(scene), rows.numpy(), camera)
 simplify(activate(scene), camera, 10)
 weighed = color_map(activate(scene), camera, (0, 0, camera.width, camera.height), rows)
 weighed.gradient(weighed.picture(torch.ones(20, 3)))

@@ -70,14 +70,6 @@ class ScreenCopy:
         fill_screen(image, self._screen)
         self._texture.write(self._screen, viewport=(self.left, 0, *self.size))
 
-    def write_part(self, image: NDArray[np.float32], x: int, y: int) -> None:
-        """Take a part of a picture that is not stretched, whose upper left pixel is x, y of it. [h,w,3]"""
-        height, width = image.shape[:2]
-        part = np.empty((height, width, 4), np.uint8)
-        fill_screen(np.ascontiguousarray(image), part)
-        place = self.left + x, self.size[1] - y - height
-        self._texture.write(part, viewport=(*place, width, height))
-
     def show(self, framebuffer: moderngl.Framebuffer) -> None:
         """Lay the picture into the lower left of a framebuffer, as far as its scissor goes."""
         framebuffer.use()

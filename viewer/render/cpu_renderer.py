@@ -1,4 +1,4 @@
-"""Draws with the CPU rasterizer and keeps the picture: while the camera rests, only its touched part anew."""
+"""Draws with the CPU rasterizer and keeps the picture."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import moderngl
@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.rasterize import ActivatedGaussians, Crop, render
+from progdf.rasterize import ActivatedGaussians, render
 from progdf.rasterize.cpu.parallel import stopped_by
 from progdf.rasterize.lines import lines_behind
-from progdf.rasterize.pixel_cells import area, dirty_rectangles, mark_cells, no_cells
 from progdf.rasterize.screen_bytes import fill_screen
 from progdf.rasterize.simplification import simplify
 from progdf.sh import C0
@@ -35,20 +34,6 @@ from .renderers import Renderer
 Image = NDArray[np.float32]
 
 SH = ("sh0", "shN")
-
-MANY = 32_768
-"""Rows beyond which nobody asks where they are: telling takes longer than what is not drawn would (100 000
-members of 125 000 Gaussians: 41 ms a step, 35 without)."""
-
-WORTH_DRAWING_APART = 0.8
-"""Share of the picture beyond which all of it is drawn."""
-
-WORTH_WAITING = 0.25
-"""Share of the picture up to which nobody has to wait for another thread."""
-
-CALL_PIXELS, GAUSSIAN_PIXELS = 4096, 1 / 3
-"""Pixels that take as long as another call of the rasterizer, and as its look at one more Gaussian."""
-
 
 BUDGETS = 50_000, 140_000, 500_000
 """How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
@@ -84,7 +69,7 @@ class _Begun:
         self._found: Future[tuple[Image, Image]] = _worker().submit(self._draw, gaussians)
 
     def shows(self, camera: Camera, background: Vec3) -> bool:
-        return self._camera is camera or _same(self._camera, self._background, camera, background)
+        return _same(self._camera, self._background, camera, background)
 
     def done(self) -> bool:
         return self._found.done()
@@ -107,9 +92,6 @@ class _Begun:
 class CpuRenderer:
     """Draws with `progdf.rasterize`, about four times faster than OpenGL in software.
 
-    Between two pictures of one camera it draws only boxes around what the changed Gaussians touched before
-    or touch now: the same bits as a whole picture.
-
     Args:
         ctx: where pictures are shown; None where they are only read
     """
@@ -119,12 +101,10 @@ class CpuRenderer:
     def __init__(self, ctx: moderngl.Context | None = None) -> None:
         self._ctx = ctx
         self._copy: ScreenCopy | None = None
-        self._stale: list[Crop] | None = None  # where the copy is behind the picture; None is everywhere
+        self._stale = True  # whether the copy is behind the picture
         self._kept: _Kept | None = None
         self._grid: Lines | None = None  # what the copy shows of it
-        self._lent = False  # whether the picture's array is in other hands
-        self._cells: NDArray[np.bool_] | None = None  # touched since the kept picture; None is everywhere
-        self._last: tuple[NDArray[np.int64], NDArray[np.bool_]] | None = None  # rows, and where they are now
+        self._changed = True  # whether Gaussians have changed since the kept picture
         self._highlights: Image | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
         self._begun: _Begun | None = None
         self._budget = BUDGETS[1]
@@ -142,35 +122,24 @@ class CpuRenderer:
             antialiased=scene.antialiased,
         )
         self._scene, self._highlights = scene, None
-        self._kept = self._cells = self._last = None
-        nobody = np.zeros(0, np.int64)  # compiled now, and not under the first touch of a slider
-        camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
-        mark_cells(no_cells(1, 1), self._drawn, nobody, camera)
-        for side in (1, 2):
+        self._kept = None
+        for side in (1, 2):  # compiled now, and not under the first touch of a slider
             fill_screen(np.zeros((1, 1, 3), np.float32), np.zeros((side, side, 4), np.uint8))
         if len(scene.means) > BUDGETS[2]:
-            simplify(self._drawn.select(torch.arange(2)), camera, 1)
+            simplify(self._drawn.select(torch.arange(2)), Camera(torch.eye(4), torch.eye(3), 1, 1), 1)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         self._drop()
         self._scene, names = scene, tuple(attributes)
         highlighted = self._highlights is not None and any(name in SH for name in names)
         names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
-        if len(rows) > MANY:
-            self._cells = None
-        cells = self._cells
-        if cells is not None and len(rows):
-            cells |= self._where(rows)
+        self._changed = self._changed or len(rows) > 0
         for first, last in row_runs(rows):  # whole runs, as slices are many times faster than indices
             part = slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW)
             for name in names:
                 self._write(scene, name, part)
             if highlighted:
                 self._apply_highlight(part)
-        if any(name not in SH for name in names):
-            self._last = None
-            if cells is not None and len(rows):
-                cells |= self._where(rows)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `Renderer.highlight`."""
@@ -183,38 +152,18 @@ class CpuRenderer:
         if not self._highlights[:, 3].any():
             self._highlights = None
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> float:
-        """Make the picture; `order` is not used, the rasterizer sorts by itself. Gives the share drawn.
-
-        With more `pixels` than one of fewer Gaussians, and always as a whole.
-        """
-        begun, found, self.begun_ms = self._begun, None, 0.0
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
+        """Make the picture; `order` is not used, the rasterizer sorts by itself. With more `pixels` than one
+        it has fewer Gaussians."""
+        begun, self.begun_ms = self._begun, 0.0
         if pixels > 1:
             found = self._draw_fewer(camera, background, pixels)
         elif begun is not None and begun.shows(camera, background):
             found, self.begun_ms = begun.result()
+        else:
+            found = _draw(self._drawn, camera, background)
         self._drop()
-        if found is not None:
-            self._keep(_Kept(*found, camera, background))
-            self._last, self._cells = None, None if pixels > 1 else no_cells(camera.width, camera.height)
-            return 1.0
-        kept, crops = self._last_of(camera, background)
-        share = area(crops) / (camera.width * camera.height)
-        if kept is None or share > WORTH_DRAWING_APART:
-            share = 1.0
-            self._keep(_Kept(*_draw(self._drawn, camera, background), camera, background))
-        elif crops:
-            parts = [_draw(self._drawn, camera, background, crop) for crop in crops]
-            if self._lent:
-                kept, self._lent = replace(kept, image=kept.image.copy()), False
-            for (x0, y0, x1, y1), (image, through) in zip(crops, parts, strict=True):
-                kept.image[y0:y1, x0:x1], kept.through[y0:y1, x0:x1] = image, through
-            self._kept = kept
-            self._stale = None if self._stale is None else [*self._stale, *crops]
-        if kept is None:
-            self._last = None
-        self._cells = no_cells(camera.width, camera.height)
-        return share
+        self._kept, self._stale, self._changed = _Kept(*found, camera, background), True, pixels > 1
 
     def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> tuple[Image, Image]:
         began = time.perf_counter()
@@ -228,22 +177,12 @@ class CpuRenderer:
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         """See `Renderer.prepare`."""
-        kept, crops = self._last_of(camera, background)
-        if kept is not None and area(crops) <= WORTH_WAITING * camera.width * camera.height:
+        if self._kept is not None and not self._changed and self._kept.shows(camera, background):
             return True
         if self._begun is None or not self._begun.shows(camera, background):
             self._drop()
             self._begun = _Begun(self._drawn, camera, background)
         return self._begun.done()
-
-    def _last_of(self, camera: Camera, background: Vec3) -> tuple[_Kept | None, list[Crop]]:
-        """The last picture, if it is of this camera, and what of it has to be drawn anew."""
-        if self._kept is None or not self._kept.shows(camera, background):
-            return None, [(0, 0, camera.width, camera.height)]
-        if self._cells is None:
-            return self._kept, [(0, 0, camera.width, camera.height)]
-        worth = CALL_PIXELS + int(GAUSSIAN_PIXELS * len(self._drawn.means))
-        return self._kept, dirty_rectangles(self._cells, (camera.width, camera.height), worth)
 
     def _drop(self) -> None:
         if self._begun is not None:
@@ -253,18 +192,11 @@ class CpuRenderer:
     def follow(self, last: Renderer) -> bool:
         """See `Renderer.follow`."""
         if isinstance(last, CpuRenderer) and last._kept is not None:
-            self._keep(last._kept)
-            self._lent = True  # two have it
+            self._kept, self._stale, self._changed = last._kept, True, True
         return self._kept is not None
-
-    def forget(self) -> None:
-        """Draw the next picture as a whole, whatever the last one was."""
-        self._drop()
-        self._kept = self._cells = self._last = None
 
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped; it stays as it is when the next one is drawn. [H,W,3]"""
-        self._lent = True
         return self._picture().image
 
     def show(
@@ -276,50 +208,29 @@ class CpuRenderer:
     ) -> None:
         """See `Renderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
-        kept, image = self._picture(), self._picture().image
+        kept = self._picture()
+        image = kept.image
         size = size or (image.shape[1], image.shape[0])
         if self._copy is None or (self._copy.size, self._copy.left) != (size, left):
             if self._copy is not None:
                 self._copy.release()
-            self._copy, self._stale = ScreenCopy(self._ctx, size, left), None
+            self._copy, self._stale = ScreenCopy(self._ctx, size, left), True
         if grid is not self._grid:
-            self._grid, self._stale = grid, None
-        if grid is None or self._stale == []:
-            self._send(self._copy, image)
-        else:  # cheaper than another picture, or another pass of software GL
+            self._grid, self._stale = grid, True
+        if self._stale and grid is None:
+            self._copy.write(image)
+        elif self._stale and grid is not None:  # cheaper than another picture, or another pass of software GL
             lines = grid.view(np.float32).reshape(len(grid), -1)
             with lines_behind(image, kept.through, lines, CLEAR):
-                self._send(self._copy, image)
+                self._copy.write(image)
+        self._stale = False
         self._copy.show(framebuffer)
-
-    def _send(self, copy: ScreenCopy, image: Image) -> None:
-        """Bring the copy up to the picture."""
-        if self._stale is None or (self._stale and copy.size != (image.shape[1], image.shape[0])):
-            copy.write(image)
-        else:
-            for x0, y0, x1, y1 in self._stale:
-                copy.write_part(image[y0:y1, x0:x1], x0, y0)
-        self._stale = []
 
     def release(self) -> None:
         """Give back what it holds."""
         self._drop()
         if self._copy is not None:
             self._copy.release()
-
-    def _keep(self, picture: _Kept) -> None:
-        """A whole new picture."""
-        self._kept, self._stale, self._lent = picture, None, False
-
-    def _where(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """The cells of the kept picture that `rows` touch as they are. While one slider is dragged, where
-        they are now is where they have been at its next step."""
-        camera = self._picture().camera
-        if self._last is None or self._last[0] is not rows:
-            cells = no_cells(camera.width, camera.height)
-            mark_cells(cells, self._drawn, rows, camera)
-            self._last = rows, cells
-        return self._last[1]
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self._drawn.tensors)
@@ -352,12 +263,10 @@ class CpuRenderer:
         return self._kept
 
 
-def _draw(
-    gaussians: ActivatedGaussians, camera: Camera, background: Vec3, crop: Crop | None = None
-) -> tuple[Image, Image]:
+def _draw(gaussians: ActivatedGaussians, camera: Camera, background: Vec3) -> tuple[Image, Image]:
     """The picture and what shines through it."""
     with torch.no_grad():
-        found = render(gaussians, camera, background, crop=crop)
+        found = render(gaussians, camera, background)
     return found.image.numpy(), found.transmittance.numpy()
 
 

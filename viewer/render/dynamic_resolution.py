@@ -91,8 +91,7 @@ def after_draw(known: DynamicResolution, timings: FrameTimings, turned: bool) ->
     """After a picture was drawn: what it took. A coarse one tells nothing of a full one."""
     if known.pixels > 1:
         return replace(known, coarse_ms=timings.total_ms)
-    if timings.share == 1.0:
-        known = replace(known, camera_ms=(*known.camera_ms[-1:], timings.total_ms))
+    known = replace(known, camera_ms=(*known.camera_ms[-1:], timings.total_ms))
     return known if turned else replace(known, slider_ms=(*known.slider_ms[-1:], timings.total_ms))
 
 

@@ -1,8 +1,7 @@
 """One engine, on screen and headless: state → compose → upload → sort → draw, published together.
 
 It compares the state with the one it last drew and does only the work between them: a camera move composes
-nothing, a change of color sorts nothing, the same state draws nothing, and where the CPU draws, a slider
-draws only the part of the picture that its members touch.
+nothing, a change of color sorts nothing, the same state draws nothing.
 """
 
 from __future__ import annotations
@@ -177,11 +176,6 @@ class ViewEngine:
         self._compose(_edits(view))
         return self.composer.gaussians
 
-    def forget(self) -> None:
-        """Draw the next picture as a whole, though only a part of the last one has changed."""
-        self._picture = None
-        self.renderer.forget()
-
     def release(self) -> None:
         """Give back what lives in the context; the context is the caller's."""
         self.renderer.release()
@@ -223,7 +217,7 @@ class ViewEngine:
             self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
             self._ordered_for = wanted.viewmat
         sorted_at = time.perf_counter()
-        share = self.renderer.draw(camera, view.background, self.order, pixels)
+        self.renderer.draw(camera, view.background, self.order, pixels)
         drawn_at = time.perf_counter()
         self._picture = wanted
         return FrameTimings(
@@ -233,7 +227,6 @@ class ViewEngine:
             1e3 * (drawn_at - sorted_at) + self.renderer.begun_ms,
             changed,
             len(self.order) if self.renderer.wants_order else len(self.scene),
-            share,
         )
 
     def _compose(self, edits: _Edits) -> tuple[float, float, int]:

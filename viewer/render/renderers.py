@@ -45,15 +45,12 @@ class Renderer(Protocol):
                 hides the Gaussian. [R,4]
         """
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> float:
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
         """Make the picture and wait until it is done.
 
         Args:
             order: farthest first, from `depth_sort.back_to_front`
             pixels: of the picture at rest that one of this one stands for, each way
-
-        Returns:
-            The share of its pixels that had to be drawn, 0..1.
         """
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
@@ -62,9 +59,6 @@ class Renderer(Protocol):
 
     def follow(self, last: Renderer) -> bool:
         """Take over another's picture, to be shown until there is a new one; whether there was one."""
-
-    def forget(self) -> None:
-        """Draw the next picture as a whole, whatever the last one was."""
 
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped. [H,W,3]"""
@@ -111,20 +105,16 @@ class GlRenderer:
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         self._renderer.highlight(rows, highlights)
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> float:
+    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
         self._renderer.set_order(order)
         self._picture = self._renderer.draw(camera, background)
         self._ctx.finish()
-        return 1.0
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         return True
 
     def follow(self, last: Renderer) -> bool:
         return False
-
-    def forget(self) -> None:
-        pass  # as it does every time
 
     def pixels(self) -> Image:
         picture = _require_picture(self._picture)

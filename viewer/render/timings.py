@@ -16,7 +16,6 @@ class FrameTimings:
         draw_ms: the picture
         changed: Gaussians whose attributes were composed anew
         drawn: Gaussians in front of the camera; all of them where the CPU rasterizer draws
-        share: of the picture's pixels that were drawn anew, 0..1
     """
 
     compose_ms: float = 0.0
@@ -25,7 +24,6 @@ class FrameTimings:
     draw_ms: float = 0.0
     changed: int = 0
     drawn: int = 0
-    share: float = 0.0
 
     @property
     def total_ms(self) -> float:

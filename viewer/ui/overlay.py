@@ -47,7 +47,6 @@ def figures(
         ("  upload", f"{timings.upload_ms:.1f} ms"),
         ("  sort", f"{timings.sort_ms:.1f} ms"),
         ("  draw", f"{timings.draw_ms:.1f} ms"),
-        ("redrawn", f"{100 * timings.share:.0f} %"),
         ("picture", f"{size[0]}×{size[1]}" + (", coarse" if pixels > 1 else "")),
     ]
     if latencies_ms:

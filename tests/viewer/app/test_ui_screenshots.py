@@ -106,9 +106,7 @@ def test_a_value_being_typed(screenshot: Compare) -> None:
 def test_the_timings_of_a_picture(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("F10")
-        hand.main_view.canvas.timings = FrameTimings(
-            1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500, share=0.03
-        )
+        hand.main_view.canvas.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500)
         hand.main_view.latencies_ms.extend([20.0, 21.0, 34.0])
         hand.frame()
         screenshot("ui_timings", hand.image()[:210, :240])

@@ -195,18 +195,6 @@ def test_regions_that_are_shown_have_their_own_colors_and_the_selection_lies_ove
     assert (colors[12, :3] == np.round(255 * np.array(region.color))).all()
 
 
-@pytest.mark.gl
-def test_a_stroke_draws_only_the_part_of_the_picture_that_it_touched(ctx: moderngl.Context) -> None:
-    engine = ViewEngine(ctx, bear().scene, bear().gdfs, "cpu")
-    weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
-    engine.highlight = Highlight(SCARF, paint.encode(weights))
-    shown(engine, view(0.0), ctx)
-    weights[:3] = 0.0
-    engine.highlight = Highlight(SCARF, paint.encode(weights))
-    shown(engine, view(0.0), ctx)
-    assert 0.0 < engine.timings.share < 0.5
-
-
 def test_weights_are_wanted_while_the_brush_is_out_over_a_layer_that_shows() -> None:
     out = replace(view(), brush=Brush(active=True))
     assert highlight.requested_highlight(out, 0) == Highlight(0, paint.FULL, thin=True)
