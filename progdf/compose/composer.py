@@ -1,52 +1,101 @@
 """`compose_layers` while a slider is dragged: the same numbers, written in place, members only.
 
 Bases are kept as they are stored (int8): a new slider value reads about 84 bytes a member, writes its
-14 numbers, and allocates nothing that grows with the scene.
+14 numbers, and allocates nothing that grows with the scene but a buffer of one attribute's sums.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from progdf.field.baked import AttributeBases
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
-from progdf.interpolation import find_segment
-from progdf.rasterize.cpu.parallel import run_chunks, threads
+from progdf.interpolation import Segment, find_segment
+from progdf.rasterize.cpu.jit import kernel
+from progdf.rasterize.cpu.parallel import run_chunks
 
-from .arrays import GAINS
-from .kernel import compose_rows
-from .layers import KINDS, Effects, Layer, changed_edits, changed_gains, check_numbers, effects_of
-from .plan import FlatWeights, RowPlan, flatten_edits, flatten_scene, plan_rows
+from .coverage import coverage
+from .layers import KINDS, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
 
-WORTH_A_THREAD = 16_384
-"""Rows below which a second thread costs more than it saves."""
+Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+CHUNK = 16_384
+"""Rows that a thread works on at once: few enough for the second cache, enough to be worth a thread."""
+
+_BLOCK = 512  # members whose offsets are summed at once
+
+_NOTHING = np.zeros(0, np.float32)  # in place of weights that are all 1, or of a coverage that hides nothing
 
 
 @dataclass(frozen=True)
 class Change:
-    """What an update touched.
+    """What an update touched."""
 
-    Args:
-        rows: sorted indices of all Gaussians that may differ from before. [M] int64
-        attributes: names of `gaussians.ATTRIBUTES` that may differ in these rows
-        largest_move: largest distance that a center has moved since the last update, world units
-    """
-
-    rows: NDArray[np.int64]
-    attributes: tuple[str, ...]
-    largest_move: float
+    rows: Rows  # sorted indices of all Gaussians that may differ from before. [M]
+    attributes: tuple[str, ...]  # names of `gaussians.ATTRIBUTES` that may differ in these rows
+    largest_move: float  # largest distance that a center has moved since the last update, world units
 
     @property
     def means_moved(self) -> bool:
         """Whether the depth order may have changed."""
         return self.largest_move > 0
+
+
+class _Bases(NamedTuple):
+    """One attribute of an edit, see `AttributeBases`."""
+
+    end: Floats  # [M,c]
+    residual: NDArray[Any]  # int8 or float32. [R,M,c]
+    scale: Floats  # [R,c]
+    coefficients: Floats  # [S,1+R]
+
+    @staticmethod
+    def of(bases: AttributeBases) -> _Bases:
+        residual = bases.residual_basis
+        residual = residual if residual.dtype == torch.int8 else residual.float()
+        tensors = bases.end_offset, residual, bases.scale, bases.coefficients
+        return _Bases(*(tensor.contiguous().numpy() for tensor in tensors))
+
+    def factors(self, at: Segment) -> tuple[Rows, Floats]:
+        """Which residual bases count in a segment of the knots, and what basis 0 and each of them is
+        multiplied with, [1+U,c]; no factors where the attribute is as it was."""
+        right, share = at
+        row = self.coefficients[right]
+        if share != 1.0:
+            left = self.coefficients[right - 1]
+            row = left + np.float32(share) * (row - left)
+        used = np.flatnonzero(row[1:])
+        if not len(used) and row[0] == 0.0:
+            return used, np.zeros((0, self.end.shape[1]), np.float32)
+        first = np.full((1, self.end.shape[1]), row[0])
+        return used, np.concatenate([first, row[1:][used, None] * self.scale[used]])
+
+
+class _Plan(NamedTuple):
+    """What to rewrite when some edits change."""
+
+    rows: Rows  # ascending. [U]
+    parts: Mapping[int, tuple[Rows, Rows]]  # by edit: members among the rows, and where they are. [m] each
+
+
+class _Part(NamedTuple):
+    """A layer's members among a range of rows."""
+
+    layer: Layer
+    edit: int
+    segment: Segment  # of the knots, where its strength lies
+    members: Rows  # [m]
+    at: Rows  # where they are in the range. [m]
+    weights: Floats  # of all members of the edit, empty: all 1
 
 
 class Composer:
@@ -63,24 +112,24 @@ class Composer:
     def __init__(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
         for gdf in gdfs:
             verify(gdf, scene)
+        self._scene, self._gdfs = scene, tuple(gdfs)
         self._index = {id(gdf): i for i, gdf in enumerate(gdfs)}
-        self._gdfs = tuple(gdfs)  # held, so that their ids stay theirs
         self._members = [gdf.region.members.numpy() for gdf in gdfs]
-        self._edited_rows = np.unique(np.concatenate([np.zeros(0, np.int64), *self._members]))
-        self._names = tuple(n for n in ATTRIBUTES if any(n in gdf.field.attributes for gdf in gdfs))
-        self._moving = [frozenset(gdf.field.attributes) for gdf in gdfs]
-        self._bases = flatten_edits(scene, gdfs, self._names)
-        self._target = flatten_scene(scene, self._names, self._edited_rows)
-        tensors: dict[str, Any] = {}
-        for name, at in zip(self._names, self._target.columns["out"].tolist(), strict=True):
-            shape = getattr(scene, name).shape
-            tensors[name] = torch.from_numpy(self._target.out[at : at + shape.numel()]).view(shape)
-        self.gaussians = replace(scene, **tensors)
+        self._bases = [
+            {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in gdfs
+        ]
+        moving = {name for bases in self._bases for name in bases}
+        before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
+        after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
+        self.gaussians = replace(scene, **after)
         """The scene under the layers of the last update; its tensors are written in place by the next."""
+        width = {name: math.prod(values.shape[1:]) for name, values in before.items()}
+        self._before = {name: values.reshape(-1, width[name]).numpy() for name, values in before.items()}
+        self._after = {name: values.view(-1, width[name]).numpy() for name, values in after.items()}
+        self._coverage: dict[int, Mapping[str, Floats]] = {}
         self._effects = Effects()
-        self._plans: dict[frozenset[int], RowPlan] = {}
-        self._choices: dict[tuple[int, ...], NDArray[np.int64]] = {}
-        self._weights = FlatWeights()
+        self._plans: dict[frozenset[int], _Plan] = {}
+        self._checked: list[tuple[torch.Tensor, int]] = []  # weights and their versions
 
     def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
         """Make `gaussians` the scene under `layers`: what `compose_layers(scene, layers, blend)` gives.
@@ -99,69 +148,88 @@ class Composer:
         """
         check_numbers(layers, blend)
         stack = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
-        self._weights.update([layer for _, layer in stack])
+        self._check_weights([layer for _, layer in stack])
         before, self._effects = self._effects, effects_of(stack, blend)
         changed = changed_edits(before, self._effects)
         if not changed:
             return Change(np.zeros(0, np.int64), (), 0.0)
         plan = self._plan(changed)
-        moving = {name for edit in plan.edits for name in self._moving[edit]}
-        kinds = changed_gains(before, self._effects, changed)
-        if kinds is not None:
-            moving = {name for edit in changed for name in self._moving[edit] if KINDS[name] in kinds}
-        chosen = tuple(i for i, name in enumerate(self._names) if name in moving)
-        if not chosen:
-            return Change(plan.rows, (), 0.0)
-        concerned = [i for i, (edit, _) in enumerate(stack) if edit in plan.edits]
-        moved = self._rewrite(
-            plan, [stack[i] for i in concerned], [self._weights.begins[i] for i in concerned], chosen, blend
+        moving = {name for edit in plan.parts for name in self._bases[edit]}
+        names = tuple(name for name in self._before if name in moving)
+        parts = [self._part(plan, edit, layer) for edit, layer in stack if edit in plan.parts]
+        count = 1 + len(plan.rows) // CHUNK
+        cuts = [len(plan.rows) * part // count for part in range(count + 1)]
+        moves = run_chunks(
+            lambda chunk: self._rewrite(plan.rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
         )
-        return Change(plan.rows, tuple(self._names[i] for i in chosen), math.sqrt(moved))
+        return Change(plan.rows, names, math.sqrt(max(moves)))
 
     def _rewrite(
-        self,
-        plan: RowPlan,
-        stack: Sequence[tuple[int, Layer]],
-        weights_at: Sequence[int],
-        chosen: tuple[int, ...],
-        blend: str,
+        self, rows: Rows, parts: Sequence[_Part], names: Sequence[str], blend: str, first: int, last: int
     ) -> float:
-        """Write these attributes of the plan's rows; the largest squared step of a center."""
-        prepared = plan.stack(tuple(edit for edit, _ in stack))
-        strengths = 0.0
-        for i, (edit, layer) in enumerate(stack):
-            right, share = find_segment(self._gdfs[edit].field.knots, layer.strength)
-            entry: Any = prepared.layers[i]
-            entry["weights"], entry["clamped_strength"] = weights_at[i], layer.clamped_strength
-            entry["right"], entry["at_knot"], entry["share"] = right, share == 1.0, share
-            prepared.gains[i] = [getattr(layer.gains, kind) for kind in GAINS]
-            strengths += layer.clamped_strength
-        # a little below 1: sums in float32 may round up to where the kernel has to look
-        normalize = blend == "normalized" and strengths > 1 - 1e-6
-        prepared = prepared._replace(weights=self._weights.flat, over=blend == "over", normalize=normalize)
-        blocks, attributes = plan.blocks, self._index_array(chosen)
-        target, lists, bases = self._target, plan.lists, self._bases
+        """Write these attributes of rows first to last; the largest squared step of a center."""
+        rows, parts = rows[first:last], [_between(part, first, last) for part in parts]
+        weight_sum = _NOTHING
+        # a little below 1: sums in float32 may round up to where they count
+        if blend == "normalized" and sum(part.layer.clamped_strength for part in parts) > 1 - 1e-6:
+            weight_sum = np.zeros(len(rows), np.float32)
+            for part in parts:
+                weights = part.weights[part.members] if len(part.weights) else np.float32(1.0)
+                weight_sum[part.at] += weights * np.float32(part.layer.clamped_strength)
+            np.maximum(weight_sum, np.float32(1.0), out=weight_sum)
+        largest = 0.0
+        for name in names:
+            after = self._after[name]
+            total = np.full((len(rows), after.shape[1]), -0.0, np.float32)  # adding to −0 leaves every bit
+            for part in parts:
+                bases, gain = self._bases[part.edit].get(name), part.layer.gain(name)
+                if bases is None or gain == 0:
+                    continue
+                used, factors = bases.factors(part.segment)
+                covered = self._covered(part.edit, KINDS[name]) if blend == "over" else _NOTHING
+                hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
+                own = part.at, part.members, part.weights
+                _add_offsets(
+                    total, own, bases.end, bases.residual, used, factors, np.float32(gain), hidden, covered
+                )
+            moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
+            largest = max(largest, moved)
+        return largest
 
-        def compose(first: int, last: int) -> float:
-            return float(compose_rows(target, lists, prepared, bases, attributes, first, last))
+    def _part(self, plan: _Plan, edit: int, layer: Layer) -> _Part:
+        weights = _NOTHING if layer.weights is None else layer.weights.detach().float().numpy()
+        segment = find_segment(layer.gdf.field.knots, layer.strength)
+        return _Part(layer, edit, segment, *plan.parts[edit], weights)
 
-        count = min(1 + len(plan.rows) // WORTH_A_THREAD, max(blocks, 1))
-        count = min(count, threads()) if count > 1 else 1
-        cuts = [blocks * part // count for part in range(count + 1)]
-        return max(run_chunks(lambda chunk: compose(cuts[chunk], cuts[chunk + 1]), count))
-
-    def _plan(self, changed: frozenset[int]) -> RowPlan:
+    def _plan(self, changed: frozenset[int]) -> _Plan:
+        """All members of these edits, and what others share rows with them."""
         if changed not in self._plans:
             if len(self._plans) >= 32:  # a handful is in use while one drags
                 self._plans.clear()
-            self._plans[changed] = plan_rows(self._members, changed, self._edited_rows)
+            chosen = [self._members[edit] for edit in changed]
+            rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
+            parts = {}
+            for edit, members in enumerate(self._members):
+                _, own, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
+                if len(own):
+                    parts[edit] = own, at
+            self._plans[changed] = _Plan(rows, parts)
         return self._plans[changed]
 
-    def _index_array(self, chosen: tuple[int, ...]) -> NDArray[np.int64]:
-        """These numbers as an array, made once."""
-        if chosen not in self._choices:
-            self._choices[chosen] = np.array(chosen, np.int64)
-        return self._choices[chosen]
+    def _covered(self, edit: int, kind: str) -> Floats:
+        if edit not in self._coverage:
+            covered = coverage(self._scene, self._gdfs[edit])
+            self._coverage[edit] = {name: values.numpy() for name, values in covered.items()}
+        return self._coverage[edit][kind]
+
+    def _check_weights(self, layers: Sequence[Layer]) -> None:
+        """`check_weights` of those that are new or were written to."""
+        given = [(layer.weights, layer.weights._version) for layer in layers if layer.weights is not None]
+        for layer in layers:
+            known = any(w is layer.weights and version == w._version for w, version in self._checked)
+            if not known:
+                check_weights(layer)
+        self._checked = given
 
     def _edit_of(self, gdf: Gdf) -> int:
         try:
@@ -170,3 +238,122 @@ class Composer:
             raise ValueError(
                 f"{gdf.name} is not one of the composer's edits; give it to Composer first"
             ) from None
+
+
+def _between(part: _Part, first: int, last: int) -> _Part:
+    """What of a part lies in rows first to last, counted from the first."""
+    begin, end = np.searchsorted(part.at, (first, last))
+    if (first, begin, end) == (0, 0, len(part.at)):
+        return part
+    return part._replace(members=part.members[begin:end], at=part.at[begin:end] - first)
+
+
+@kernel(cache=True, allocates=True)
+def _add_offsets(
+    total: Floats,
+    own: tuple[Rows, Rows, Floats],
+    end: Floats,
+    residual: NDArray[Any],
+    used: Rows,
+    factors: Floats,
+    gain: np.float32,
+    hidden: np.float32,
+    covered: Floats,
+) -> None:
+    """total ← total · (1 − m hidden c) + m gain Δ, for one layer and attribute: see `compose_layers`.
+
+    Args:
+        total: sums so far, written. [U,c]
+        own: where the layer's members are in `total` [m], which they are [m], and the weights of all members
+            [M], empty: all 1
+        end, residual: as stored. [M,c], [R,M,c]
+        used, factors: see `_Bases.factors`. [U], [1+U,c] or none
+        hidden, covered: the share of lower layers that is hidden at c = 1, and c [M], empty: 0
+    """
+    at, members, weights = own
+    one, width = np.float32(1.0), total.shape[1]
+    offsets = np.zeros(_BLOCK * width, np.float32)  # of a block of members: they stay in the first cache
+    tiles = np.empty((len(factors), _BLOCK * width), np.float32)
+    for k in range(len(factors)):
+        for i in range(min(_BLOCK, len(at))):
+            for c in range(width):
+                tiles[k, i * width + c] = factors[k, c]
+    ends, sums = end.reshape(-1), total.reshape(-1)
+    for first in range(0, len(at), _BLOCK):
+        count = min(_BLOCK, len(at) - first)
+        low, row = members[first], at[first]
+        if members[first + count - 1] - low == count - 1:  # one run: along memory
+            for k in range(len(factors)):
+                tile = tiles[k]
+                if k == 0:
+                    stored = ends[low * width : (low + count) * width]
+                    for j in range(count * width):
+                        offsets[j] = tile[j] * stored[j]
+                else:
+                    levels = residual[used[k - 1]].reshape(-1)[low * width : (low + count) * width]
+                    for j in range(count * width):
+                        offsets[j] += tile[j] * np.float32(levels[j])
+        else:
+            for k in range(len(factors)):
+                for i in range(count):
+                    for c in range(width):
+                        j = i * width + c
+                        if k == 0:
+                            offsets[j] = factors[0, c] * end[members[first + i], c]
+                        else:
+                            level = residual[used[k - 1], members[first + i], c]
+                            offsets[j] += factors[k, c] * np.float32(level)
+        if len(weights) == 0 and len(covered) == 0 and at[first + count - 1] - row == count - 1:
+            run = sums[row * width : (row + count) * width]
+            for j in range(count * width):
+                run[j] += gain * offsets[j]
+            continue
+        for i in range(count):
+            row, member, weight = at[first + i], members[first + i], one
+            if len(weights):
+                weight = weights[member]
+                if weight == 0.0:
+                    continue
+            for c in range(width):
+                if len(covered):
+                    total[row, c] *= one - (weight * hidden) * covered[member]
+                total[row, c] += (weight * gain) * offsets[i * width + c]
+
+
+@kernel(cache=True, allocates=True)
+def _finish(
+    after: Floats, before: Floats, rows: Rows, total: Floats, weight_sum: Floats, measure: bool
+) -> float:
+    """after ← before + total / weight_sum in these rows; the largest squared step of one, if asked for.
+
+    Args:
+        after, before: [N,c]
+        rows: [U]
+        total: the sums; overwritten. [U,c]
+        weight_sum: at least 1, empty: all 1. [U]
+    """
+    largest, width = np.float32(0.0), total.shape[1]
+    for first in range(0, len(rows), _BLOCK):
+        count = min(_BLOCK, len(rows) - first)
+        if len(weight_sum):
+            for i in range(first, first + count):
+                for c in range(width):
+                    total[i, c] /= weight_sum[i]
+        if measure:
+            for i in range(first, first + count):
+                row, step = rows[i], np.float32(0.0)
+                for c in range(3):
+                    moved = before[row, c] + total[i, c] - after[row, c]
+                    step += moved * moved
+                largest = max(largest, step)
+        row = rows[first]
+        if rows[first + count - 1] - row == count - 1:
+            new, old, own = after[row : row + count], before[row : row + count], total[first : first + count]
+            new_run, old_run, own_run = new.reshape(-1), old.reshape(-1), own.reshape(-1)
+            for j in range(count * width):
+                new_run[j] = old_run[j] + own_run[j]
+            continue
+        for i in range(first, first + count):
+            for c in range(width):
+                after[rows[i], c] = before[rows[i], c] + total[i, c]
+    return float(largest)

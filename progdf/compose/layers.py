@@ -140,22 +140,7 @@ def changed_edits(before: Effects, now: Effects) -> frozenset[int]:
     )
 
 
-def changed_gains(before: Effects, now: Effects, changed: frozenset[int]) -> set[str] | None:
-    """Kinds of change whose gains alone tell the changed edits from before; None where more than gains do."""
-    pairs = [(before.of.get(edit, ()), now.of.get(edit, ())) for edit in changed]
-    if now.blend != before.blend or not all(_same(a, b, gains=False) for a, b in pairs):
-        return None
-    return {
-        kind
-        for effects in pairs
-        for a, b in zip(*effects, strict=True)
-        for kind, gain in vars(a[1]).items()
-        if gain != getattr(b[1], kind)
-    }
-
-
-def _same(before: Effect, now: Effect, gains: bool = True) -> bool:
+def _same(before: Effect, now: Effect) -> bool:
     return len(before) == len(now) and all(
-        a[0] == b[0] and a[2] is b[2] and a[3:] == b[3:] and (not gains or a[1] == b[1])
-        for a, b in zip(before, now, strict=True)
+        a[:2] == b[:2] and a[2] is b[2] and a[3:] == b[3:] for a, b in zip(before, now, strict=True)
     )
