@@ -77,7 +77,7 @@ def draw(ctx: moderngl.Context, request: pytest.FixtureRequest) -> Iterator[obje
     def picture(scene: Gaussians, camera: Camera) -> np.ndarray:
         if request.param != "gl":
             return render(scene, camera, engine=request.param).image.detach().clamp(0, 1).numpy()
-        made.append(ViewEngine(ctx, scene, (), "gl", "auto"))
+        made.append(ViewEngine(ctx, scene, (), "gl"))
         return np.asarray(made[-1].image(ViewState(), camera=camera))
 
     yield picture
