@@ -210,7 +210,7 @@ def test_a_switch_that_changes_the_last_bits_makes_another_kind_of_processor(
     kinds = [processor_kind()]
     monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "OTHER")
     kinds.append(processor_kind())
-    monkeypatch.setattr("numba.config.CPU_NAME", "generic")
+    monkeypatch.setattr("numba.config.CPU_NAME", "another")
     kinds.append(processor_kind())
     monkeypatch.setenv("MKL_ENABLE_INSTRUCTIONS", "SSE4_2")
     kinds.append(processor_kind())
