@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import pack
 from progdf.metrics.image import decibels
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
 from trainer.optimize.color_solver import color_columns

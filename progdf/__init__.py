@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from progdf.compose.layers import Layer
-    from progdf.compose.reference import compose_layers
     from progdf.formats.ply import load_ply, save_ply
     from progdf.formats.scene_file import load_scene
     from progdf.gdf.file import Gdf, load_gdf, save_gdf
     from progdf.io.cameras import load_cameras
 
     from .camera import Camera
+    from .compose.reference import compose_layers
     from .gaussians import Gaussians
     from .rasterize import render
 

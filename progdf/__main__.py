@@ -20,8 +20,7 @@ from typing import NoReturn
 from progdf.io.atomic import atomic_write, disk_full
 from progdf.io.user_folders import state_folder
 
-from .errors import ProgdfError
-from .terminal import PrintableFormatter, escape_text
+from .errors import PrintableFormatter, ProgdfError, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.pipeline.demo:main", "make a scene, train its edits, write previews, open the window"),

@@ -1,6 +1,6 @@
 """A region: which Gaussians an edit may change, and how sure we are of each; set operations, plain shapes.
 
-The language in which a region is written is in `progdf.scene.region_spec`.
+The language in which a region is written is in `progdf.scene.regions`.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.images import write_image
 from progdf.region import Region
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from trainer.editors import EditorSettings, ImageEditor, check_new_editor, make_editor
 from trainer.regions.from_pictures import RegionSettings, region_kinds
 from trainer.views.view import View, make_view, with_near_plane

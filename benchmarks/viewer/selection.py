@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.table import Table, machine
 from progdf.gaussians import Gaussians
 from progdf.scene import selection as shapes
-from progdf.scene.neighborhood import Neighborhood, grow_along_surface
+from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.state import selection
 

@@ -10,12 +10,12 @@ from typing import Annotated
 
 import tyro
 
+from progdf.errors import print_line
 from progdf.formats.scene_file import load_scene_with_report
 from progdf.io.cameras import load_cameras
 from progdf.scene.stats import survey
 from progdf.scene.strays import find_strays
 from progdf.scene.up_axis import UpChoice, find_up
-from progdf.terminal import print_line
 
 from .options import parse_options
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, print_line
 from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import load_scene, scene_name
@@ -18,7 +18,6 @@ from progdf.gaussians import Gaussians
 from progdf.io.atomic import check_not_an_input
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import clean, find_strays, picture_difference
-from progdf.terminal import print_line
 
 from .options import parse_options
 

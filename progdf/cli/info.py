@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, print_line
 from progdf.formats.load_report import file_size, format_count, group_digits
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO
@@ -21,7 +21,6 @@ from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json, decode_json
 from progdf.scene.stats import survey
-from progdf.terminal import print_line
 
 from .options import parse_options
 

@@ -17,7 +17,7 @@ import tyro
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, print_line
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.formats.scene_file import load_scene, rotate_about_x, scene_name
 from progdf.gaussians import BASE_CHANNELS, Gaussians
@@ -25,7 +25,6 @@ from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.atomic import check_not_an_input
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
-from progdf.terminal import print_line
 
 from .options import parse_options
 

@@ -3,7 +3,7 @@
 Every function takes sRGB as it is stored (0..1, not linear) in any shape [...,3], returns the same shape,
 gives the input back bit for bit where the strength is 0, and moves continuously with it. Hue, chroma and
 lightness are those of `progdf.color.oklab`; what lies between the original and the finished edit is said in
-`progdf.color.path`.
+`progdf.color.oklab`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,17 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 
-from .oklab import fit_gamut, hue_of, oklab_to_srgb, srgb_to_oklab
-from .path import STRAIGHT, ColorPath, Strength, bend_of, interpolate_colors
+from .oklab import (
+    STRAIGHT,
+    ColorPath,
+    Strength,
+    bend_of,
+    fit_gamut,
+    hue_of,
+    interpolate_colors,
+    oklab_to_srgb,
+    srgb_to_oklab,
+)
 
 _LEAST_CHROMA = 0.015  # of a target that has a hue
 _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further

@@ -5,8 +5,14 @@ Its polar form, OKLCh, has hue, chroma and lightness: scaling the lightness ther
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
 import torch
 from torch import Tensor
+
+from progdf.errors import ProgdfError
 
 _LMS_FROM_LINEAR = (
     (0.4122214708, 0.5363325363, 0.0514459929),
@@ -56,3 +62,115 @@ def fit_gamut(lab: Tensor) -> Tensor:
 def hue_of(lab: Tensor) -> Tensor:
     """Radians, −pi..pi. [...,3] -> [...]"""
     return torch.atan2(lab[..., 2], lab[..., 1])
+
+
+Strength = float | Tensor
+"""How far the edit has gone, 0..1: one number, or a tensor with the colors' shape less the last axis."""
+
+_GREEN = math.radians(142.5)  # hue of sRGB's
+
+ColorPath = Literal["bowed", "hue", "straight", "srgb"]
+"""The way of colors from the original to the finished edit, see `bend_of`."""
+
+
+@dataclass(frozen=True)
+class Bend:
+    """How the way between two colors bends from the straight line in OKLab towards the hue circle.
+
+    Args:
+        bow: share of the way along the hue circle in the mixture, 0 (straight) to 1
+        direction: 1 or −1: the sense in which nearly opposite hues turn, the same all over a region
+        whole, none: hues that lie so near to opposite (angle missing, radians) that they turn in this sense
+            altogether, and those from which on each takes its own shorter way; in between the two ways mix
+        fade: straight in sRGB instead, as pictures are cross-faded
+    """
+
+    bow: float
+    direction: float
+    whole: float
+    none: float
+    fade: bool = False
+
+
+STRAIGHT = Bend(0.0, 1.0, 0.0, 1.0)
+"""No bend at all."""
+
+
+def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Bend:
+    """The bend for a region whose typical color `reference` becomes `target`; sRGB, [3] each.
+
+    - "bowed": mostly straight, bowed by 0.4 towards the shorter hue, so that half of blue is half way to blue
+      and not gray. Hues that are opposite within 10° keep off green, which nobody expects.
+    - "hue": along the hue circle, the shorter way; between nearly opposite hues the way over green.
+    - "straight": straight in OKLab; "srgb": straight in sRGB. Both go through gray between opposite hues.
+    """
+    if path in ("straight", "srgb"):
+        return replace(STRAIGHT, fade=path == "srgb")
+    start, end = (hue_of(srgb_to_oklab(color.clamp(0, 1))) for color in (reference, target))
+    short, to_green = _wrap(end - start), _wrap(_GREEN - start)
+    over_green = bool(to_green * short > 0) and bool(to_green.abs() <= short.abs())
+    opposite, green, bow, whole, none = {
+        "bowed": (170.0, False, 0.4, 15.0, 60.0),
+        "hue": (140.0, True, 1.0, 45.0, 120.0),
+    }[path]
+    turns = float(short.abs()) >= math.radians(opposite) and over_green is not green
+    sense = 1.0 if bool(short > 0) is not turns else -1.0
+    return Bend(bow, sense, math.radians(whole), math.radians(none))
+
+
+def path_of(name: str) -> ColorPath:
+    """The path of that name; else a ProgdfError."""
+    for path in get_args(ColorPath):
+        if path == name:
+            return path  # type: ignore[no-any-return]
+    raise ProgdfError(f"unknown color path '{name}'; use one of {', '.join(get_args(ColorPath))}")
+
+
+def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:
+    """Colors on their way to others: straight in OKLab, bowed towards the hue circle.
+
+    The bow grows with what both colors have of chroma: a gray's hue is noise, and turned it would shine in
+    all colors of the rainbow half way. Neighbors keep together all around the circle, see `Bend`.
+
+    Args:
+        rgb: at strength 0, sRGB; what lies outside 0..1 (SH colors may) fades with the strength. [...,3]
+        end: at strength 1, bit for bit, 0..1. [...,3]
+        strength: 0..1
+        bend: of the region
+    """
+    inside = rgb.clamp(0, 1)
+    s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
+    if bend.fade:
+        way = torch.lerp(inside, end, s[..., None])
+    else:
+        way = _bowed(srgb_to_oklab(inside), srgb_to_oklab(end), s, bend)
+    edited = way + (1 - s)[..., None] * (rgb - inside)
+    return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
+
+
+def _bowed(a: Tensor, b: Tensor, s: Tensor, bend: Bend) -> Tensor:
+    """From OKLab to OKLab; sRGB. [...,3], [...,3], [...] -> [...,3]"""
+    chroma_a, chroma_b = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1)
+    turn = bend.direction * _wrap(hue_of(b) - hue_of(a))  # -pi..pi, the region's sense being positive
+    own = _rise(turn + math.pi, bend.whole, bend.none)
+    chroma = torch.lerp(chroma_a, chroma_b, s)
+
+    def rotate(angle: Tensor) -> Tensor:
+        hue = hue_of(a) + bend.direction * s * angle
+        return torch.stack([chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1)
+
+    around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), own[..., None])
+    bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
+    lab = torch.lerp(a, b, s[..., None])
+    lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])
+    return fit_gamut(lab)
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def _rise(values: Tensor, low: float, high: float) -> Tensor:
+    """0 up to `low`, 1 from `high`, smooth between."""
+    x = ((values - low) / (high - low)).clamp(0, 1)
+    return x * x * (3 - 2 * x)

@@ -22,8 +22,8 @@ from progdf.interpolation import Segment, find_segment
 from progdf.rasterize.cpu.jit import kernel
 from progdf.rasterize.cpu.parallel import run_chunks
 
-from .coverage import coverage
 from .layers import KINDS, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
+from .reference import coverage
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]

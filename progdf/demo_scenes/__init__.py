@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .assemble import DemoScene
-from .bear import SKY, SMALLEST, bear
+from .bear import SKY, SMALLEST, bear, paint_panda
 from .edits import (
     AnalyticEdit,
     bear_edits,
@@ -16,7 +16,6 @@ from .edits import (
     stripes_edit,
     swing_edit,
 )
-from .panda import paint_panda
 from .room import SMALLEST_ROOM, room
 
 __all__ = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,15 +11,147 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
 from progdf.sh import rgb_to_sh0
 from progdf.torch_threads import one_thread
 
 from .light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, view_dependent_light
-from .noise import lattice
-from .paint import Paint, Painter
 from .surface import Part, Samples, sample
+
+_SIDE = 64  # the lattice repeats after this many cells; a power of two
+
+
+def lattice(seed: int) -> Tensor:
+    """Random numbers in −1..1 on a lattice of 64³ nodes, for `noise`. [64³] float32"""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(_SIDE**3, generator=generator) * 2 - 1
+
+
+def noise(points: Tensor, table: Tensor, frequency: float, octaves: int = 1) -> Tensor:
+    """Value noise, −1..1, mean about 0; each octave doubles the frequency and halves the height.
+
+    Args:
+        points: where. [N,3]
+        table: what `lattice` made
+        frequency: cells per world unit
+        octaves: how many layers of detail, ≥ 1
+
+    Returns:
+        [N]
+    """
+    total = torch.zeros(points.shape[0])
+    height, span = 1.0, 0.0
+    for octave in range(octaves):
+        # the shift keeps the lattice planes of the octaves, and the part's planes of symmetry, apart
+        total += height * _value_noise(points * frequency + 17.31 * (octave + 1), table)
+        span += height
+        height, frequency = height / 2, frequency * 2
+    return total / span
+
+
+def _value_noise(places: Tensor, table: Tensor) -> Tensor:
+    cell = places.floor()
+    f = places - cell
+    f = f * f * (3 - 2 * f)
+    low = cell.long() & (_SIDE - 1)
+    high = (low + 1) & (_SIDE - 1)
+    x = (low[:, 0] * _SIDE * _SIDE, high[:, 0] * _SIDE * _SIDE)
+    y = (low[:, 1] * _SIDE, high[:, 1] * _SIDE)
+    z = (low[:, 2], high[:, 2])
+    planes = []
+    for i in range(2):
+        rows = [torch.lerp(table[x[i] + y[j] + z[0]], table[x[i] + y[j] + z[1]], f[:, 2]) for j in range(2)]
+        planes.append(torch.lerp(rows[0], rows[1], f[:, 1]))
+    return torch.lerp(planes[0], planes[1], f[:, 0])
+
+
+@dataclass(frozen=True)
+class Pelt:
+    """How the Gaussians of a surface lie: most of them flat on it, some standing out as hairs or blades.
+
+    Args:
+        standing: share of those that stand out, 0..1
+        flat: standard deviations along the flow, across it and through the surface, in sample spacings
+        hair: the same of those that stand out
+        length: what is added to a hair's first, world units: fur keeps some length however fine the sampling
+        rise: how steeply a hair leaves the surface; 0 lies, 1 is 45 degrees
+        lift: how far a hair's middle is above the surface, in its first standard deviation
+        unruly: how much directions differ from neighbor to neighbor
+    """
+
+    standing: float = 0.0
+    flat: tuple[float, float, float] = (0.64, 0.64, 0.14)
+    hair: tuple[float, float, float] = (0.70, 0.24, 0.16)
+    length: float = 0.0
+    rise: float = 0.45
+    lift: float = 0.35
+    unruly: float = 0.35
+
+
+BARE = Pelt()
+
+
+@dataclass(frozen=True)
+class Paint:
+    """What a surface looks like before light falls on it.
+
+    Args:
+        color: sRGB 0..1. [N,3]
+        relief: how far the normals lean, for light only. [N,3]
+        velvet: brightening where the surface turns away from the eye, sRGB units
+        gloss: mirror highlight, sRGB units
+        flow: where hairs and flat Gaussians point; only its part along the surface counts. [N,3]
+        pelt: how the Gaussians lie
+        glows: whether `color` is what is seen, whatever light there is
+    """
+
+    color: Tensor
+    relief: Tensor
+    velvet: float = 0.0
+    gloss: float = 0.0
+    flow: Tensor | None = None
+    pelt: Pelt = BARE
+    glows: bool = False
+
+
+Painter = Callable[[Part, Samples, Tensor], Paint]
+"""The paint of a part at its samples; the tensor is the noise's table."""
+
+
+def bumps(points: Tensor, table: Tensor, frequency: float, height: float) -> Tensor:
+    """A relief of noise, see `Paint.relief`. [N,3] -> [N,3]"""
+    offsets = torch.tensor([[0.0, 0.0, 0.0], [5.2, 1.3, 8.1], [2.7, 9.4, 4.6]])
+    return height * torch.stack([noise(points + offset, table, frequency, 2) for offset in offsets], dim=1)
+
+
+def swirl(points: Tensor, table: Tensor, main: tuple[float, float, float], height: float = 0.7) -> Tensor:
+    """A flow along `main` that noise bends. [N,3] -> [N,3]"""
+    bend = torch.stack([noise(points + 3.1 * k, table, 2.5) for k in range(3)], dim=1)
+    return torch.tensor(main) + height * bend
+
+
+def mix_colors(dark: str, light: str, share: Tensor) -> Tensor:
+    """From one `#rrggbb` to another; what lies outside 0..1 is cut. [N] -> [N,3]"""
+    return torch.lerp(parse_color(dark), parse_color(light), share.clamp(0, 1)[:, None])
+
+
+def flat(color: str, points: Tensor) -> Tensor:
+    """One `#rrggbb` everywhere. [N,3] -> [N,3]"""
+    return parse_color(color).expand(len(points), 3)
+
+
+def mix(under: Tensor, over: Tensor, share: Tensor) -> Tensor:
+    """`over` where `share` is 1. [N,3], [N,3], [N] -> [N,3]"""
+    return torch.lerp(under, over, share.clamp(0, 1)[:, None])
+
+
+def step(value: Tensor, low: float, high: float) -> Tensor:
+    """0 up to `low`, 1 from `high`, smooth between. [...] -> [...]"""
+    share = ((value - low) / (high - low)).clamp(0, 1)
+    return share * share * (3 - 2 * share)
+
 
 _PROBES = 600
 _MOST_DRAWN = 10_000  # per Gaussian kept; a part of which less shows is misplaced

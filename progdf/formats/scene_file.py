@@ -20,11 +20,10 @@ from typing import Any
 
 import torch
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, escape_text
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import read_file
 from progdf.io.json_values import decode_json
-from progdf.terminal import escape_text
 
 from . import gaussforge_child
 from .compressed_ply import is_compressed, read_compressed_ply

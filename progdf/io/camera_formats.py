@@ -14,9 +14,8 @@ import msgspec
 import torch
 from torch import Tensor
 
-from progdf.camera import Camera
+from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
-from progdf.lens import Lens
 
 from .json_values import convert_json
 

@@ -17,9 +17,8 @@ from pathlib import Path
 import msgspec
 import torch
 
-from progdf.camera import Camera
+from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
-from progdf.lens import Lens
 
 from . import colmap_child
 from .atomic import open_error

@@ -2,9 +2,135 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from progdf.gaussians import Gaussians
+from progdf.rasterize.cpu.parallel import threads
+
+from .selection import Floats, Mask, alike_in_color
+
+_RING, _AROUND, _LINKS = 8, 24, 8  # neighbors: of a step, of a vote, of a connection
+_REACH = 3.0  # times how far neighbors commonly are; what is farther is none, also where none is nearer
+_TOUCH = 1.0
+_WORTH_THREADS = 2000  # Gaussians of which the neighbors are sought
+
+
+class Neighborhood:
+    """The centers of a scene's Gaussians in a k-d tree; make it once for a scene (1M: about a second).
+
+    Args:
+        scene: its centers; those that are not finite count as at the origin
+    """
+
+    def __init__(self, scene: Gaussians) -> None:
+        self._points = np.nan_to_num(scene.means.numpy().astype(np.float64))
+        self._sizes = np.exp(scene.log_scales.numpy().max(axis=1))
+        self._tree = cKDTree(self._points, balanced_tree=False, compact_nodes=False)
+
+    def grow(self, mask: Mask) -> Mask:
+        """With the nearest neighbors of what is selected. [N]"""
+        near, reached = self._near(np.flatnonzero(mask), _RING)
+        grown = mask.copy()
+        grown[near[reached]] = True
+        return grown
+
+    def shrink(self, mask: Mask) -> Mask:
+        """Without what has a nearest neighbor that is not selected. [N]"""
+        rows = np.flatnonzero(mask)
+        near, reached = self._near(rows, _RING)
+        shrunk = mask.copy()
+        shrunk[rows[(reached & ~mask[near]).any(axis=1)]] = False
+        return shrunk
+
+    def smooth(self, mask: Mask) -> Mask:
+        """At its border what most neighbors are: strays and holes go, edges get straighter. [N]"""
+        near, reached = self._near(np.flatnonzero(mask), _RING)
+        across = reached & ~mask[near]
+        border = np.zeros_like(mask)
+        border[near[across]] = True
+        border[np.flatnonzero(mask)[across.any(axis=1)]] = True
+        rows = np.flatnonzero(border)
+        near, reached = self._near(rows, _AROUND)
+        votes, voters = (reached & mask[near]).sum(axis=1) + mask[rows], reached.sum(axis=1) + 1
+        smoothed = mask.copy()
+        smoothed[rows] = 2 * votes > voters
+        return smoothed
+
+    def largest_part(self, mask: Mask) -> Mask:
+        """Only the connected part that has most members; nothing of nothing. [N]"""
+        rows = np.flatnonzero(mask)
+        largest = np.zeros_like(mask)
+        if not len(rows):
+            return largest
+        tree = cKDTree(self._points[rows])
+        start, end = self._links(tree, rows, np.arange(len(rows)))
+        pairs = coo_array((np.ones(len(start), bool), (start, end)), shape=(len(rows), len(rows)))
+        part = connected_components(pairs, directed=False)[1]
+        largest[rows[part == np.bincount(part).argmax()]] = True
+        return largest
+
+    def connected_part(self, mask: Mask, seeds: NDArray[np.int64]) -> Mask:
+        """What of `mask` is connected within it with any of the rows `seeds` that are in it. [N]"""
+        rows = np.flatnonzero(mask)
+        reached = np.zeros(len(rows), bool)
+        frontier = np.flatnonzero(np.isin(rows, seeds))
+        if len(frontier):
+            tree = cKDTree(self._points[rows], balanced_tree=False, compact_nodes=False)
+        while len(frontier):
+            reached[frontier] = True
+            end = self._links(tree, rows, frontier)[1]
+            frontier = np.unique(end[~reached[end]])
+        part = np.zeros_like(mask)
+        part[rows[reached]] = True
+        return part
+
+    def nearest(self, point: tuple[float, float, float]) -> int:
+        """The Gaussian whose center is nearest to a point, world units."""
+        return int(self._tree.query(point)[1])
+
+    def _near(self, rows: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64], Mask]:
+        """The k nearest others of some Gaussians [M,k], and which of them are within reach [M,k]."""
+        k = min(k, len(self._points) - 1)
+        if not len(rows) or k < 1:
+            return np.zeros((len(rows), 0), np.int64), np.zeros((len(rows), 0), bool)
+        distances, near = self._tree.query(self._points[rows], k + 1, workers=threads())
+        distances, near = distances[:, 1:], near[:, 1:]
+        return near, distances <= _REACH * np.median(distances[:, -1])
+
+    def _links(
+        self, tree: cKDTree, rows: NDArray[np.int64], some: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The pairs of connected ones in a tree of `rows`, of which `some` begin; all as places in `rows`."""
+        k = min(_LINKS + 1, len(rows))
+        workers = threads() if len(some) > _WORTH_THREADS else 1
+        distances, near = tree.query(self._points[rows[some]], k, workers=workers)
+        distances, near = distances.reshape(len(some), k), near.reshape(len(some), k)
+        sizes = self._sizes[rows]
+        touch = distances <= _TOUCH * (sizes[some][:, None] + sizes[near])
+        return np.broadcast_to(some[:, None], near.shape)[touch], near[touch]
+
+
+def grow_along_surface(
+    neighborhood: Neighborhood, colors: Floats, seeds: NDArray[np.int64], color: Floats, tolerance: float
+) -> Mask:
+    """What is connected with the seeds and alike in color.
+
+    Args:
+        neighborhood: of the scene
+        colors: of its Gaussians, OKLab. [N,3]
+        seeds: rows to begin at, also where they are not alike themselves. [M]
+        color: what others are compared with, OKLab. [3]
+        tolerance: how far a color may be from it
+    """
+    alike = alike_in_color(colors, color, tolerance)
+    alike[seeds] = True
+    return neighborhood.connected_part(alike, seeds)
 
 
 def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,7 @@ from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.images import write_image
 from progdf.rasterize import render
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.paths import SHARED_DATA
 from trainer.options import TrainOptions

@@ -22,7 +22,7 @@ from PIL import Image
 from progdf.formats.scene_file import load_scene
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.rasterize.cpu import jit
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_json, changed_parts
 from tests.helpers.hostile import NPY_HEADERS
 from tests.helpers.hostile import npy as write_npy

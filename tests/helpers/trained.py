@@ -12,7 +12,7 @@ from torch import Tensor
 
 import trainer.pipeline.run
 from progdf.camera import Camera
-from progdf.demo_scenes.bear_parts import LABELS
+from progdf.demo_scenes.bear import LABELS
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask

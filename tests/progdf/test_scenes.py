@@ -11,9 +11,9 @@ import torch
 
 from progdf import demo_scenes as scenes
 from progdf.color.edits import typical_color
-from progdf.demo_scenes import bear_paint, surface
+from progdf.demo_scenes import surface
 from progdf.demo_scenes.assemble import assemble
-from progdf.demo_scenes.bear_parts import bear_parts
+from progdf.demo_scenes.bear import bear_parts, paint_bear
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.rasterize import render
@@ -78,7 +78,7 @@ def test_a_part_that_lies_inside_another_is_reported_not_searched_for() -> None:
     outer = surface.Part("outer", "x", surface.ball(), torch.zeros(3), torch.eye(3))
     inner = surface.Part("inner", "x", surface.ball(), torch.zeros(3), 0.1 * torch.eye(3))
     with pytest.raises(ValueError, match="lies inside other parts; move it"):
-        assemble([outer, inner], ("x",), bear_paint.paint, 500, 0)
+        assemble([outer, inner], ("x",), paint_bear, 500, 0)
 
 
 def test_too_few_gaussians_for_a_bear_are_refused() -> None:
@@ -289,6 +289,6 @@ def test_which_of_parts_of_one_size_gets_the_gaussian_that_is_left_does_not_hang
             surface.Part("head", name, surface.ball(), torch.tensor([i, 0.0, 0.0]), r * torch.eye(3))
             for i, (name, r) in enumerate(zip("abc", radii.tolist(), strict=True))
         ]
-        _, labels = assemble(balls, ("a", "b", "c"), bear_paint.paint, 100, 0)
+        _, labels = assemble(balls, ("a", "b", "c"), paint_bear, 100, 0)
         counts.add(tuple(labels.bincount().tolist()))
     assert len(counts) == 1, counts

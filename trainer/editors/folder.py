@@ -20,10 +20,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from progdf.camera import undistort
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import read_picture
-from progdf.lens import undistort
 from progdf.region import Region
 from trainer.views.view import View
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
-from progdf.color.path import ColorPath, bend_of, interpolate_colors, path_of
+from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region

@@ -19,7 +19,7 @@ from progdf.gaussians import Gaussians
 from progdf.io.atomic import make_folder
 from progdf.io.images import write_image
 from progdf.metrics.slider import Pictures
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from trainer.editors import make_editor
 from trainer.optimize.losses import Perceptual
 from trainer.options import TrainOptions

@@ -21,7 +21,7 @@ from scipy.sparse import csr_matrix, diags
 from torch import Tensor
 
 from progdf.color.edits import typical_color
-from progdf.color.path import bend_of, interpolate_colors
+from progdf.color.oklab import bend_of, interpolate_colors
 from progdf.gaussians import Gaussians, unpack
 from progdf.rasterize.color_maps import ColorMap
 from progdf.sh import C0, sh0_to_rgb

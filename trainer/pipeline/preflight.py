@@ -8,7 +8,7 @@ from pathlib import Path
 from progdf.gaussians import ZERO
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
-from progdf.scene.region_spec import check_region
+from progdf.scene.regions import check_region
 from trainer.editors import check_editor, check_new_editor
 from trainer.editors.pictures import picture_cameras
 from trainer.options import VIEWS

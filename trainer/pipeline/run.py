@@ -16,7 +16,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.io.json_values import convert_json, plain
 from progdf.region import Region
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from trainer.editors import GIVEN, VIEW_BY_VIEW, make_editor
 from trainer.editors.base import EditKind
 from trainer.editors.folder import FolderEditor

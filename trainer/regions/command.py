@@ -21,7 +21,7 @@ from progdf.io.images import write_image
 from progdf.io.npy import save_npy
 from progdf.region import Region
 from progdf.scene.bounds import front_direction
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from progdf.scene.subject import fit_eye, subject_rows
 from progdf.scene.up_axis import find_up
 from trainer.option_checks import check_ranges

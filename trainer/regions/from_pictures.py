@@ -20,7 +20,7 @@ from progdf.io.picture_camera import edits_in_picture
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.region_spec import Check, Kind
+from progdf.scene.regions import Check, Kind
 from progdf.scene.up_axis import UpChoice, find_up
 from trainer.editors.cache import KeptPictures, Recipe
 from trainer.editors.pictures import picture_paths, rendered_cameras

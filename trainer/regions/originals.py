@@ -13,7 +13,7 @@ from progdf.io.images import write_image
 from progdf.region import whole_scene
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.option_checks import check_ranges
 from trainer.views.choose import choose_views

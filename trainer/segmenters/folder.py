@@ -17,10 +17,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from progdf.camera import Camera
+from progdf.camera import Camera, undistort
 from progdf.errors import ProgdfError
 from progdf.io.images import flatten_onto, open_picture
-from progdf.lens import undistort
 from trainer.editors.folder import SUFFIXES
 
 

@@ -14,12 +14,11 @@ from PIL import Image
 
 from progdf.camera import Camera
 from progdf.cli.options import parse_options
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, print_line
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.picture_camera import camera_chunk
-from progdf.terminal import print_line
 from progdf.torch_threads import one_thread
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, escape_text
 from progdf.io.json_values import convert_json, plain
 from progdf.io.session import (
     SUFFIX,
@@ -21,7 +21,6 @@ from progdf.io.session import (
     verify_files,
     write_session,
 )
-from progdf.terminal import escape_text
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import move_camera
 from viewer.state import paint

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from progdf.scene.neighborhood import Neighborhood, grow_along_surface
+from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from progdf.scene.selection import (
     Centers,
     Mask,

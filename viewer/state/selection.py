@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
-from progdf.scene.neighborhood import Neighborhood
+from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask, combine
 
 SUFFIX = ".region.npy"

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from progdf.color import edits as color
 from progdf.color.edits import parse_color, recolor
-from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
-from progdf.color.path import ColorPath, bend_of, interpolate_colors
+from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, srgb_to_oklab
 
 PAIRS = {
     "skin to blue": ("#e0ac88", "#3060d0"),

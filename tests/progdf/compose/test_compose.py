@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from progdf.compose.composer import Composer
-from progdf.compose.coverage import coverage
-from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
+from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers, coverage
 from progdf.errors import ProgdfError
 from progdf.field import fit_keyframes
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack

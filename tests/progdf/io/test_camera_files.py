@@ -12,10 +12,9 @@ import torch
 from PIL import Image
 
 import progdf
-from progdf.camera import Camera
+from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
-from progdf.lens import Lens
 from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
 from tests.helpers.full_disk import files_up_to
 from tests.helpers.refused import refusal

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from progdf.camera import Camera
+from progdf.camera import Camera, Lens
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.lens import Lens
 from tests.helpers.refused import refusal
 from tests.helpers.scenes import orbit_camera
 

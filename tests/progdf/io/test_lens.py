@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.lens import Lens, undistort
+from progdf.camera import Lens, undistort
 
 BARREL = Lens(k1=-0.18, k2=0.03, p1=0.004, p2=-0.006, k3=0.002)
 K = torch.tensor([[90.0, 0.0, 63.0], [0.0, 85.0, 49.5], [0.0, 0.0, 1.0]])

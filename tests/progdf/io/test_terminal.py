@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from progdf.__main__ import main
-from progdf.errors import ProgdfError
+from progdf.errors import PrintableFormatter, ProgdfError, escape_text
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
-from progdf.terminal import PrintableFormatter, escape_text
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.ply_files import scene_of, table_of, with_extra, write
 from tests.helpers.scenes import front_camera, random_gaussians

@@ -15,7 +15,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.region import Region, difference, from_mask, union
-from progdf.scene.region_spec import check_region, parse_region, split_spec
+from progdf.scene.regions import check_region, parse_region, split_spec
 from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
 from tests.helpers.scenes import orbit_camera, random_gaussians
 

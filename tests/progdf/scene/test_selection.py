@@ -12,7 +12,7 @@ from matplotlib.path import Path as Outline
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.scene.neighborhood import Neighborhood, grow_along_surface
+from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from progdf.scene.selection import (
     MODES,
     Surface,

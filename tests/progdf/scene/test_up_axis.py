@@ -18,15 +18,8 @@ from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.region_spec import parse_region
-from progdf.scene.up_axis import (
-    AXES,
-    axis_direction,
-    direction_name,
-    find_up,
-    guess_up,
-    up_from_json,
-)
+from progdf.scene.regions import parse_region
+from progdf.scene.up_axis import AXES, axis_direction, direction_name, find_up, guess_up, up_from_json
 from tests.helpers.demo_scenes import bear, room
 from tests.helpers.scenes import ball, high_chair, random_gaussians, turned, upright_turn
 from tests.helpers.stacks import bear_stack

@@ -25,7 +25,7 @@ from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import find_picture_camera
 from progdf.region import from_labels
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers import demo_scenes
 from trainer.pipeline import demo
 from trainer.plan import Plan

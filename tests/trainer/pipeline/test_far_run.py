@@ -14,7 +14,7 @@ from progdf.gdf.file import load_gdf
 from progdf.io.cameras import load_cameras
 from progdf.io.images import read_picture, to_picture
 from progdf.io.picture_camera import camera_chunk
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.trained import quick_options, train
 from trainer.editors.pictures import picture_cameras

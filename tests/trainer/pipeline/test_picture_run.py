@@ -18,7 +18,7 @@ from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk, find_picture_camera
 from progdf.metrics.image import decibels
 from progdf.region import Region
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers.trained import quick_options, train
 from trainer.editors import make_editor
 from trainer.evaluate.command import evaluate_folder

@@ -18,7 +18,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.io.images import save_as, to_picture
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.region_spec import check_region, parse_region
+from progdf.scene.regions import check_region, parse_region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import random_gaussians

@@ -13,15 +13,14 @@ import torch
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from progdf.camera import Camera
+from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import write_image
-from progdf.lens import Lens
 from progdf.region import Region
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear

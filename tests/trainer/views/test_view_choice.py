@@ -10,12 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.camera import Camera, intrinsics, look_at
+from progdf.camera import Camera, Lens, intrinsics, look_at
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
-from progdf.lens import Lens
 from progdf.region import from_mask
 from tests.helpers.demo_scenes import room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from progdf.camera import Lens, undistort
 from progdf.errors import ProgdfError
 from progdf.io.images import write_image
-from progdf.lens import Lens, undistort
 from progdf.rasterize import render
 from progdf.region import from_mask
 from progdf.scene.bounds import scene_sphere

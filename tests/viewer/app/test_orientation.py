@@ -12,7 +12,7 @@ from imgui_bundle import imgui
 from PIL import Image
 
 from progdf.formats.ply import save_ply
-from progdf.scene import known_ups
+from progdf.scene import up_axis
 from progdf.scene.up_axis import find_up
 from tests.helpers.null_app import null_app, press
 from tests.helpers.scenes import random_gaussians
@@ -181,7 +181,7 @@ def test_a_scene_that_does_not_tell_which_way_is_up_is_asked_about_once(
         assert app.main_view.up_strip is not None, "the tool goes first"
         press(app, "Escape")
         assert app.main_view.up_strip is None
-        kept = known_ups.find(app.document.scene)
+        kept = up_axis.find(app.document.scene)
         assert kept is not None
         assert tuple(kept.tolist()) == app.main_view.work.view.camera.up
         change_camera = with_up(app.main_view.work.view.camera, (1.0, 0.0, 0.0))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from progdf.errors import ProgdfError
-from progdf.scene.region_spec import parse_region
+from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view

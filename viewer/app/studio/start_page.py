@@ -9,8 +9,8 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from progdf import __version__
+from progdf.errors import escape_text
 from progdf.io.session import SUFFIX
-from progdf.terminal import escape_text
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import accent_button, elide, picture, section, tip
 

@@ -11,7 +11,7 @@ from typing import Protocol
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import make_folder
-from progdf.scene.region_spec import check_region
+from progdf.scene.regions import check_region
 from viewer.app.application import Application, failure_line
 from viewer.files import regions
 from viewer.files.document import Document

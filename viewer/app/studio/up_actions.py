@@ -8,7 +8,7 @@ from pathlib import Path
 import moderngl
 import torch
 
-from progdf.scene import known_ups
+from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import first_camera
@@ -96,7 +96,7 @@ class UpActions:
 
     def _answer(self, up: Vec3) -> None:
         if self._path is not None:
-            known_ups.remember(self._app.document.scene, up)
+            up_axis.remember(self._app.document.scene, up)
             self._up = up
         self.close()
         self._app.main_view.wake()
