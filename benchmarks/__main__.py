@@ -49,7 +49,7 @@ class BenchOptions:
         what: rasterize, field, edits, networks, viewer, select, frames, moving, window, warps, pictures;
             none named is all
         json: also write the tables to this JSON file
-        markdown: also put the tables between their markers in this Markdown file
+        markdown: also put the tables between their markers in these Markdown files
         runs: finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits
         plot: `field` also draws its errors into this PNG file
         scenes: .ply files that viewer, select, frames, moving and window take in place of the bears, warps
@@ -59,7 +59,7 @@ class BenchOptions:
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     json: Path | None = None
-    markdown: Path | None = None
+    markdown: tuple[Path, ...] = ()
     runs: tuple[Path, ...] = ()
     plot: Path | None = None
     scenes: tuple[Path, ...] = ()
@@ -87,8 +87,9 @@ def main(argv: Sequence[str]) -> int:
     for output in (options.json, options.plot):  # told now, not when an hour has been measured
         if output is not None and not output.parent.is_dir():
             raise ProgdfError(f"the folder {output.parent} does not exist; create it first")
-    if options.markdown is not None and not options.markdown.is_file():
-        raise ProgdfError(f"{options.markdown} does not exist; check the name and the folder")
+    for page in options.markdown:
+        if not page.is_file():
+            raise ProgdfError(f"{page} does not exist; check the name and the folder")
     given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
     given |= {name: {"runs": options.runs} for name in ("edits", "networks")}
     if options.runs and (not options.what or "field" in options.what):
@@ -115,9 +116,9 @@ def main(argv: Sequence[str]) -> int:
             temporary_file.write_text(
                 json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
             )
-    if options.markdown:
-        filled = put_tables(options.markdown.read_text(encoding="utf-8"), tables)
-        with atomic_write(options.markdown) as temporary_file:
+    for page in options.markdown:
+        filled = put_tables(page.read_text(encoding="utf-8"), tables)
+        with atomic_write(page) as temporary_file:
             temporary_file.write_text(filled, encoding="utf-8")
     return 0
 

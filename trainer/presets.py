@@ -87,7 +87,7 @@ CONSTANTS: Mapping[Preset, Constants] = {
 
 PRESETS: Mapping[Preset, Mapping[str, Any]] = {
     "default": {},
-    # the trainer of ProGDF (AAAI 2025) as it is printed: docs/method.md, The paper to the letter
+    # the trainer of ProGDF (AAAI 2025) as it is printed: docs/paper.md
     "paper": {
         "steps": 1500,
         "stages": 1,

@@ -14,8 +14,8 @@ from progdf.formats.load_report import format_count
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
-from progdf.scene.stats import survey
 from progdf.scene.orbit_rig import orbit_rig
+from progdf.scene.stats import survey
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.stacks import bear_stack
 

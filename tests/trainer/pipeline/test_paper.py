@@ -1,4 +1,4 @@
-"""`--preset paper`, line by line as docs/method.md, The paper to the letter, has it."""
+"""`--preset paper`, line by line as docs/paper.md, has it."""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.rasterize import render
 from progdf.rasterize.depth import render_depth
-from progdf.scene.stats import survey
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
+from progdf.scene.stats import survey
 from progdf.scene.subject import subject_rows
 from progdf.scene.up_axis import find_up
 from tests.helpers.ply_files import moved_columns, write
