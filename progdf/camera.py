@@ -98,25 +98,18 @@ NEAR = 0.01
 class Camera:
     """A pinhole camera.
 
-    Args:
-        viewmat: world → camera. [4,4] float32, column vectors
-        K: intrinsics in pixels, [[fx,0,cx],[0,fy,cy],[0,0,1]]. [3,3] float32
-        width: image width in pixels, ≥ 1
-        height: image height in pixels, ≥ 1
-        name: where it came from, for messages and file names
-        lens: what bends photographs that this camera took; a render is straight, so nothing that draws asks
-        near: depth at and below which a training draws nothing, world units, see `bounds.near_plane`
-
     Raises:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite.
     """
 
-    viewmat: Tensor
-    K: Tensor
-    width: int
-    height: int
-    name: str = ""
+    viewmat: Tensor  # world → camera. [4,4] float32, column vectors
+    K: Tensor  # intrinsics in pixels, [[fx,0,cx],[0,fy,cy],[0,0,1]]. [3,3] float32
+    width: int  # image width in pixels, ≥ 1
+    height: int  # image height in pixels, ≥ 1
+    name: str = ""  # where it came from, for messages and file names
+    # what bends photographs that this camera took; a render is straight, so nothing that draws asks
     lens: Lens | None = None
+    # depth at and below which a training draws nothing, world units, see `bounds.near_plane`
     near: float = NEAR
 
     def __post_init__(self) -> None:

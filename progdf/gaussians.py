@@ -27,28 +27,20 @@ ZERO: Origin = (0.0, 0.0, 0.0)
 class Gaussians:
     """N Gaussians as raw tensors; activate with `scales`, `opacities`, `unit_quats`.
 
-    Args:
-        means: centers relative to `origin`, world units. [N,3]
-        quats: rotations wxyz, any nonzero length. [N,4]
-        log_scales: log of the standard deviations in world units. [N,3]
-        logit_opacities: opacities before the sigmoid. [N]
-        sh0: color, band 0 of the spherical harmonics. [N,3]
-        shN: color, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
-        antialiased: trained with Mip-Splatting's 2D filter and to be drawn with it, see `rasterize`
-        origin: where in the world the means begin, see `progdf.formats.repair.find_origin`. Everything inside
-            the program, cameras too, is relative to it; files, options and messages are in the world
-
     Raises:
         ValueError: a shape does not fit the others.
     """
 
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    logit_opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
+    means: Tensor  # centers relative to `origin`, world units. [N,3]
+    quats: Tensor  # rotations wxyz, any nonzero length. [N,4]
+    log_scales: Tensor  # log of the standard deviations in world units. [N,3]
+    logit_opacities: Tensor  # opacities before the sigmoid. [N]
+    sh0: Tensor  # color, band 0 of the spherical harmonics. [N,3]
+    shN: Tensor  # color, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
+    # trained with Mip-Splatting's 2D filter and to be drawn with it, see `rasterize`
     antialiased: bool = False
+    # where in the world the means begin, see `progdf.formats.repair.find_origin`. Everything inside the
+    # program, cameras too, is relative to it; files, options and messages are in the world
     origin: Origin = ZERO
 
     def __post_init__(self) -> None:

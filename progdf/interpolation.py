@@ -10,15 +10,10 @@ from torch import Tensor
 
 
 class Segment(NamedTuple):
-    """A place between two knots.
+    """A place between two knots."""
 
-    Args:
-        right: index of the right one, 1..S−1; the left one is that before it
-        share: of the way from the left one, 1 exactly at the right one; beyond 0..1 outside all knots
-    """
-
-    right: int
-    share: float
+    right: int  # index of the right one, 1..S−1; the left one is that before it
+    share: float  # of the way from the left one, 1 exactly at the right one; beyond 0..1 outside all knots
 
 
 def find_segment(knots: Tensor, x: float) -> Segment:

@@ -16,16 +16,11 @@ from .gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Region:
-    """A named set of Gaussians with a soft score.
+    """A named set of Gaussians with a soft score."""
 
-    Args:
-        name: what the person calls it
-        members: sorted, unique row indices into the scene. [M] int64
-        score: membership of every Gaussian of the scene, 0..1; the viewer moves its threshold. [N] float32
-    """
-
-    name: str
-    members: Tensor
+    name: str  # what the person calls it
+    members: Tensor  # sorted, unique row indices into the scene. [M] int64
+    # membership of every Gaussian of the scene, 0..1; the viewer moves its threshold. [N] float32
     score: Tensor
 
     def __post_init__(self) -> None:

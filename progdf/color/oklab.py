@@ -75,21 +75,15 @@ ColorPath = Literal["bowed", "hue", "straight", "srgb"]
 
 @dataclass(frozen=True)
 class Bend:
-    """How the way between two colors bends from the straight line in OKLab towards the hue circle.
+    """How the way between two colors bends from the straight line in OKLab towards the hue circle."""
 
-    Args:
-        bow: share of the way along the hue circle in the mixture, 0 (straight) to 1
-        direction: 1 or −1: the sense in which nearly opposite hues turn, the same all over a region
-        whole, none: hues that lie so near to opposite (angle missing, radians) that they turn in this sense
-            altogether, and those from which on each takes its own shorter way; in between the two ways mix
-        fade: straight in sRGB instead, as pictures are cross-faded
-    """
-
-    bow: float
-    direction: float
+    bow: float  # share of the way along the hue circle in the mixture, 0 (straight) to 1
+    direction: float  # 1 or −1: the sense in which nearly opposite hues turn, the same all over a region
+    # whole, none: hues that lie so near to opposite (angle missing, radians) that they turn in this sense
+    # altogether, and those from which on each takes its own shorter way; in between the two ways mix
     whole: float
     none: float
-    fade: bool = False
+    fade: bool = False  # straight in sRGB instead, as pictures are cross-faded
 
 
 STRAIGHT = Bend(0.0, 1.0, 0.0, 1.0)

@@ -42,20 +42,13 @@ class Gains:
 
 @dataclass(frozen=True)
 class Layer:
-    """One edit in the stack.
+    """One edit in the stack."""
 
-    Args:
-        gdf: the edit
-        strength: slider value s, 0..1; above 1 is extrapolation
-        enabled: a disabled layer does nothing at all
-        gains: per-attribute gains
-        weights: soft membership times painted weight per member, 0..1; None is 1 everywhere. [M] float32
-    """
-
-    gdf: Gdf
-    strength: float = 1.0
-    enabled: bool = True
-    gains: Gains = Gains()
+    gdf: Gdf  # the edit
+    strength: float = 1.0  # slider value s, 0..1; above 1 is extrapolation
+    enabled: bool = True  # a disabled layer does nothing at all
+    gains: Gains = Gains()  # per-attribute gains
+    # soft membership times painted weight per member, 0..1; None is 1 everywhere. [M] float32
     weights: Tensor | None = None
 
     @property

@@ -166,20 +166,13 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
 
 @dataclass(frozen=True)
 class _Part:
-    """A layer's members of weight ≠ 0, m in number.
+    """A layer's members of weight ≠ 0, m in number."""
 
-    Args:
-        layer: the layer
-        members: which of its members these are, all of them as a slice. [m] int64
-        rows: where they are among the rows that change, all of them as a slice. [m] int64
-        weights: theirs. [m] float32
-        coverage: how far it hides the layers below, by kind of attribute; empty but for "over". [M] float32
-    """
-
-    layer: Layer
-    members: Tensor | slice
-    rows: Tensor | slice
-    weights: Tensor
+    layer: Layer  # the layer
+    members: Tensor | slice  # which of its members these are, all of them as a slice. [m] int64
+    rows: Tensor | slice  # where they are among the rows that change, all of them as a slice. [m] int64
+    weights: Tensor  # theirs. [m] float32
+    # how far it hides the layers below, by kind of attribute; empty but for "over". [M] float32
     coverage: Mapping[str, Tensor]
 
     def moves(self, attribute: str) -> bool:

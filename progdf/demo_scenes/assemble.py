@@ -69,25 +69,17 @@ def _value_noise(places: Tensor, table: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Pelt:
-    """How the Gaussians of a surface lie: most of them flat on it, some standing out as hairs or blades.
+    """How the Gaussians of a surface lie: most of them flat on it, some standing out as hairs or blades."""
 
-    Args:
-        standing: share of those that stand out, 0..1
-        flat: standard deviations along the flow, across it and through the surface, in sample spacings
-        hair: the same of those that stand out
-        length: what is added to a hair's first, world units: fur keeps some length however fine the sampling
-        rise: how steeply a hair leaves the surface; 0 lies, 1 is 45 degrees
-        lift: how far a hair's middle is above the surface, in its first standard deviation
-        unruly: how much directions differ from neighbor to neighbor
-    """
-
-    standing: float = 0.0
+    standing: float = 0.0  # share of those that stand out, 0..1
+    # standard deviations along the flow, across it and through the surface, in sample spacings
     flat: tuple[float, float, float] = (0.64, 0.64, 0.14)
-    hair: tuple[float, float, float] = (0.70, 0.24, 0.16)
+    hair: tuple[float, float, float] = (0.70, 0.24, 0.16)  # the same of those that stand out
+    # what is added to a hair's first, world units: fur keeps some length however fine the sampling
     length: float = 0.0
-    rise: float = 0.45
-    lift: float = 0.35
-    unruly: float = 0.35
+    rise: float = 0.45  # how steeply a hair leaves the surface; 0 lies, 1 is 45 degrees
+    lift: float = 0.35  # how far a hair's middle is above the surface, in its first standard deviation
+    unruly: float = 0.35  # how much directions differ from neighbor to neighbor
 
 
 BARE = Pelt()
@@ -95,25 +87,16 @@ BARE = Pelt()
 
 @dataclass(frozen=True)
 class Paint:
-    """What a surface looks like before light falls on it.
+    """What a surface looks like before light falls on it."""
 
-    Args:
-        color: sRGB 0..1. [N,3]
-        relief: how far the normals lean, for light only. [N,3]
-        velvet: brightening where the surface turns away from the eye, sRGB units
-        gloss: mirror highlight, sRGB units
-        flow: where hairs and flat Gaussians point; only its part along the surface counts. [N,3]
-        pelt: how the Gaussians lie
-        glows: whether `color` is what is seen, whatever light there is
-    """
-
-    color: Tensor
-    relief: Tensor
-    velvet: float = 0.0
-    gloss: float = 0.0
+    color: Tensor  # sRGB 0..1. [N,3]
+    relief: Tensor  # how far the normals lean, for light only. [N,3]
+    velvet: float = 0.0  # brightening where the surface turns away from the eye, sRGB units
+    gloss: float = 0.0  # mirror highlight, sRGB units
+    # where hairs and flat Gaussians point; only its part along the surface counts. [N,3]
     flow: Tensor | None = None
-    pelt: Pelt = BARE
-    glows: bool = False
+    pelt: Pelt = BARE  # how the Gaussians lie
+    glows: bool = False  # whether `color` is what is seen, whatever light there is
 
 
 Painter = Callable[[Part, Samples, Tensor], Paint]
@@ -159,23 +142,14 @@ _MOST_DRAWN = 10_000  # per Gaussian kept; a part of which less shows is misplac
 
 @dataclass(frozen=True)
 class DemoScene:
-    """A scene of which everything is known.
+    """A scene of which everything is known."""
 
-    Args:
-        gaussians: the scene
-        labels: which part each Gaussian belongs to, an index into `label_names`. [N] uint8
-        label_names: what the labels mean
-        cameras: around the scene, framing it, even in azimuth
-        up: world direction that is up. [3]
-        background: what stands behind it in pictures, sRGB
-    """
-
-    gaussians: Gaussians
-    labels: Tensor
-    label_names: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    up: Tensor
-    background: tuple[float, float, float]
+    gaussians: Gaussians  # the scene
+    labels: Tensor  # which part each Gaussian belongs to, an index into `label_names`. [N] uint8
+    label_names: tuple[str, ...]  # what the labels mean
+    cameras: tuple[Camera, ...]  # around the scene, framing it, even in azimuth
+    up: Tensor  # world direction that is up. [3]
+    background: tuple[float, float, float]  # what stands behind it in pictures, sRGB
 
     def members(self, *names: str) -> Tensor:
         """Sorted indices of the Gaussians of the named parts. [M] int64"""

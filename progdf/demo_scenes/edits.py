@@ -26,15 +26,10 @@ Change = Callable[[Gaussians, float], Gaussians]
 
 @dataclass(frozen=True)
 class AnalyticEdit:
-    """An edit given by a formula.
+    """An edit given by a formula."""
 
-    Args:
-        name: what it does
-        change: the formula
-    """
-
-    name: str
-    change: Change
+    name: str  # what it does
+    change: Change  # the formula
 
     def apply(self, scene: Gaussians, members: Tensor, strength: float) -> Gaussians:
         """The scene with `members` ([M] int64) edited to `strength` (0..1); other rows keep their bytes.

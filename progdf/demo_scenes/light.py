@@ -16,15 +16,11 @@ _SH_C1 = math.sqrt(3 / (4 * math.pi))
 
 @dataclass(frozen=True)
 class Daylight:
-    """How much light there is.
+    """How much light there is."""
 
-    Args:
-        sun: [N,3] points -> [N], the share of the key light that comes in, 0..1; None is all of it
-        fill: strength of the light from all around
-    """
-
+    # [N,3] points -> [N], the share of the key light that comes in, 0..1; None is all of it
     sun: Callable[[Tensor], Tensor] | None = None
-    fill: float = 1.0
+    fill: float = 1.0  # strength of the light from all around
 
 
 OUTDOORS = Daylight()

@@ -16,20 +16,15 @@ _TURNS = 64
 
 @dataclass(frozen=True)
 class Shape:
-    """A surface of revolution about the local y axis.
+    """A surface of revolution about the local y axis."""
 
-    Args:
-        profile: radius and height along the curve that turns, the outside on the left hand; None is the flat
-            square x, z in −1..1 that faces up. [P,2]
-        level: [N,3] local points -> [N]: below 1 inside, 1 on the surface, above 1 outside
-        nearest: [N,3] local points -> [N,3] a point of the surface close to each
-        girth: how thick the body is, as a share of its radius
-    """
-
+    # radius and height along the curve that turns, the outside on the left hand; None is the flat square x, z
+    # in −1..1 that faces up. [P,2]
     profile: Tensor | None
+    # [N,3] local points -> [N]: below 1 inside, 1 on the surface, above 1 outside
     level: Callable[[Tensor], Tensor]
-    nearest: Callable[[Tensor], Tensor]
-    girth: float = 1.0
+    nearest: Callable[[Tensor], Tensor]  # [N,3] local points -> [N,3] a point of the surface close to each
+    girth: float = 1.0  # how thick the body is, as a share of its radius
 
 
 def ball(exponent: float = 2.0) -> Shape:
@@ -127,29 +122,19 @@ def panel() -> Shape:
 
 @dataclass(frozen=True)
 class Part:
-    """A shape placed in the world.
+    """A shape placed in the world."""
 
-    Args:
-        name: which part it is; paint goes by it
-        label: name of the label its Gaussians carry
-        shape: the surface
-        center: where the shape's origin lies, world units. [3]
-        matrix: local -> world directions, stretch and rotation in one. [3,3]
-        weight: Gaussians per area against other parts
-        density: relative Gaussians per area along the profile, by local radius; None is even
-        clears: no other part's Gaussians within this share of its size: nothing grows over an eye
-        casts_shadow: whether the key light stops at it; a part that does is shadowed as an ellipsoid
-    """
-
-    name: str
-    label: str
-    shape: Shape
-    center: Tensor
-    matrix: Tensor
-    weight: float = 1.0
+    name: str  # which part it is; paint goes by it
+    label: str  # name of the label its Gaussians carry
+    shape: Shape  # the surface
+    center: Tensor  # where the shape's origin lies, world units. [3]
+    matrix: Tensor  # local -> world directions, stretch and rotation in one. [3,3]
+    weight: float = 1.0  # Gaussians per area against other parts
+    # relative Gaussians per area along the profile, by local radius; None is even
     density: Callable[[Tensor], Tensor] | None = None
+    # whether the key light stops at it; a part that does is shadowed as an ellipsoid
     casts_shadow: bool = True
-    clears: float = 0.0
+    clears: float = 0.0  # no other part's Gaussians within this share of its size: nothing grows over an eye
 
     def to_local(self, points: Tensor) -> Tensor:
         """World points in the shape's coordinates. [N,3] -> [N,3]"""
@@ -180,19 +165,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on one part's surface.
+    """Points on one part's surface."""
 
-    Args:
-        points: world positions. [N,3]
-        local: the same in the shape's coordinates. [N,3]
-        normals: unit, outwards. [N,3]
-        spacing: distance to the neighbors, world units. [N]
-    """
-
-    points: Tensor
-    local: Tensor
-    normals: Tensor
-    spacing: Tensor
+    points: Tensor  # world positions. [N,3]
+    local: Tensor  # the same in the shape's coordinates. [N,3]
+    normals: Tensor  # unit, outwards. [N,3]
+    spacing: Tensor  # distance to the neighbors, world units. [N]
 
     def __getitem__(self, index: Tensor) -> Samples:
         return Samples(self.points[index], self.local[index], self.normals[index], self.spacing[index])

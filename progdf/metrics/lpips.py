@@ -33,40 +33,27 @@ Features = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Convolution:
-    """One convolution, with a ReLU behind it.
+    """One convolution, with a ReLU behind it."""
 
-    Args:
-        side: of its kernel, pixels
-        inputs, outputs: channels
-        stride, padding: pixels
-        pool: side of the max pooling before it, which halves the picture; 0: none
-        compared: LPIPS looks at what it sees
-    """
-
-    side: int
+    side: int  # of its kernel, pixels
+    # inputs, outputs: channels
     inputs: int
     outputs: int
+    # stride, padding: pixels
     stride: int = 1
     padding: int = 1
-    pool: int = 0
-    compared: bool = True
+    pool: int = 0  # side of the max pooling before it, which halves the picture; 0: none
+    compared: bool = True  # LPIPS looks at what it sees
 
 
 @dataclass(frozen=True)
 class Backbone:
-    """A network that LPIPS can look through.
+    """A network that LPIPS can look through."""
 
-    Args:
-        weights: its file in the package
-        group: its name in that file
-        convolutions: in order
-        least_size: smallest side of an image, pixels: below it the last pooling has nothing left
-    """
-
-    weights: str
-    group: str
-    convolutions: Sequence[Convolution]
-    least_size: int
+    weights: str  # its file in the package
+    group: str  # its name in that file
+    convolutions: Sequence[Convolution]  # in order
+    least_size: int  # smallest side of an image, pixels: below it the last pooling has nothing left
 
 
 def _vgg16() -> tuple[Convolution, ...]:
@@ -101,19 +88,12 @@ BACKBONES: Mapping[Net, Backbone] = {
 
 @dataclass(frozen=True)
 class Lpips:
-    """The network; make it with `Lpips.load()`.
+    """The network; make it with `Lpips.load()`."""
 
-    Args:
-        backbone: its shape
-        kernels: of the convolutions. [out,in,k,k] each
-        biases: [out] each
-        importance: of each channel of the five layers that are compared, ≥ 0. [out] each
-    """
-
-    backbone: Backbone
-    kernels: Sequence[Tensor]
-    biases: Sequence[Tensor]
-    importance: Sequence[Tensor]
+    backbone: Backbone  # its shape
+    kernels: Sequence[Tensor]  # of the convolutions. [out,in,k,k] each
+    biases: Sequence[Tensor]  # [out] each
+    importance: Sequence[Tensor]  # of each channel of the five layers that are compared, ≥ 0. [out] each
 
     @classmethod
     def load(cls, net: Net = "alex", device: torch.device | str = "cpu") -> Lpips:

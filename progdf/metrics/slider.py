@@ -14,25 +14,16 @@ Pictures = Callable[[float], Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class SliderStatistics:
-    """The figures of `report.json`'s `slider`.
+    """The figures of `report.json`'s `slider`."""
 
-    Args:
-        monotone: the distance from the original never falls by more than 1 % of the whole change
-        uniformity: smallest over largest visible change of equal steps, 0..1; 0 where nothing changes
-        largest_jump: largest visible change of a step of at most 1/1000, as a share of the whole change
-        t50, t90: slider value at which half and nine tenths of the distance to the end are first reached,
-            0..1
-        distances: distance from the original at equal steps, the first 0
-        steps: visible change of each equal step
-    """
-
-    monotone: bool
-    uniformity: float
-    largest_jump: float
+    monotone: bool  # the distance from the original never falls by more than 1 % of the whole change
+    uniformity: float  # smallest over largest visible change of equal steps, 0..1; 0 where nothing changes
+    largest_jump: float  # largest visible change of a step of at most 1/1000, as a share of the whole change
+    # t50, t90: slider value at which half and nine tenths of the distance to the end are first reached, 0..1
     t50: float
     t90: float
-    distances: tuple[float, ...]
-    steps: tuple[float, ...]
+    distances: tuple[float, ...]  # distance from the original at equal steps, the first 0
+    steps: tuple[float, ...]  # visible change of each equal step
 
 
 def slider_statistics(

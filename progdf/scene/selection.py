@@ -37,15 +37,11 @@ _MOST_CELLS = 1024  # a side, of the grid into which a polygon is filled
 
 
 class Centers(NamedTuple):
-    """Where the centers of Gaussians are in a picture.
+    """Where the centers of Gaussians are in a picture."""
 
-    Args:
-        points: pixels from the upper left corner; NaN where a center is not in front of the camera. [N,2]
-        depths: camera z, world units. [N]
-    """
-
+    # pixels from the upper left corner; NaN where a center is not in front of the camera. [N,2]
     points: Floats
-    depths: Floats
+    depths: Floats  # camera z, world units. [N]
 
 
 def combine(mask: Mask, found: Mask, mode: str) -> Mask:

@@ -16,30 +16,19 @@ from .up_axis import UpAxis, find_up
 
 @dataclass(frozen=True)
 class Survey:
-    """A scene in numbers.
+    """A scene in numbers."""
 
-    Args:
-        count: Gaussians N
-        center: median of the means, in the world
-        radius: distance from the center within which 97 % of the means lie, world units
-        farthest: distance of the farthest mean from the center, world units
-        box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis, in the world
-        up: which way is up, and how that was decided
-        surrounding: it looks like a scene to stand inside, which cameras around it cannot frame
-        median_size: median of the longest axes, one standard deviation, world units
-        largest_size: the longest axis of all
-    """
-
-    count: int
-    center: tuple[float, float, float]
-    radius: float
-    farthest: float
+    count: int  # Gaussians N
+    center: tuple[float, float, float]  # median of the means, in the world
+    radius: float  # distance from the center within which 97 % of the means lie, world units
+    farthest: float  # distance of the farthest mean from the center, world units
+    # box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis, in the world
     box: tuple[float, ...]
     bulk_box: tuple[float, ...]
-    up: UpAxis
-    surrounding: bool
-    median_size: float
-    largest_size: float
+    up: UpAxis  # which way is up, and how that was decided
+    surrounding: bool  # it looks like a scene to stand inside, which cameras around it cannot frame
+    median_size: float  # median of the longest axes, one standard deviation, world units
+    largest_size: float  # the longest axis of all
 
     def lines(self) -> list[str]:
         """The survey for a person, a line per fact."""
