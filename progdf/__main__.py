@@ -98,7 +98,7 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(f"progdf {__version__}")
         return 0
-    places = {name: place for name, (place, _) in COMMANDS.items()} | HIDDEN
+    places = {name: path for name, (path, _) in COMMANDS.items()} | HIDDEN
     if arguments[0] not in places:
         raise ProgdfError(f"unknown command '{arguments[0]}'; use one of {', '.join(COMMANDS)}")
     module, function = places[arguments[0]].split(":")

@@ -82,12 +82,12 @@ def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor
     rays = (torch.stack([columns, rows], dim=-1) - middle) / focal
     pixels = lens.distort(rays) * focal + middle
     size = torch.tensor([width, height], dtype=torch.float64)
-    shown = ((pixels >= 0) & (pixels <= size)).all(dim=-1) & (rays.norm(dim=-1) < lens.valid_radius())
+    visible = ((pixels >= 0) & (pixels <= size)).all(dim=-1) & (rays.norm(dim=-1) < lens.valid_radius())
     grid = (2 * pixels / size - 1).float()
     straight = grid_sample(
         photograph.permute(2, 0, 1)[None], grid[None], padding_mode="border", align_corners=False
     )[0].permute(1, 2, 0)
-    return torch.where(shown[..., None], straight, 0.0), shown
+    return torch.where(visible[..., None], straight, 0.0), visible
 
 
 NEAR = 0.01
@@ -114,9 +114,9 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, side in (("viewmat", 4), ("K", 3)):
-            found = list(getattr(self, name).shape)
-            if found != [side, side]:
-                raise ValueError(f"{name} has shape {found}, expected [{side}, {side}]")
+            shape = list(getattr(self, name).shape)
+            if shape != [side, side]:
+                raise ValueError(f"{name} has shape {shape}, expected [{side}, {side}]")
             if not bool(getattr(self, name).isfinite().all()):
                 raise ValueError(f"{name} has a number that is not finite")
         if self.width < 1 or self.height < 1:

@@ -53,13 +53,15 @@ class Gaussians:
             "sh0": (n, 3),
         }
         for name, shape in expected.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"{name} has shape {list(found)}, expected {list(shape)} (N={n} from means)")
-        found = tuple(self.shN.shape)
-        if len(found) != 3 or found[0] != n or found[2] != 3 or found[1] not in _SH_BANDS:
+            actual = tuple(getattr(self, name).shape)
+            if actual != shape:
+                raise ValueError(
+                    f"{name} has shape {list(actual)}, expected {list(shape)} (N={n} from means)"
+                )
+        actual = tuple(self.shN.shape)
+        if len(actual) != 3 or actual[0] != n or actual[2] != 3 or actual[1] not in _SH_BANDS:
             raise ValueError(
-                f"shN has shape {list(found)}, expected [{n}, K, 3] with K one of {list(_SH_BANDS)}"
+                f"shN has shape {list(actual)}, expected [{n}, K, 3] with K one of {list(_SH_BANDS)}"
             )
 
     def __len__(self) -> int:

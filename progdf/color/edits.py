@@ -68,9 +68,9 @@ def recolor(
         reference: the region's own color, `typical_color` of `rgb` by default. [3]
         path: see `bend_of`
     """
-    own = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
+    typical = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
     return interpolate_colors(
-        rgb, recolor_fully(rgb, target, own), strength, bend_of(own, _as_tensor(target, rgb), path)
+        rgb, recolor_fully(rgb, target, typical), strength, bend_of(typical, _as_tensor(target, rgb), path)
     )
 
 
@@ -102,9 +102,9 @@ def tint(
 
     See `recolor` for the arguments; here `reference` decides nothing but the bend.
     """
-    own = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
+    typical = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
     return interpolate_colors(
-        rgb, tint_fully(rgb, target, share), strength, bend_of(own, _as_tensor(target, rgb), path)
+        rgb, tint_fully(rgb, target, share), strength, bend_of(typical, _as_tensor(target, rgb), path)
     )
 
 

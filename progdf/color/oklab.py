@@ -146,14 +146,14 @@ def _bowed(a: Tensor, b: Tensor, s: Tensor, bend: Bend) -> Tensor:
     """From OKLab to OKLab; sRGB. [...,3], [...,3], [...] -> [...,3]"""
     chroma_a, chroma_b = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1)
     turn = bend.direction * _wrap(hue_of(b) - hue_of(a))  # -pi..pi, the region's sense being positive
-    own = _rise(turn + math.pi, bend.whole, bend.none)
+    alone = _rise(turn + math.pi, bend.whole, bend.none)
     chroma = torch.lerp(chroma_a, chroma_b, s)
 
     def rotate(angle: Tensor) -> Tensor:
         hue = hue_of(a) + bend.direction * s * angle
         return torch.stack([chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1)
 
-    around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), own[..., None])
+    around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), alone[..., None])
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
     lab = torch.lerp(a, b, s[..., None])
     lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])

@@ -71,8 +71,8 @@ class _Bases(NamedTuple):
         right, share = at
         row = self.coefficients[right]
         if share != 1.0:
-            left = self.coefficients[right - 1]
-            row = left + np.float32(share) * (row - left)
+            low = self.coefficients[right - 1]
+            row = low + np.float32(share) * (row - low)
         used = np.flatnonzero(row[1:])
         if not len(used) and row[0] == 0.0:
             return used, np.zeros((0, self.end.shape[1]), np.float32)
@@ -188,9 +188,17 @@ class Composer:
                 used, factors = bases.factors(part.segment)
                 covered = self._covered(part.edit, KINDS[name]) if blend == "over" else _NOTHING
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
-                own = part.at, part.members, part.weights
+                selection = part.at, part.members, part.weights
                 _add_offsets(
-                    total, own, bases.end, bases.residual, used, factors, np.float32(gain), hidden, covered
+                    total,
+                    selection,
+                    bases.end,
+                    bases.residual,
+                    used,
+                    factors,
+                    np.float32(gain),
+                    hidden,
+                    covered,
                 )
             moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)

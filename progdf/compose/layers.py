@@ -94,9 +94,9 @@ def check_weights(layer: Layer) -> None:
     """The part of `check_layers` that looks at one layer's weights."""
     if layer.weights is None:
         return
-    found, members = list(layer.weights.shape), len(layer.gdf.region)
-    if found != [members]:
-        raise ValueError(f"weights of {layer.gdf.name} has shape {found}, expected [{members}]")
+    shape, members = list(layer.weights.shape), len(layer.gdf.region)
+    if shape != [members]:
+        raise ValueError(f"weights of {layer.gdf.name} has shape {shape}, expected [{members}]")
     if members and not (float(layer.weights.min()) >= 0.0 and float(layer.weights.max()) <= 1.0):
         raise ValueError(f"weights of {layer.gdf.name} has a number outside 0..1")
 
@@ -115,13 +115,13 @@ class Effects:
 
 def effects_of(stack: Sequence[tuple[int, Layer]], blend: str) -> Effects:
     """The effects of active layers, lowest first, each with the index of its edit."""
-    found: dict[int, Effect] = {}
-    for place, (edit, layer) in enumerate(stack):
+    effects: dict[int, Effect] = {}
+    for index, (edit, layer) in enumerate(stack):
         version = -1 if layer.weights is None else layer.weights._version
-        order = place if blend == "over" else 0
+        order = index if blend == "over" else 0
         entry = (layer.strength, layer.gains, layer.weights, version, order)
-        found[edit] = (*found.get(edit, ()), entry)
-    return Effects(blend, found)
+        effects[edit] = (*effects.get(edit, ()), entry)
+    return Effects(blend, effects)
 
 
 def changed_edits(before: Effects, now: Effects) -> frozenset[int]:

@@ -189,16 +189,16 @@ def _parts(scene: Gaussians, layers: Sequence[Layer], blend: str) -> tuple[Tenso
         chosen.append((_ALL, weights) if len(selected) == len(weights) else (selected, weights[selected]))
     reached = [layer.gdf.region.members[members] for layer, (members, _) in zip(layers, chosen, strict=True)]
     rows = reached[0] if len(reached) == 1 else torch.unique(torch.cat(reached))
-    place = torch.empty(len(scene) if len(reached) > 1 else 0, dtype=torch.int64)
+    position = torch.empty(len(scene) if len(reached) > 1 else 0, dtype=torch.int64)
     if len(reached) > 1:
-        place[rows] = torch.arange(len(rows))
+        position[rows] = torch.arange(len(rows))
     return rows, [
         _Part(
             layer,
             members,
-            _ALL if len(own) == len(rows) else place[own],
+            _ALL if len(layer_rows) == len(rows) else position[layer_rows],
             weights,
             coverage(scene, layer.gdf) if blend == "over" else {},
         )
-        for layer, own, (members, weights) in zip(layers, reached, chosen, strict=True)
+        for layer, layer_rows, (members, weights) in zip(layers, reached, chosen, strict=True)
     ]

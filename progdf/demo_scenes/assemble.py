@@ -184,31 +184,31 @@ def assemble(
 
 def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     """How many Gaussians each part gets, adding up to `size`, and the share of its surface that shows."""
-    wishes, shown = [], []
+    wishes, shares = [], []
     for part in parts:
         probes = sample(part, _PROBES)
         share = float(_is_shown(parts, part, probes).float().mean())
         # five digits: what equal parts get must not hang on the last bits, which depend on the processor
         wishes.append(float(f"{float((probes.spacing**2).sum()) * share * part.weight:.5g}"))
-        shown.append(max(share, 1 / _PROBES))
+        shares.append(max(share, 1 / _PROBES))
     quotas = [max(1.0, size * wish / sum(wishes)) for wish in wishes]
     quotas = [quota * size / sum(quotas) for quota in quotas]
     counts = [math.floor(quota) for quota in quotas]
-    rest = sorted(range(len(parts)), key=lambda i: (counts[i] - quotas[i], -i))
-    for i in rest[: size - sum(counts)]:
+    by_surplus = sorted(range(len(parts)), key=lambda i: (counts[i] - quotas[i], -i))
+    for i in by_surplus[: size - sum(counts)]:
         counts[i] += 1
-    return counts, shown
+    return counts, shares
 
 
-def _is_shown(parts: Sequence[Part], own: Part, at: Samples) -> Tensor:
+def _is_shown(parts: Sequence[Part], outer: Part, at: Samples) -> Tensor:
     """Which samples lie on the outside of all other parts, or just below their skin. [N] bool"""
-    shown = torch.ones(len(at), dtype=torch.bool)
+    visible = torch.ones(len(at), dtype=torch.bool)
     for part in parts:
-        if part is not own and part.touches(own):
-            shown &= part.depth(at.points) <= 0.6 * at.spacing.clamp_max(0.03)
-            if part.clears > own.clears:
-                shown &= part.shape.level(part.to_local(at.points)) > 1 + part.clears
-    return shown
+        if part is not outer and part.touches(outer):
+            visible &= part.depth(at.points) <= 0.6 * at.spacing.clamp_max(0.03)
+            if part.clears > outer.clears:
+                visible &= part.shape.level(part.to_local(at.points)) > 1 + part.clears
+    return visible
 
 
 def _sample_visible(
@@ -218,14 +218,14 @@ def _sample_visible(
     drawn = math.ceil(count / share)
     while True:
         at = sample(part, drawn)
-        kept = _is_shown(parts, part, at).nonzero()[:, 0]
-        if len(kept) >= count:
+        rows = _is_shown(parts, part, at).nonzero()[:, 0]
+        if len(rows) >= count:
             break
         if drawn > _MOST_DRAWN * count:
             raise ValueError(f"{part.name} at {part.center.tolist()} lies inside other parts; move it")
-        drawn = max(drawn + 1, math.ceil(1.01 * drawn * count / max(len(kept), 1)))
-    chosen = torch.randperm(len(kept), generator=random)[:count].sort().values
-    return at[kept[chosen]]
+        drawn = max(drawn + 1, math.ceil(1.01 * drawn * count / max(len(rows), 1)))
+    chosen = torch.randperm(len(rows), generator=random)[:count].sort().values
+    return at[rows[chosen]]
 
 
 def _make_gaussians(

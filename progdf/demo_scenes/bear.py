@@ -286,8 +286,8 @@ def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...
     painted = _wash(painted, cover(("ears", "arms", "legs")), _CHARCOAL)
     painted = _wash(painted, patches, _CHARCOAL)
     dark = 1 - step(picture.mean(dim=2), _DARK - 0.12, _DARK)
-    kept = torch.maximum(eyes, features * dark) * head
-    return torch.lerp(painted, picture, kept[..., None])
+    mask = torch.maximum(eyes, features * dark) * head
+    return torch.lerp(painted, picture, mask[..., None])
 
 
 def _wash(picture: Tensor, share: Tensor, color: str) -> Tensor:

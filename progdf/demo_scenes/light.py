@@ -46,10 +46,10 @@ GROUND = torch.tensor([0.20, 0.24, 0.12])
 
 
 def irradiance(
-    points: Tensor, normals: Tensor, parts: Sequence[Part], own: Part, daylight: Daylight = OUTDOORS
+    points: Tensor, normals: Tensor, parts: Sequence[Part], receiver: Part, daylight: Daylight = OUTDOORS
 ) -> Tensor:
-    """Linear light that falls on each point of the part `own`. [N,3], [N,3] -> [N,3]"""
-    others = [part for part in parts if part is not own]
+    """Linear light that falls on each point of the part `receiver`. [N,3], [N,3] -> [N,3]"""
+    others = [part for part in parts if part is not receiver]
     open_sky = torch.ones(len(points))
     lit = torch.ones(len(points)) if daylight.sun is None else daylight.sun(points)
     for part in others:
@@ -131,5 +131,5 @@ def _key_light_share(local: Tensor, part: Part) -> Tensor:
     share = ((closest - 1 + blur) / (2 * blur)).clamp(0, 1)
     passed = share * share * (3 - 2 * share)
     begins = (world_ahead / 0.03).clamp(0, 1)
-    left: Tensor = 1 - (1 - passed) * begins
-    return left
+    light: Tensor = 1 - (1 - passed) * begins
+    return light

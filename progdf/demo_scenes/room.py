@@ -321,9 +321,9 @@ def _rig(count: int = 32, width: int = 512, height: int = 384) -> tuple[Camera, 
     cameras = []
     for i in range(count):
         turn = 2 * math.pi * i / count
-        stand = 1.6 / max(abs(math.sin(turn)), abs(math.cos(turn))) ** 0.3
+        distance = 1.6 / max(abs(math.sin(turn)), abs(math.cos(turn))) ** 0.3
         eye = torch.tensor(
-            [stand * math.sin(turn), 1.1 + 0.5 * ((0.3 + 0.618034 * i) % 1.0), stand * math.cos(turn)]
+            [distance * math.sin(turn), 1.1 + 0.5 * ((0.3 + 0.618034 * i) % 1.0), distance * math.cos(turn)]
         )
         aside = 0.3 * math.sin(3 * turn)
         target = torch.tensor([aside * math.cos(turn), 0.75, -aside * math.sin(turn)])

@@ -59,13 +59,13 @@ class Backbone:
 def _vgg16() -> tuple[Convolution, ...]:
     """Thirteen convolutions in five blocks; the last of each block is compared."""
     blocks, inputs = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)), 3
-    found = []
+    features = []
     for block, (outputs, count) in enumerate(blocks):
         for i in range(count):
             pool = 2 if block and i == 0 else 0
-            found.append(Convolution(3, inputs, outputs, pool=pool, compared=i == count - 1))
+            features.append(Convolution(3, inputs, outputs, pool=pool, compared=i == count - 1))
             inputs = outputs
-    return tuple(found)
+    return tuple(features)
 
 
 BACKBONES: Mapping[Net, Backbone] = {

@@ -43,12 +43,12 @@ def slider_statistics(
         distances.append(visible_change(original, now, masks))
         steps.append(visible_change(before, now, masks))
         before = now
-    whole = max(distances)
+    largest = max(distances)
     falls = [a - b for a, b in pairwise(distances)]
     return SliderStatistics(
-        monotone=max(falls) <= 0.01 * whole,
+        monotone=max(falls) <= 0.01 * largest,
         uniformity=min(steps) / max(steps) if max(steps) > 0 else 0.0,
-        largest_jump=_largest_jump(pictures, steps, masks) / whole if whole > 0 else 0.0,
+        largest_jump=_largest_jump(pictures, steps, masks) / largest if largest > 0 else 0.0,
         t50=_place_of_share(distances, 0.5),
         t90=_place_of_share(distances, 0.9),
         distances=tuple(distances),
@@ -76,11 +76,11 @@ def _largest_jump(pictures: Pictures, steps: Sequence[float], masks: Sequence[Te
     while high - low > 1e-3:
         middle = (low + high) / 2
         at_middle = pictures(middle)
-        left, right = visible_change(at_low, at_middle, masks), visible_change(at_middle, at_high, masks)
-        if left >= right:
-            high, at_high, change = middle, at_middle, left
+        before, after = visible_change(at_low, at_middle, masks), visible_change(at_middle, at_high, masks)
+        if before >= after:
+            high, at_high, change = middle, at_middle, before
         else:
-            low, at_low, change = middle, at_middle, right
+            low, at_low, change = middle, at_middle, after
     return change
 
 

@@ -102,8 +102,8 @@ def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
     ahead = front_direction(up)
     plan = scene.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
-    place = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
-    return place[:, 0] * per_side + place[:, 1]
+    cell = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
+    return cell[:, 0] * per_side + cell[:, 1]
 
 
 def drop_background(scene: Gaussians) -> Gaussians | None:

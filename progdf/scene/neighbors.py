@@ -147,12 +147,12 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tupl
     """
     k = min(k, len(points) - 1)
     places = points.double().numpy()
-    distances, found = cKDTree(places).query(places[rows.numpy()], k + 1, workers=workers)
-    distances, found = distances.reshape(len(rows), k + 1), found.reshape(len(rows), k + 1)
-    dropped = found == rows.numpy()[:, None]
+    distances, neighbors = cKDTree(places).query(places[rows.numpy()], k + 1, workers=workers)
+    distances, neighbors = distances.reshape(len(rows), k + 1), neighbors.reshape(len(rows), k + 1)
+    dropped = neighbors == rows.numpy()[:, None]
     dropped[~dropped.any(axis=1), -1] = True  # more points than k in its own place, and it is not among them
     others = ~dropped
     return (
-        torch.from_numpy(found[others].reshape(len(rows), k)),
+        torch.from_numpy(neighbors[others].reshape(len(rows), k)),
         torch.from_numpy(distances[others].reshape(len(rows), k)),
     )

@@ -73,36 +73,36 @@ Selecting = Callable[[Gaussians], Mask]
 """What a checked part does with a scene."""
 
 
-def read_part(kind: str, rest: str) -> Selecting:
+def read_part(kind: str, argument: str) -> Selecting:
     """What a part of one of `PARTS` selects.
 
     Raises:
         ProgdfError: no scene can have it: its numbers or its camera cannot be read.
     """
     if kind == "color":
-        code, tolerance = _with_tolerance(kind, rest, 1, "#rrggbb[,tolerance]")
-        lab = _oklab(rest, code[0])
+        code, tolerance = _with_tolerance(kind, argument, 1, "#rrggbb[,tolerance]")
+        lab = _oklab(argument, code[0])
         return lambda scene: alike_in_color(base_colors(scene), lab, tolerance)
     if kind == "flood":
-        words, tolerance = _with_tolerance(kind, rest, 3, "x,y,z[,tolerance]")
-        x, y, z = _described_numbers(kind, rest, ",".join(words), "x,y,z[,tolerance]")
+        words, tolerance = _with_tolerance(kind, argument, 3, "x,y,z[,tolerance]")
+        x, y, z = _described_numbers(kind, argument, ",".join(words), "x,y,z[,tolerance]")
         return lambda scene: _flood(scene, (x, y, z), tolerance)
     if kind == "front":
-        camera_of = _camera(kind, rest, "CAMERA")
+        camera_of = _camera(kind, argument, "CAMERA")
         return lambda scene: _front(scene, camera_of(scene))
     form, least, odd = _FORMS[kind]
-    where, _, text = rest.rpartition(":")
+    where, _, text = argument.rpartition(":")
     camera_of, numbers = (
         _camera(kind, where, f"CAMERA:{form}"),
-        _described_numbers(kind, rest, text, f"CAMERA:{form}"),
+        _described_numbers(kind, argument, text, f"CAMERA:{form}"),
     )
     if len(numbers) < least or len(numbers) % 2 != odd or (kind == "rectangle" and len(numbers) > least):
         raise ProgdfError(
-            f"region '{kind}:{shorten(rest)}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}"
+            f"region '{kind}:{shorten(argument)}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}"
         )
     if odd and numbers[0] <= 0:
         raise ProgdfError(
-            f"the radius in region '{kind}:{shorten(rest)}' is {numbers[0]:g}; it must be positive"
+            f"the radius in region '{kind}:{shorten(argument)}' is {numbers[0]:g}; it must be positive"
         )
     return partial(_inside, kind, camera_of, numbers)
 
@@ -158,23 +158,23 @@ def _camera(kind: str, text: str, form: str) -> Callable[[Gaussians], Camera]:
     return lambda scene: read_camera(text, scene.origin)
 
 
-def _with_tolerance(kind: str, rest: str, count: int, form: str) -> tuple[list[str], float]:
-    words = rest.split(",")
+def _with_tolerance(kind: str, text: str, count: int, form: str) -> tuple[list[str], float]:
+    words = text.split(",")
     if not count <= len(words) <= count + 1:
-        raise ProgdfError(f"region '{kind}:{shorten(rest)}' cannot be read; write {kind}:{form}")
-    tolerance = _described_numbers(kind, rest, words[count], form)[0] if len(words) > count else TOLERANCE
+        raise ProgdfError(f"region '{kind}:{shorten(text)}' cannot be read; write {kind}:{form}")
+    tolerance = _described_numbers(kind, text, words[count], form)[0] if len(words) > count else TOLERANCE
     if not 0 < tolerance <= 1:
         raise ProgdfError(
-            f"the tolerance in region '{kind}:{shorten(rest)}' is {tolerance:g}; write above 0, up to 1"
+            f"the tolerance in region '{kind}:{shorten(text)}' is {tolerance:g}; write above 0, up to 1"
         )
     return words[:count], tolerance
 
 
-def _described_numbers(kind: str, rest: str, text: str, form: str) -> list[float]:
+def _described_numbers(kind: str, typed: str, text: str, form: str) -> list[float]:
     numbers = read_numbers(text)
     if not numbers:
         raise ProgdfError(
-            f"region '{kind}:{shorten(rest)}' does not end in numbers up to {LARGEST:g}; write {kind}:{form}"
+            f"region '{kind}:{shorten(typed)}' does not end in numbers up to {LARGEST:g}; write {kind}:{form}"
         )
     return numbers
 
@@ -193,10 +193,10 @@ def shorten(text: str) -> str:
     return text if len(text) <= 80 else f"{text[:79]}…"
 
 
-def _oklab(rest: str, code: str) -> list[float]:
+def _oklab(text: str, code: str) -> list[float]:
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", code.strip()):
         raise ProgdfError(
-            f"'{shorten(code)}' in region 'color:{shorten(rest)}' is not a color; "
+            f"'{shorten(code)}' in region 'color:{shorten(text)}' is not a color; "
             "write for example color:#903020"
         )
     rgb = torch.tensor(ImageColor.getrgb(code.strip())[:3]) / 255.0
@@ -267,16 +267,16 @@ def parse_region(
             mask[region.members.numpy()] = True
             joined = from_mask("", torch.from_numpy(read_step(part)(neighborhood, mask)))
         else:
-            kind, colon, rest = part.partition(":")
+            kind, colon, text = part.partition(":")
             if part == "all":
-                found = whole_scene(scene)
+                selected = whole_scene(scene)
             elif kind in known and (colon or kind in BARE):
-                found = known[kind](rest, scene)
+                selected = known[kind](text, scene)
             else:
                 raise _unknown(part, known)
-            if doubt := _doubt(kind, len(found), len(scene)):
+            if doubt := _doubt(kind, len(selected), len(scene)):
                 say(f"{shorten(part)} {doubt}")
-            joined = _SIGNS[sign](region, found)
+            joined = _SIGNS[sign](region, selected)
         if len(region) and not len(joined):
             say(f"nothing is left of the region after {sign}{shorten(part)}")
         region = joined
@@ -312,11 +312,11 @@ def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
         **checks,
     }
     for sign, part in split_spec(spec, tuple(known)):
-        kind, colon, rest = part.partition(":")
+        kind, colon, text = part.partition(":")
         if sign == "|":
             read_step(part)
         elif kind in known and (colon or kind in BARE):
-            known[kind](rest)
+            known[kind](text)
         elif part != "all":
             raise _unknown(part, known)
 
@@ -340,8 +340,8 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     return list(zip(["+", *pieces[1::2]], pieces[0::2], strict=True))
 
 
-def _by_hand(kind: str, rest: str, scene: Gaussians) -> Region:
-    return from_mask(f"{kind}:{rest}", torch.from_numpy(read_part(kind, rest)(scene)))
+def _by_hand(kind: str, text: str, scene: Gaussians) -> Region:
+    return from_mask(f"{kind}:{text}", torch.from_numpy(read_part(kind, text)(scene)))
 
 
 def read_labels(path: str, count: int) -> Tensor:
@@ -386,17 +386,17 @@ def _open_members(path: str) -> NDArray[Any]:
     return open_npy(path, "rows, as progdf region … -o FILE.npy writes them")
 
 
-def _check_file(rest: str) -> None:
-    if not rest:
+def _check_file(text: str) -> None:
+    if not text:
         raise ProgdfError("file: needs a file; write file:MEMBERS.npy, as progdf region … -o writes it")
-    _open_members(rest)
+    _open_members(text)
 
 
-def _file(rest: str, scene: Gaussians) -> Region:
-    _check_file(rest)
+def _file(text: str, scene: Gaussians) -> Region:
+    _check_file(text)
     mask = torch.zeros(len(scene), dtype=torch.bool)
-    mask[read_members(rest, len(scene))] = True
-    return from_mask(f"file:{rest}", mask)
+    mask[read_members(text, len(scene))] = True
+    return from_mask(f"file:{text}", mask)
 
 
 def _open_labels(path: str) -> NDArray[Any]:
@@ -406,62 +406,62 @@ def _open_labels(path: str) -> NDArray[Any]:
     return labels
 
 
-def _check_labels(rest: str) -> None:
-    _open_labels(_parse_labels(rest)[0])
+def _check_labels(text: str) -> None:
+    _open_labels(_parse_labels(text)[0])
 
 
-def _parse_labels(rest: str) -> tuple[str, list[int]]:
+def _parse_labels(text: str) -> tuple[str, list[int]]:
     """The file and the labels of FILE.npy:ID[,ID…]."""
-    path, colon, ids = rest.rpartition(":")
+    path, colon, ids = text.rpartition(":")
     if not colon or not path:
-        raise ProgdfError(f"region 'labels:{shorten(rest)}' has no label; write labels:FILE.npy:ID[,ID…]")
+        raise ProgdfError(f"region 'labels:{shorten(text)}' has no label; write labels:FILE.npy:ID[,ID…]")
     try:
         return path, [int(word) for word in ids.split(",")]
     except ValueError:
         raise ProgdfError(
-            f"'{shorten(ids)}' in region 'labels:{shorten(rest)}' is not a list of integers; "
+            f"'{shorten(ids)}' in region 'labels:{shorten(text)}' is not a list of integers; "
             "write labels:FILE.npy:ID[,ID…]"
         ) from None
 
 
-def _labels(rest: str, scene: Gaussians) -> Region:
-    path, wanted = _parse_labels(rest)
+def _labels(text: str, scene: Gaussians) -> Region:
+    path, ids = _parse_labels(text)
     labels = read_labels(path, len(scene))
     present = torch.unique(labels).tolist()
     known = set(present)
-    absent = [wanted_id for wanted_id in wanted if wanted_id not in known]
+    absent = [wanted_id for wanted_id in ids if wanted_id not in known]
     if absent:
-        shown = ", ".join(str(label) for label in present[:12]) + (" …" if len(present) > 12 else "")
-        raise ProgdfError(f"{path} has no Gaussian with label {absent[0]}; it has {shown}")
-    return from_labels(f"labels:{rest}", labels, wanted)
+        listed = ", ".join(str(label) for label in present[:12]) + (" …" if len(present) > 12 else "")
+        raise ProgdfError(f"{path} has no Gaussian with label {absent[0]}; it has {listed}")
+    return from_labels(f"labels:{text}", labels, ids)
 
 
-def _corners(rest: str) -> list[float]:
-    return _numbers("box", rest, "x0,y0,z0,x1,y1,z1")
+def _corners(text: str) -> list[float]:
+    return _numbers("box", text, "x0,y0,z0,x1,y1,z1")
 
 
-def _box(rest: str, scene: Gaussians) -> Region:
-    numbers = torch.tensor(_corners(rest), dtype=torch.float64)
-    return inside_box(f"box:{rest}", scene, numbers[:3], numbers[3:])
+def _box(text: str, scene: Gaussians) -> Region:
+    numbers = torch.tensor(_corners(text), dtype=torch.float64)
+    return inside_box(f"box:{text}", scene, numbers[:3], numbers[3:])
 
 
-def _ball(rest: str) -> list[float]:
-    numbers = _numbers("sphere", rest, "x,y,z,r")
+def _ball(text: str) -> list[float]:
+    numbers = _numbers("sphere", text, "x,y,z,r")
     if numbers[3] <= 0:
-        raise ProgdfError(f"the radius in region 'sphere:{rest}' is {numbers[3]:g}; it must be positive")
+        raise ProgdfError(f"the radius in region 'sphere:{text}' is {numbers[3]:g}; it must be positive")
     return numbers
 
 
-def _sphere(rest: str, scene: Gaussians) -> Region:
-    numbers = _ball(rest)
-    return inside_sphere(f"sphere:{rest}", scene, torch.tensor(numbers[:3], dtype=torch.float64), numbers[3])
+def _sphere(text: str, scene: Gaussians) -> Region:
+    numbers = _ball(text)
+    return inside_sphere(f"sphere:{text}", scene, torch.tensor(numbers[:3], dtype=torch.float64), numbers[3])
 
 
-def _numbers(kind: str, rest: str, form: str) -> list[float]:
-    numbers, count = read_numbers(rest), form.count(",") + 1
+def _numbers(kind: str, text: str, form: str) -> list[float]:
+    numbers, count = read_numbers(text), form.count(",") + 1
     if len(numbers) != count:
         raise ProgdfError(
-            f"region '{kind}:{shorten(rest)}' is not {count} numbers up to {LARGEST:g}; write {kind}:{form}"
+            f"region '{kind}:{shorten(text)}' is not {count} numbers up to {LARGEST:g}; write {kind}:{form}"
         )
     return numbers
 

@@ -44,17 +44,17 @@ class Centers(NamedTuple):
     depths: Floats  # camera z, world units. [N]
 
 
-def combine(mask: Mask, found: Mask, mode: str) -> Mask:
-    """A selection after `found` was selected as well, by one of `MODES`. [N]"""
+def combine(mask: Mask, selection: Mask, mode: str) -> Mask:
+    """A selection after `selection` was selected as well, by one of `MODES`. [N]"""
     match mode:
         case "new":
-            return found
+            return selection
         case "add":
-            return mask | found
+            return mask | selection
         case "subtract":
-            return mask & ~found
+            return mask & ~selection
         case "intersect":
-            return mask & found
+            return mask & selection
     raise ValueError(f"mode is '{mode}', expected one of {', '.join(MODES)}")
 
 
@@ -162,11 +162,11 @@ def front_surface(
     part = slice(None) if rows is None else rows
     points, depths = centers.points[part], centers.depths[part]
     width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
-    place = points / np.array([camera.width / width, camera.height / height], np.float32)
-    shown = np.asarray(np.isfinite(place).all(axis=1))
-    if not shown.any():
-        return shown
-    cells = np.where(shown[:, None], place, place[shown][0]).clip(0, (width - 1, height - 1)).astype(np.intp)
+    uv = points / np.array([camera.width / width, camera.height / height], np.float32)
+    visible = np.asarray(np.isfinite(uv).all(axis=1))
+    if not visible.any():
+        return visible
+    cells = np.where(visible[:, None], uv, uv[visible][0]).clip(0, (width - 1, height - 1)).astype(np.intp)
     (x0, y0), (x1, y1) = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
     with torch.no_grad():
         z = torch.from_numpy(centers.depths)[:, None].nan_to_num().expand(-1, 3).contiguous()
@@ -176,7 +176,7 @@ def front_surface(
     depth = np.where(covered > _COVERED, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
     surface = depth[cells[:, 1] - y0, cells[:, 0] - x0]
     size = np.exp(scene.log_scales.numpy()[part].max(axis=1))
-    return np.asarray(shown & (depths <= surface * (1.0 + _BEHIND) + _OWN * size))
+    return np.asarray(visible & (depths <= surface * (1.0 + _BEHIND) + _OWN * size))
 
 
 class Surface:

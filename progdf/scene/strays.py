@@ -75,20 +75,21 @@ def find_strays(scene: Gaussians) -> Strays:
     """
     drawn = (scene.opacities >= INVISIBLE).numpy()
     rows = np.flatnonzero(drawn)
-    found: dict[str, list[Rows]] = {"giants": [], "needles": [], "floaters": []}
+    strays_by_kind: dict[str, list[Rows]] = {"giants": [], "needles": [], "floaters": []}
     points, sizes, tips = _measure(scene[torch.from_numpy(rows)])
-    left = np.arange(len(rows))
-    while len(left) >= _ENOUGH:
-        kinds = _find_once(points[left], sizes[left], tips[left])
+    remaining = np.arange(len(rows))
+    while len(remaining) >= _ENOUGH:
+        kinds = _find_once(points[remaining], sizes[remaining], tips[remaining])
         strays = np.concatenate([*kinds.values()])
         if not len(strays):
             break
         for kind, those in kinds.items():
-            found[kind].append(rows[left[those]])
-        left = np.delete(left, strays)
+            strays_by_kind[kind].append(rows[remaining[those]])
+        remaining = np.delete(remaining, strays)
     empty = np.zeros(0, np.int64)
     return Strays(
-        np.flatnonzero(~drawn), **{kind: np.sort(np.concatenate([empty, *f])) for kind, f in found.items()}
+        np.flatnonzero(~drawn),
+        **{kind: np.sort(np.concatenate([empty, *f])) for kind, f in strays_by_kind.items()},
     )
 
 
@@ -141,13 +142,15 @@ def _find_once(points: Floats, sizes: Floats, tips: Floats) -> dict[str, Rows]:
     distances, near = np.maximum(distances[:, 1:], 1e-30), near[:, 1:]
     spacing = distances[:, -1]
     extent = _REACH * np.exp(longest[body])
-    room = np.log(np.maximum(spacing, extent))  # how far from each its neighborhood goes
+    log_reach = np.log(np.maximum(spacing, extent))  # how far from each its neighborhood goes
 
     def emptiness(rows: Rows) -> Floats:
         """How far the ends lie outside the neighborhood of what is nearest to them, log. [M] -> [M]"""
         ends = points[rows, None, None] + tips[rows, :, None] * np.array([1.0, -1.0])[:, None]
         away, nearest = tree.query(ends, workers=threads())
-        empty: Floats = (np.log(np.maximum(away, 1e-30)) - room[nearest]).reshape(len(rows), 4).max(axis=1)
+        empty: Floats = (
+            (np.log(np.maximum(away, 1e-30)) - log_reach[nearest]).reshape(len(rows), 4).max(axis=1)
+        )
         return empty
 
     usual = emptiness(body[:: -(-len(body) // _SAMPLE)])

@@ -116,15 +116,15 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     some = inside[:: -(-len(inside) // _LOOKED_AT)]
     near = _FREE * float(half[:2].min())
     most, view = -1.0, (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
-    for place in torch.cartesian_prod(*[torch.linspace(-0.75, 0.75, 5)] * 2):
-        stand = center + half * torch.cat([place, torch.tensor([0.2])])
-        free = float((some - stand).norm(dim=1).min()) > near
+    for offset in torch.cartesian_prod(*[torch.linspace(-0.75, 0.75, 5)] * 2):
+        candidate = center + half * torch.cat([offset, torch.tensor([0.2])])
+        free = float((some - candidate).norm(dim=1).min()) > near
         for turn in range(12):
             angle = math.radians(30 * turn)
             back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-            seen = _visible(some - stand, back, wide=1.0).sum() / len(some) + float(free)
+            seen = _visible(some - candidate, back, wide=1.0).sum() / len(some) + float(free)
             if float(seen) > most:
-                most, view = float(seen), (stand, stand - float(half[:2].min()) * back)
+                most, view = float(seen), (candidate, candidate - float(half[:2].min()) * back)
     eye, target = view
     return middle + eye @ axes, middle + (target - torch.tensor([0.0, 0.0, 0.1 * float(half[2])])) @ axes
 
@@ -170,10 +170,10 @@ def _visible(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
     within = (depth > 0) if wide else torch.ones_like(depth, dtype=torch.bool)
     for cell in cells:
         within &= (cell >= 0) & (cell < 24)
-    place = (cells[0] * 24 + cells[1]).clamp(0, 575).long()
+    index = (cells[0] * 24 + cells[1]).clamp(0, 575).long()
     far = torch.where(within, depth, math.inf)
-    nearest = torch.full((576,), math.inf).scatter_reduce(0, place, far, "amin")
-    return within & (depth <= nearest[place] + 0.08 * size)
+    nearest = torch.full((576,), math.inf).scatter_reduce(0, index, far, "amin")
+    return within & (depth <= nearest[index] + 0.08 * size)
 
 
 def ground_height(scene: Gaussians, up: Tensor) -> float:
@@ -185,8 +185,8 @@ def ground_height(scene: Gaussians, up: Tensor) -> float:
     solid = rows[scene.opacities[rows] > _SOLID]
     if not len(solid):
         return 0.0
-    shown = scene[_without_background(scene, solid)]
-    height = float(_quantile(shown.means @ up, _FEET))
+    visible = scene[_without_background(scene, solid)]
+    height = float(_quantile(visible.means @ up, _FEET))
     return height if math.isfinite(height) else 0.0
 
 
@@ -199,10 +199,10 @@ def _without_background(scene: Gaussians, rows: Tensor) -> Tensor:
     for _ in range(3):
         means = scene.means[rows]
         distances = (means - means.median(dim=0).values).norm(dim=1)
-        kept = distances <= _CORE * distances.median()
-        if bool(kept.all()):
+        core = distances <= _CORE * distances.median()
+        if bool(core.all()):
             break
-        rows = rows[kept]
+        rows = rows[core]
     return rows
 
 
@@ -232,13 +232,13 @@ def _rows_above_ground(height: Tensor, plan: Tensor) -> Tensor | None:
     above = height - ground
     standing = above > _ABOVE
     covered = torch.zeros(len(taken)).index_add(0, cell, standing.float()) > 0.1 * counts
-    found = (
+    on_ground = (
         int(standing.sum()) >= _ENOUGH
         and float((above < -_ABOVE).float().mean()) <= _UNDER
         and float((above[lowest].abs() < _ABOVE).float().mean()) >= _SHOWN
         and float(covered.float().mean()) <= _COVERED
     )
-    return standing if found else None
+    return standing if on_ground else None
 
 
 def _ground(low: Tensor, form: Tensor) -> Tensor:
@@ -252,8 +252,8 @@ def _ground(low: Tensor, form: Tensor) -> Tensor:
         # numpy's own: torch's threads spin over a few hundred rows, and this is in the way of a first picture
         fit = np.linalg.lstsq((form * weights[:, None]).numpy(), (low * weights).numpy(), rcond=None)
         surface = torch.from_numpy(fit[0])
-        left = low - form @ surface
-        weights = 1.0 / (1.0 + (left / torch.where(left > 0, 0.5 * _ABOVE, _ABOVE)) ** 2)
+        residual = low - form @ surface
+        weights = 1.0 / (1.0 + (residual / torch.where(residual > 0, 0.5 * _ABOVE, _ABOVE)) ** 2)
     return surface
 
 
@@ -279,10 +279,10 @@ def _connected_cells(boxes: Tensor, span: int) -> Tensor:
     """Which thing each cell belongs to; cells that touch, corners included, are one. [B] ascending -> [B]"""
     steps = torch.tensor([-1, 0, 1])
     around = boxes[:, None] + ((steps[:, None, None] * span + steps[:, None]) * span + steps).flatten()
-    place = torch.searchsorted(boxes, around).clamp_max(len(boxes) - 1)
-    own = torch.arange(len(boxes))
-    near = torch.where(boxes[place] == around, place, own[:, None])
-    thing = own
+    box = torch.searchsorted(boxes, around).clamp_max(len(boxes) - 1)
+    index = torch.arange(len(boxes))
+    near = torch.where(boxes[box] == around, box, index[:, None])
+    thing = index
     while True:
         least = thing[near].amin(dim=1)
         least = least[least]  # halves the way to the first of the thing

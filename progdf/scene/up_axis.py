@@ -42,11 +42,11 @@ def find(scene: Gaussians) -> Tensor | None:
 def remember(scene: Gaussians, up: tuple[float, float, float]) -> None:
     """Keep what was chosen for a scene; what cannot be written is not remembered."""
     key = fingerprint(scene).means_sha256
-    kept = {name: known for name, known in _read().items() if name != key} | {key: list(up)}
+    remembered = {name: known for name, known in _read().items() if name != key} | {key: list(up)}
     with contextlib.suppress(OSError):
         _place().parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(_place()) as temporary_file:
-            temporary_file.write_text(json.dumps(dict([*kept.items()][-MOST:])), encoding="utf-8")
+            temporary_file.write_text(json.dumps(dict([*remembered.items()][-MOST:])), encoding="utf-8")
 
 
 def _read() -> dict[str, object]:
@@ -139,21 +139,21 @@ def direction_name(direction: Tensor) -> str:
 
 
 def find_up(
-    scene: Gaussians, cameras: Sequence[Camera] = (), asked: str = "auto", path: Path | None = None
+    scene: Gaussians, cameras: Sequence[Camera] = (), choice: str = "auto", path: Path | None = None
 ) -> UpAxis:
     """The world direction that is up.
 
     Args:
         scene: N Gaussians
         cameras: given with the scene; people hold them level, so their mean up is the scene's, if they agree
-        asked: an axis decides all; "auto" leaves it to the cameras, to what was chosen for this scene before
+        choice: an axis decides all; "auto" leaves it to the cameras, to what was chosen for this scene before
             (`known_ups`), to cameras beside its file, and to the scene's shape
         path: the scene's file
     """
-    if asked != "auto":
-        return UpAxis(axis_direction(asked), "as --up says")
-    if (held := _held_up(cameras)) is not None:
-        return UpAxis(held, "as the cameras are held")
+    if choice != "auto":
+        return UpAxis(axis_direction(choice), "as --up says")
+    if (up := _held_up(cameras)) is not None:
+        return UpAxis(up, "as the cameras are held")
     if (chosen := find(scene)) is not None:
         return UpAxis(chosen, "as was chosen for this scene before")
     beside = (
@@ -161,8 +161,8 @@ def find_up(
         if path is None
         else [camera for camera in cameras_beside(path, scene.origin) if _sees(camera, scene)]
     )
-    if (held := _held_up(beside)) is not None:
-        return UpAxis(held, f"as the {len(beside)} cameras beside the scene's file are held")
+    if (up := _held_up(beside)) is not None:
+        return UpAxis(up, f"as the {len(beside)} cameras beside the scene's file are held")
     return _weigh(scene)
 
 
@@ -181,8 +181,8 @@ def _held_up(cameras: Sequence[Camera]) -> Tensor | None:
 
 def _sees(camera: Camera, scene: Gaussians) -> bool:
     """Whether the scene's middle is in the picture, as where cameras belong to it."""
-    place = camera.viewmat[:3, :3] @ scene_sphere(scene)[0] + camera.viewmat[:3, 3]
-    x, y, depth = (float(c) for c in camera.K @ place)
+    center = camera.viewmat[:3, :3] @ scene_sphere(scene)[0] + camera.viewmat[:3, 3]
+    x, y, depth = (float(c) for c in camera.K @ center)
     return depth > 0 and 0 <= x <= camera.width * depth and 0 <= y <= camera.height * depth
 
 
@@ -202,18 +202,20 @@ def _weigh(scene: Gaussians) -> UpAxis:
         usual = sorted((axis_direction(axis) for axis in AXES), key=_convention, reverse=True)
         return UpAxis(usual[0], why, certain=False, candidates=tuple(usual))
     directions = [axis_direction(axis) for axis in AXES]
-    found = [shape.evidence(direction) for direction in directions]
-    walled = min(evidence["ground plane"] for evidence in found) >= _WALLED
+    shape_signs = [shape.evidence(direction) for direction in directions]
+    walled = min(evidence["ground plane"] for evidence in shape_signs) >= _WALLED
     if (normal := _ground_normal(shape.places)) is not None:
         both = [shape.evidence(normal), shape.evidence(-normal)]
-        planes = [evidence["ground plane"] for evidence in [*found, *both]]
+        planes = [evidence["ground plane"] for evidence in [*shape_signs, *both]]
         if planes[6] - planes[7] > max(abs(planes[i] - planes[i + 1]) for i in (0, 2, 4)):
-            directions, found = [*directions, normal, -normal], [*found, *both]
+            directions, shape_signs = [*directions, normal, -normal], [*shape_signs, *both]
     counted = ["ground plane"] if walled else [*_WEIGHTS]
     terms = []
     for i, direction in enumerate(directions):
-        own = found[i] | {"ground plane": found[i]["ground plane"] - found[i ^ 1]["ground plane"]}
-        term = {name: _WEIGHTS[name] * own[name] for name in counted}
+        signs = shape_signs[i] | {
+            "ground plane": shape_signs[i]["ground plane"] - shape_signs[i ^ 1]["ground plane"]
+        }
+        term = {name: _WEIGHTS[name] * signs[name] for name in counted}
         terms.append(term | {"convention": _convention(direction)})
     totals = torch.tensor([sum(term.values()) for term in terms])
     likely = torch.softmax(totals, 0)
@@ -221,8 +223,10 @@ def _weigh(scene: Gaussians) -> UpAxis:
     best = order[0]
     rival = next(i for i in order if float(directions[i] @ directions[best]) < math.sqrt(0.5))
     against = {name: value - terms[rival][name] for name, value in terms[best].items()}
-    told = sorted((name for name in against if abs(against[name]) >= _TOLD), key=lambda n: -abs(against[n]))
-    reasons = ", ".join(f"{name} {against[name]:+.1f}" for name in told)
+    decisive = sorted(
+        (name for name in against if abs(against[name]) >= _TOLD), key=lambda n: -abs(against[n])
+    )
+    reasons = ", ".join(f"{name} {against[name]:+.1f}" for name in decisive)
     other = direction_name(directions[rival])
     odds = float(likely[best] / likely[rival])
     why = f"{100 * float(likely[best]):.0f} % likely; against {other}: {reasons}"
@@ -291,11 +295,11 @@ class _Shape:
         along = self.places @ normal
         ordered = along.sort().values
         middle = 0.5 * (ordered[len(along) // 50] + ordered[-1 - len(along) // 50])
-        own, mirrored = (
+        upright, mirrored = (
             _cell_counts(places).sqrt()
             for places in (self.places, self.places - 2 * (along - middle)[:, None] * normal)
         )
-        return float(own @ mirrored / (own.norm() * mirrored.norm()))
+        return float(upright @ mirrored / (upright.norm() * mirrored.norm()))
 
 
 def _shape_of(scene: Gaussians) -> _Shape | None:
@@ -334,17 +338,17 @@ def _ground_plane(height: Tensor, plan: Tensor, facing: Tensor) -> float:
     """
     slabs, cells = 60, 10
     row = ((height + 1.5) / 0.05).long().clamp(0, slabs - 1)
-    place = (plan * cells).long().clamp(0, cells - 1)
-    cell = (row * cells + place[:, 0]) * cells + place[:, 1]
+    index = (plan * cells).long().clamp(0, cells - 1)
+    cell = (row * cells + index[:, 0]) * cells + index[:, 1]
     table = torch.bincount(cell, minlength=slabs * cells**2).view(slabs, cells**2).float() / len(height)
     faced = torch.bincount(row, facing, minlength=slabs) / len(height)
     within = faced[:-1] + faced[1:]
-    shown = table[:-1] + table[1:] > 0
+    visible = table[:-1] + table[1:] > 0
     total = table.sum(dim=1).cumsum(0)
     below = torch.cat([torch.zeros(2), total[:-3]])  # a row apart from the slab's two
     above = 1 - torch.cat([total[2:], torch.ones(1)])
     side = (above - below) / (above + below).clamp_min(0.02)
-    cover = shown.float().sum(dim=1) / (table.sum(dim=0) > 0).float().sum()
+    cover = visible.float().sum(dim=1) / (table.sum(dim=0) > 0).float().sum()
     return max(0.0, float((within * cover * side).max()))
 
 
@@ -357,12 +361,12 @@ def _ground_normal(places: Tensor) -> Tensor | None:
     a, b, c = some[draws].unbind(1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
     for _ in range(2):
-        apart = some @ normals.T - (a * normals).sum(dim=1)
-        within = (apart.abs() < 0.04).double().mean(dim=0)
-        above, below = ((side > 0.08).double().mean(dim=0) for side in (apart, -apart))
+        distances = some @ normals.T - (a * normals).sum(dim=1)
+        within = (distances.abs() < 0.04).double().mean(dim=0)
+        above, below = ((side > 0.08).double().mean(dim=0) for side in (distances, -distances))
         worth = within * (above - below).abs() / (above + below).clamp_min(0.02)
         best = int(worth.argmax())
-        inside = some[apart[:, best].abs() < 0.04]
+        inside = some[distances[:, best].abs() < 0.04]
         a = inside.mean(dim=0)[None]
         normals = torch.linalg.svd(inside - a, full_matrices=False).Vh[2][None]
     up = normals[0].float() * (1.0 if float(above[best]) > float(below[best]) else -1.0)
