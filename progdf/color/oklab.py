@@ -137,12 +137,12 @@ def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend)
     if bend.fade:
         way = torch.lerp(inside, end, s[..., None])
     else:
-        way = _bowed(srgb_to_oklab(inside), srgb_to_oklab(end), s, bend)
+        way = _mix_oklab(srgb_to_oklab(inside), srgb_to_oklab(end), s, bend)
     edited = way + (1 - s)[..., None] * (rgb - inside)
     return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
 
 
-def _bowed(a: Tensor, b: Tensor, s: Tensor, bend: Bend) -> Tensor:
+def _mix_oklab(a: Tensor, b: Tensor, s: Tensor, bend: Bend) -> Tensor:
     """From OKLab to OKLab; sRGB. [...,3], [...,3], [...] -> [...,3]"""
     chroma_a, chroma_b = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1)
     turn = bend.direction * _wrap(hue_of(b) - hue_of(a))  # -pi..pi, the region's sense being positive

@@ -186,20 +186,11 @@ class Composer:
                 if bases is None or gain == 0:
                     continue
                 used, factors = bases.factors(part.segment)
-                covered = self._covered(part.edit, KINDS[name]) if blend == "over" else _NOTHING
+                covered = self._coverage_of(part.edit, KINDS[name]) if blend == "over" else _NOTHING
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
                 selection = part.at, part.members, part.weights
-                _add_offsets(
-                    total,
-                    selection,
-                    bases.end,
-                    bases.residual,
-                    used,
-                    factors,
-                    np.float32(gain),
-                    hidden,
-                    covered,
-                )
+                stored, scale = (bases.end, bases.residual), np.float32(gain)
+                _add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
             moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
@@ -224,7 +215,7 @@ class Composer:
             self._plans[changed] = _Plan(rows, parts)
         return self._plans[changed]
 
-    def _covered(self, edit: int, kind: str) -> Floats:
+    def _coverage_of(self, edit: int, kind: str) -> Floats:
         if edit not in self._coverage:
             covered = coverage(self._scene, self._gdfs[edit])
             self._coverage[edit] = {name: values.numpy() for name, values in covered.items()}
@@ -259,9 +250,8 @@ def _between(part: _Part, first: int, last: int) -> _Part:
 @kernel(cache=True, allocates=True)
 def _add_offsets(
     total: Floats,
-    own: tuple[Rows, Rows, Floats],
-    end: Floats,
-    residual: NDArray[Any],
+    part: tuple[Rows, Rows, Floats],
+    stored: tuple[Floats, NDArray[Any]],
     used: Rows,
     factors: Floats,
     gain: np.float32,
@@ -272,13 +262,13 @@ def _add_offsets(
 
     Args:
         total: sums so far, written. [U,c]
-        own: where the layer's members are in `total` [m], which they are [m], and the weights of all members
+        part: where the layer's members are in `total` [m], which they are [m], and the weights of all members
             [M], empty: all 1
-        end, residual: as stored. [M,c], [R,M,c]
+        stored: end and residual. [M,c], [R,M,c]
         used, factors: see `_Bases.factors`. [U], [1+U,c] or none
         hidden, covered: the share of lower layers that is hidden at c = 1, and c [M], empty: 0
     """
-    at, members, weights = own
+    (at, members, weights), (end, residual_levels) = part, stored
     one, width = np.float32(1.0), total.shape[1]
     offsets = np.zeros(_BLOCK * width, np.float32)  # of a block of members: they stay in the first cache
     tiles = np.empty((len(factors), _BLOCK * width), np.float32)
@@ -294,11 +284,11 @@ def _add_offsets(
             for k in range(len(factors)):
                 tile = tiles[k]
                 if k == 0:
-                    stored = ends[low * width : (low + count) * width]
+                    run = ends[low * width : (low + count) * width]
                     for j in range(count * width):
-                        offsets[j] = tile[j] * stored[j]
+                        offsets[j] = tile[j] * run[j]
                 else:
-                    levels = residual[used[k - 1]].reshape(-1)[low * width : (low + count) * width]
+                    levels = residual_levels[used[k - 1]].reshape(-1)[low * width : (low + count) * width]
                     for j in range(count * width):
                         offsets[j] += tile[j] * np.float32(levels[j])
         else:
@@ -309,7 +299,7 @@ def _add_offsets(
                         if k == 0:
                             offsets[j] = factors[0, c] * end[members[first + i], c]
                         else:
-                            level = residual[used[k - 1], members[first + i], c]
+                            level = residual_levels[used[k - 1], members[first + i], c]
                             offsets[j] += factors[k, c] * np.float32(level)
         if len(weights) == 0 and len(covered) == 0 and at[first + count - 1] - row == count - 1:
             run = sums[row * width : (row + count) * width]

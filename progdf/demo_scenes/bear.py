@@ -155,7 +155,16 @@ def ellipsoid(
 ) -> Part:
     """An ellipsoid of these radii, turned by degrees about x, then y, then z; see `Part` for the rest."""
     matrix = rotation_matrix(turn) @ torch.diag(torch.tensor(radii))
-    return Part(name, label, ball(exponent), torch.tensor(center), matrix, weight, None, casts_shadow, clears)
+    return Part(
+        name,
+        label,
+        ball(exponent),
+        torch.tensor(center),
+        matrix,
+        weight,
+        casts_shadow=casts_shadow,
+        clears=clears,
+    )
 
 
 def _detail(
@@ -198,7 +207,7 @@ def _pads(foot: Part) -> list[Part]:
         frame = turn @ torch.stack([side, torch.linalg.cross(outward, side), outward], dim=1)
         matrix = frame @ torch.diag(torch.tensor([wide, tall, 0.022]))
         center = foot.center + turn @ torch.tensor([x, y, z])
-        pads.append(Part("pad", foot.label, ball(), center, matrix, 3.0, None, False, 0.08))
+        pads.append(Part("pad", foot.label, ball(), center, matrix, 3.0, casts_shadow=False, clears=0.08))
     return pads
 
 

@@ -201,16 +201,21 @@ def room(size: int = 40_000, seed: int = 0) -> DemoScene:
 
 def room_parts() -> list[Part]:
     """Every part of the room; y is up, the floor at 0."""
-    (window_y, window_z), (tall, wide) = _WINDOW
-    table, vase, lamp, stool = (0.55, -0.35), (0.55, -0.35), (1.62, -1.62), (-0.45, 0.35)
-    flowers = [
-        (0.0, 0.0, 0.0),
-        (0.13, -0.03, 0.05),
-        (-0.12, -0.02, 0.06),
-        (0.05, 0.05, -0.12),
-        (-0.05, 0.07, 0.1),
+    toy = ellipsoid("ball", "ball", (-1.05, 0.195, -0.75), (0.18, 0.18, 0.18), (30, 0, 25), 2.5)
+    return [
+        *_shell(),
+        *_table_with_flowers((0.55, -0.35)),
+        *_lamp((1.62, -1.62)),
+        *_stool((-0.45, 0.35)),
+        toy,
     ]
+
+
+def _shell() -> list[Part]:
+    """Floor, ceiling and walls, and what hangs on them and lies there."""
+    (window_y, window_z), (tall, wide) = _WINDOW
     x, y, z = (_HALF, 0.0, 0.0), (0.0, _HEIGHT / 2, 0.0), (0.0, 0.0, _HALF)
+    pane = (-_HALF + 0.015, window_y, window_z)
     return [
         _flat("floor", "floor", (0, 0, 0), x, z, (0, 1, 0), 0.8),
         _flat("ceiling", "ceiling", (0, _HEIGHT, 0), x, z, (0, -1, 0), 0.3),
@@ -218,71 +223,74 @@ def room_parts() -> list[Part]:
         _flat("wall", "walls", (_HALF, _HEIGHT / 2, 0), z, y, (-1, 0, 0), 0.5),
         _flat("wall", "walls", (0, _HEIGHT / 2, -_HALF), x, y, (0, 0, 1), 0.5),
         _flat("wall", "walls", (0, _HEIGHT / 2, _HALF), x, y, (0, 0, -1), 0.5),
-        _flat(
-            "window",
-            "walls",
-            (-_HALF + 0.015, window_y, window_z),
-            (0, tall, 0),
-            (0, 0, wide),
-            (1, 0, 0),
-            1.5,
-        ),
+        _flat("window", "walls", pane, (0, tall, 0), (0, 0, wide), (1, 0, 0), 1.5),
         _flat("picture", "picture", (-0.35, 1.5, -_HALF + 0.015), (0.62, 0, 0), (0, 0.45, 0), (0, 0, 1), 4.0),
         ellipsoid(
-            "rug",
-            "rug",
-            (-0.15, 0.012, 0.1),
-            (1.15, 0.014, 1.15),
-            weight=1.5,
-            exponent=10,
-            casts_shadow=False,
+            "rug", "rug", (-0.15, 0.012, 0.1), (1.15, 0.014, 1.15), (0, 0, 0), 1.5, 10, casts_shadow=False
         ),
-        ellipsoid("wood", "table", (table[0], 0.74, table[1]), (0.62, 0.028, 0.62), weight=1.8, exponent=8),
-        ellipsoid("wood", "table", (table[0], 0.37, table[1]), (0.055, 0.36, 0.055), weight=1.5, exponent=6),
-        ellipsoid("wood", "table", (table[0], 0.03, table[1]), (0.30, 0.03, 0.30), weight=1.5, exponent=4),
-        _lathe_body(
-            "vase",
-            "vase",
-            (vase[0], 0.765, vase[1]),
-            (0.055, 0.045, 0.09, 0.125, 0.11, 0.07),
-            (0.40, 0.33, 0.25, 0.16, 0.07, 0.0),
-        ),
+    ]
+
+
+def _table_with_flowers(at: tuple[float, float]) -> list[Part]:
+    """A round table at (x, z), a vase on it and five flowers in that."""
+    x, z = at
+    flowers = (
+        (0.0, 0.0, 0.0),
+        (0.13, -0.03, 0.05),
+        (-0.12, -0.02, 0.06),
+        (0.05, 0.05, -0.12),
+        (-0.05, 0.07, 0.1),
+    )
+    bowed = (0.055, 0.045, 0.09, 0.125, 0.11, 0.07), (0.40, 0.33, 0.25, 0.16, 0.07, 0.0)
+    return [
+        ellipsoid("wood", "table", (x, 0.74, z), (0.62, 0.028, 0.62), weight=1.8, exponent=8),
+        ellipsoid("wood", "table", (x, 0.37, z), (0.055, 0.36, 0.055), weight=1.5, exponent=6),
+        ellipsoid("wood", "table", (x, 0.03, z), (0.30, 0.03, 0.30), weight=1.5, exponent=4),
+        _lathe_body("vase", "vase", (x, 0.765, z), *bowed),
         *[
             ellipsoid(
                 "stem",
                 "vase",
-                (vase[0] + 0.5 * x, 1.24 + 0.5 * y, vase[1] + 0.5 * z),
+                (x + 0.5 * a, 1.24 + 0.5 * b, z + 0.5 * c),
                 (0.008, 0.15, 0.008),
-                (130 * z, 0, -130 * x),
+                (130 * c, 0, -130 * a),
                 4.0,
             )
-            for x, y, z in flowers
+            for a, b, c in flowers
         ],
         *[
-            ellipsoid(
-                "flower", "vase", (vase[0] + x, 1.40 + y, vase[1] + z), (0.072, 0.055, 0.072), weight=4.0
-            )
-            for x, y, z in flowers
+            ellipsoid("flower", "vase", (x + a, 1.40 + b, z + c), (0.072, 0.055, 0.072), weight=4.0)
+            for a, b, c in flowers
         ],
-        ellipsoid("metal", "lamp", (lamp[0], 0.02, lamp[1]), (0.17, 0.02, 0.17), weight=2.0, exponent=4),
-        ellipsoid("metal", "lamp", (lamp[0], 0.75, lamp[1]), (0.016, 0.74, 0.016), weight=2.0, exponent=8),
-        _lathe_body("shade", "lamp", (lamp[0], 1.42, lamp[1]), (0.14, 0.26), (0.36, 0.0)),
-        ellipsoid(
-            "cushion", "stool", (stool[0], 0.44, stool[1]), (0.24, 0.055, 0.24), weight=2.0, exponent=2.8
-        ),
+    ]
+
+
+def _lamp(at: tuple[float, float]) -> list[Part]:
+    x, z = at
+    return [
+        ellipsoid("metal", "lamp", (x, 0.02, z), (0.17, 0.02, 0.17), weight=2.0, exponent=4),
+        ellipsoid("metal", "lamp", (x, 0.75, z), (0.016, 0.74, 0.016), weight=2.0, exponent=8),
+        _lathe_body("shade", "lamp", (x, 1.42, z), (0.14, 0.26), (0.36, 0.0)),
+    ]
+
+
+def _stool(at: tuple[float, float]) -> list[Part]:
+    x, z = at
+    legs = [(math.cos(angle), math.sin(angle)) for angle in (0.5, 2.6, 4.7)]
+    return [
+        ellipsoid("cushion", "stool", (x, 0.44, z), (0.24, 0.055, 0.24), weight=2.0, exponent=2.8),
         *[
             ellipsoid(
                 "wood",
                 "stool",
-                (stool[0] + 0.15 * c, 0.2, stool[1] + 0.15 * s),
+                (x + 0.15 * c, 0.2, z + 0.15 * s),
                 (0.022, 0.22, 0.022),
                 (12 * s, 0, -12 * c),
                 2.0,
                 5.0,
             )
-            for c, s in ((math.cos(a), math.sin(a)) for a in (0.5, 2.6, 4.7))
+            for c, s in legs
         ],
-        ellipsoid("ball", "ball", (-1.05, 0.195, -0.75), (0.18, 0.18, 0.18), (30, 0, 25), 2.5),
     ]
 
 

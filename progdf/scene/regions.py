@@ -273,7 +273,7 @@ def parse_region(
             elif kind in known and (colon or kind in BARE):
                 selected = known[kind](text, scene)
             else:
-                raise _unknown(part, known)
+                raise _unknown_region(part, known)
             if doubt := _doubt(kind, len(selected), len(scene)):
                 say(f"{shorten(part)} {doubt}")
             joined = _SIGNS[sign](region, selected)
@@ -318,10 +318,10 @@ def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
         elif kind in known and (colon or kind in BARE):
             known[kind](text)
         elif part != "all":
-            raise _unknown(part, known)
+            raise _unknown_region(part, known)
 
 
-def _unknown(part: str, known: Iterable[str]) -> ProgdfError:
+def _unknown_region(part: str, known: Iterable[str]) -> ProgdfError:
     choice = ", ".join(["all", *(word if word in BARE else f"{word}:…" for word in known)])
     return ProgdfError(f"unknown region '{shorten(part)}'; write {choice}")
 
