@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import io
-import re
 import sys
 import tokenize
 from collections.abc import Iterator, Mapping
@@ -61,7 +60,7 @@ def measure(path: Path, source: str) -> Module:
 
 def modules(package: str) -> list[Module]:
     """All modules of a package that hold more than a line."""
-    paths = sorted((ROOT / package).rglob("*.py"))
+    paths = sorted((ROOT / package).rglob("*.py"), key=lambda path: (path.parent.parts, path.name))
     measured = [measure(path.relative_to(ROOT), path.read_text(encoding="utf-8")) for path in paths]
     return [module for module in measured if len(module.tree.body) > 1]
 
@@ -128,7 +127,7 @@ def table() -> str:
 
 
 def tree() -> str:
-    """The modules of the packages by folder, each with the first sentence that it says of itself."""
+    """The modules of the packages by folder, each with the first line that it says of itself."""
     lines = ["```"]
     for package in PACKAGES:
         folder = None
@@ -136,8 +135,7 @@ def tree() -> str:
             if module.path.parent != folder:
                 folder = module.path.parent
                 lines.append(f"{folder.as_posix()}/")
-            text = (ast.get_docstring(module.tree) or "").split("\n\n")[0]
-            first = re.split(r"(?<=[.?])\s|: ", " ".join(text.split()))[0].rstrip(".:")
+            first = (ast.get_docstring(module.tree) or "").split("\n")[0].rstrip(".:")
             lines.append(f"  {module.path.name:24} {first}")
     return "\n".join([*lines, "```\n"])
 
