@@ -48,9 +48,8 @@ def measure(path: Path, source: str) -> Module:
         if isinstance(node, ast.Import | ast.ImportFrom):
             imports |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
         for child in getattr(node, "body", []) if isinstance(getattr(node, "body", None), list) else []:
-            if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
-                if isinstance(child.value.value, str):
-                    texts |= set(range(child.lineno, (child.end_lineno or child.lineno) + 1))
+            if isinstance(child, ast.Expr) and isinstance(getattr(child.value, "value", None), str):
+                texts |= set(range(child.lineno, (child.end_lineno or child.lineno) + 1))
     used: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in _NO_CODE:
@@ -105,7 +104,7 @@ def dotted(path: Path) -> str:
 
 def table() -> str:
     """Sizes of each package and of all, as Markdown."""
-    head = "modules | lines | code | imports | median file | longest function | widest call".split(" | ")
+    head = ["modules", "lines", "code", "imports", "median file", "longest function", "widest call"]
     rows = ["| | " + " | ".join(head) + " |", "|" + " --- |" * (len(head) + 1)]
     groups = {name: modules(name) for name in PACKAGES}
     for name, group in [*groups.items(), ("all", [module for one in groups.values() for module in one])]:
