@@ -57,20 +57,20 @@ def jobs() -> None:
         while queue.busy:
             for ended in queue.poll():
                 return ended.status + ended.error
-            if until and any(job.progress.doing == until for job in queue.jobs):
+            if until and any(job.progress.label == until for job in queue.jobs):
                 break
             time.sleep(0.05)
         return until
 
     queue = TrainingQueue()
     number = queue.add(order("blue"))
-    assert wait("optimize") == "optimize"
+    assert wait("Training") == "Training"
     queue.stop(number)
     assert (said := wait()) == "stopped", said
     queue.resume(number)
     assert (said := wait()) == "done", said
     queue.add(order("red"))
-    assert wait("optimize") == "optimize"
+    assert wait("Training") == "Training"
     assert queue._child is not None
     queue._child.kill()
     assert wait().startswith("failed")

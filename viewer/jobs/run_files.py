@@ -14,8 +14,8 @@ import hashlib
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import torch
@@ -31,19 +31,9 @@ from progdf.io.tensors import read_tensors
 from progdf.io.user_folders import state_folder
 from progdf.region import Region
 
-from .training_job import EditOrder, Progress, progress_of
+from .training_job import EditOrder, Progress
 
 ORDER, LOG, WINDOW_LOCK = ".train.json", ".train.log", ".train.lock"
-
-
-class _Said(msgspec.Struct):
-    """What the trainer writes while it works, RUN/state/progress.json."""
-
-    doing: str
-    done: int
-    total: int
-    note: str = ""
-    seconds: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # of all sessions of the run
 
 
 class _Paint(msgspec.Struct):
@@ -190,12 +180,12 @@ def discard(order: EditOrder) -> None:
 
 
 def read_progress(order: EditOrder, before: Progress) -> Progress:
-    """How far the run says that it is."""
+    """How far the run says that it is; its share and seconds begin at 0 again until it has read its state."""
     try:
-        said = read_json(order.out / "state" / "progress.json", _Said)
+        now = read_json(order.out / "state" / "progress.json", Progress)
     except ProgdfError:
         return before
-    return progress_of(said.doing, said.done, said.total, said.note, before, said.seconds)
+    return replace(now, share=max(now.share, before.share), seconds=max(now.seconds, before.seconds))
 
 
 def newest_recording(order: EditOrder) -> Path | None:

@@ -2,42 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 Status = Literal["queued", "running", "stopping", "stopped", "elsewhere", "failed", "done"]
-
-PHASES = (
-    ("edit", 0.08, 0.38),
-    ("even the slider", 0.08, 0.2),
-    ("try kinds", 0.08, 0.2),
-    ("move parts", 0.38, 0.5),
-    ("optimize", 0.38, 0.64),
-    ("time the slider", 0.64, 0.66),
-    ("picture the edit", 0.66, 0.7),
-    ("weigh the members", 0.7, 0.73),
-    ("fit the field", 0.73, 0.82),
-    ("field", 0.7, 0.82),
-    ("measure the edit", 0.82, 0.96),
-)
-"""What `progdf train` says that it does, and between which shares of its time that usually lies."""
-
-SAID = {
-    "": "Starting",
-    "edit": "Editing views",
-    "even the slider": "Evening the slider",
-    "try kinds": "Choosing what moves",
-    "move parts": "Moving parts",
-    "optimize": "Training",
-    "time the slider": "Timing the slider",
-    "picture the edit": "Finishing",
-    "weigh the members": "Packing",
-    "fit the field": "Packing",
-    "field": "Packing",
-    "measure the edit": "Measuring",
-}
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 @dataclass(frozen=True)
@@ -76,24 +49,12 @@ class EditOrder:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is.
+    """How far a run is, as the trainer writes it to RUN/state/progress.json."""
 
-    Args:
-        share: of its whole time, 0..1, by what its part usually takes
-        doing: in the words of the trainer
-        loss: of the training, "" while there is none
-        seconds: that were spent on it, in all its sessions
-    """
-
-    share: float = 0.0
-    doing: str = ""
-    loss: str = ""
-    seconds: float = 0.0
-
-    @property
-    def said(self) -> str:
-        """What the run does, for the person."""
-        return SAID.get(self.doing, self.doing.capitalize())
+    share: Share = 0.0  # of its whole time
+    label: str = ""  # what it does, "" while it starts
+    loss: str = ""  # of the training, "" where there is none
+    seconds: Seconds = 0.0  # that were spent on it, in all its sessions
 
 
 @dataclass(frozen=True)
@@ -133,17 +94,6 @@ class TrainingJob:
         if self.status != "running" or done < 0.05 or self.seconds < 2.0:
             return None
         return self.seconds * (1.0 - self.progress.share) / done
-
-
-def progress_of(
-    doing: str, done: int, total: int, note: str, before: Progress, seconds: float = 0.0
-) -> Progress:
-    """Progress by what the trainer says; the share never goes back."""
-    low, high = next(((low, high) for name, low, high in PHASES if name == doing), (before.share,) * 2)
-    share = low + (high - low) * min(max(done / max(total, 1), 0.0), 1.0)
-    loss = re.search(r"loss\D*([\d.]+)", note)
-    spent = max(seconds, before.seconds)  # a run that goes on begins at 0 again, until it has its state
-    return Progress(max(share, before.share), doing, loss[1].rstrip(".") if loss else before.loss, spent)
 
 
 def duration(seconds: float) -> str:

@@ -180,10 +180,10 @@ def _said(job: TrainingJob) -> str:
             return STARVED
         case "running":
             left = job.seconds_left
-            finding = not progress.doing and job.order.region == "changed"
-            words = ["Finding what changed" if finding else progress.said]
+            starting = "Finding what changed" if job.order.region == "changed" else "Starting"
+            words = [progress.label or starting]
             words += [f"{duration(left)} left"] if left is not None else []
-            words += [f"loss {progress.loss}"] if progress.loss and progress.doing == "optimize" else []
+            words += [f"loss {progress.loss}"] if progress.loss else []
             return "  ·  ".join(words)
         case "queued":
             return "Waits for the one before"

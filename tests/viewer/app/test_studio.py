@@ -32,6 +32,7 @@ class Trainer:
     ended: int | None = None
     line = ""
     edit: Path | None = None
+    starved = False
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
         type(self).said = arguments
@@ -145,7 +146,7 @@ def test_a_training_is_discarded_only_after_a_question(window: application.App) 
     state = job.order.out / "state"
     state.mkdir(parents=True)
     (state / "run.json").touch()
-    (state / "progress.json").write_text('{"doing": "optimize", "done": 1, "total": 2, "seconds": 2280}')
+    (state / "progress.json").write_text('{"share": 0.5, "label": "Training", "seconds": 2280}')
     request(window, f"stop_run:{job.number}")
     turn(window)
     assert window.main_view.work.jobs[0].status == "stopped"

@@ -66,7 +66,7 @@ def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
 
 def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
-    running = TrainingJob(1, order, "running", Progress(0.45, "optimize", "0.0114"), 20.0)
+    running = TrainingJob(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     line = "region 'sphere:99,99,99,1' holds no Gaussian"
     jobs = (
         running,
@@ -94,7 +94,7 @@ def test_the_question_about_a_film(screenshot: Compare) -> None:
 
 def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
-    running = TrainingJob(1, order, "running", Progress(0.45, "optimize", "0.0114"), 20.0)
+    running = TrainingJob(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
 
         def asked(job: TrainingJob, x: float, y: float) -> tuple[str, ...]:

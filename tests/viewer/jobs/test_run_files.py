@@ -58,15 +58,15 @@ def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Pa
         b"",
         b'{"scene": "a.ply", "na',
         b"\xff\xfe{}",
-        b'{"doing": "\xff", "done": 1, "total": 2}',
+        b'{"label": "\xff", "share": 0.5}',
         b'{"scene": "\xff", "name": "", "region": "", "editor": "", "quick": true}',
         b"[" * 100_000,
         b'{"a":' * 100_000,
         b"1" * 5000,
         b"null",
-        b'{"doing": 1, "done": 1e400, "total": "x"}',
-        b'{"doing": "edit", "done": 1, "total": 2, "seconds": -1}',
-        b'{"scene": "\\ud800", "doing": "\\ud800", "done": 1, "total": 2}',
+        b'{"label": 1, "share": 1e400}',
+        b'{"label": "Training", "share": 0.5, "seconds": -1}',
+        b'{"scene": "\\ud800", "label": "\\ud800", "share": 1.5}',
         b" " * (1 << 21),
         None,
     ],
@@ -153,8 +153,10 @@ def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_pa
         advance(10, "loss to the edit 0.5")
     log.close()
     told = run_files.read_progress(asked, Progress())
-    assert told.loss == "0.5"
+    assert (told.share, told.label, told.loss) == (0.64, "Training", "0.5")
     assert told.seconds > 0.0, "for the question whether to discard it"
+    later = Progress(0.9, "Packing", "", 1e6)
+    assert run_files.read_progress(asked, later) == Progress(0.9, "Training", "0.5", 1e6), "never back"
     members = torch.tensor([1, 5])
     region = Region("blue", members, torch.zeros(len(scene)).index_fill(0, members, 1.0))
     folder.state.save("region", {"members": region.members, "score": region.score}, {"name": "blue"})

@@ -5,25 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from viewer.jobs.training_job import EditOrder, Progress, TrainingJob, duration, progress_of
+from viewer.jobs.training_job import EditOrder, Progress, TrainingJob, duration
 
 JOB = TrainingJob(1, EditOrder(Path("a.ply"), Path("out"), "a", "all", "night"), "running")
-
-
-def test_progress_never_goes_back_whatever_part_comes_next() -> None:
-    parts = [("edit", 3, 10), ("edit", 10, 10), ("optimize", 1, 100), ("even the slider", 9, 9), ("?", 1, 2)]
-    found, shares = Progress(), []
-    for doing, done, total in parts:
-        found = progress_of(doing, done, total, "", found)
-        shares.append(found.share)
-    assert shares == sorted(shares)
-    assert 0.0 < shares[0] < shares[-1] < 1.0
-
-
-def test_the_loss_stays_on_the_card_once_it_is_known() -> None:
-    found = progress_of("optimize", 3, 10, "loss to the edit 0.0123", Progress())
-    assert found.loss == "0.0123"
-    assert progress_of("fit the field", 1, 2, "", found).loss == "0.0123"
 
 
 def test_time_left_is_told_once_something_is_done() -> None:

@@ -92,7 +92,7 @@ def wait(queue: TrainingQueue, until: str = "") -> list[TrainingJob]:
     ended, begun = [], time.monotonic()
     while queue.busy and time.monotonic() - begun < PATIENCE_S:
         ended += queue.poll()
-        if until and any(job.progress.doing == until for job in queue.jobs):
+        if until and any(job.progress.label == until for job in queue.jobs):
             break
         time.sleep(0.05)
     return ended
@@ -122,7 +122,7 @@ def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: 
 def test_a_run_that_is_stopped_goes_on_another_day(scene: Path) -> None:
     queue = TrainingQueue()
     number = queue.add(order(scene, "blue"))
-    wait(queue, until="edit")
+    wait(queue, until="Editing views")
     queue.stop(number)
     (stopped,) = wait(queue)
     queue.close()
