@@ -19,7 +19,7 @@ from progdf.io.atomic import atomic_write
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.io.session import SUFFIX
 from progdf.io.user_folders import pictures_folder
-from viewer.jobs.run_files import takes_files
+from viewer.jobs.training import takes_files
 from viewer.state.view_state import ViewState
 
 from . import timeline_file

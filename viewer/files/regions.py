@@ -17,7 +17,7 @@ import numpy as np
 
 from progdf.errors import ProgdfError
 from progdf.io.npy import save_npy
-from viewer.jobs.run_files import edits_folder
+from viewer.jobs.training import edits_folder
 from viewer.state import selection
 from viewer.state.selection import SUFFIX, NamedRegion, SelectionState, unpack
 

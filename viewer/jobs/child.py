@@ -16,8 +16,11 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
+
+from msgspec import Meta
 
 GRACE_S = 8.0
 """After which a child that was asked to stop is killed: it may be saving its state."""
@@ -30,6 +33,16 @@ STARVED_S = 5.0
 """Between two looks at whether a child gets the processor."""
 
 _TALKS = "--talks"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a command is; the trainer writes it to RUN/state/progress.json."""
+
+    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # of its whole time
+    label: str = ""  # what it does, "" while it starts
+    loss: str = ""  # of the training, "" where there is none
+    seconds: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0  # that were spent on a run, in all its sessions
 
 
 class Child:

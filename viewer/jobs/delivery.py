@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import re
-import tempfile
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar
 
-from .child import Child, last_line
+from .child import Progress, last_line
 
-Status = Literal["running", "stopping", "failed", "done", "stopped"]
 FORMATS = (".mp4", ".gif", "")
 """Of films: two kinds of files, and a folder of frames."""
 FORMAT_NAMES = ("MP4", "GIF", "PNG frames")
@@ -23,142 +19,58 @@ FPS = (12, 24, 25, 30, 60)
 
 @dataclass(frozen=True)
 class DeliverOptions:
-    """What a picture or a film is asked for.
+    """What a picture or a film is asked for."""
 
-    Args:
-        width, height: pixels
-        alpha: the background is transparent
-        fps: frames a second
-        seconds: of a film that moves a slider there and back
-        format: of `FORMATS`
-        moves: "timeline", or the name of the layer whose slider moves
-        can_move: what there is to choose from
-    """
-
-    width: int = 1920
+    width: int = 1920  # pixels
     height: int = 1080
-    alpha: bool = False
-    fps: int = 24
-    seconds: float = 4.0
-    format: str = ".mp4"
-    moves: str = ""
-    can_move: tuple[str, ...] = ()
+    alpha: bool = False  # the background is transparent
+    fps: int = 24  # frames a second
+    seconds: float = 4.0  # of a film that moves a slider there and back
+    format: str = ".mp4"  # of `FORMATS`
+    moves: str = ""  # "timeline", or the name of the layer whose slider moves
+    can_move: tuple[str, ...] = ()  # what there is to choose from
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """One of them, as the panel shows it.
+    """A command that writes a file or a folder; stopped, it leaves nothing."""
 
-    Args:
-        number: what it is called by
-        title: what it is
-        out: the file or folder
-        status: where it stands
-        done, total: frames; 0 of 0 while nothing is known
-        note: what the command said last
-        seconds: that it has run, whole ones
-        error: the one line of a failure
-        starved: other programs keep the processor
-        scene: the file that it is made from
-        elsewhere: the name of that where another scene is open, else ""
-    """
-
-    number: int
-    title: str
+    name: str  # of its card
     out: Path
-    status: Status = "running"
-    done: int = 0
-    total: int = 0
-    note: str = ""
-    seconds: int = 0
-    error: str = ""
-    starved: bool = False
-    scene: Path | None = None
-    elsewhere: str = ""
+    words: tuple[str, ...]  # after `progdf`
+    log: Path  # what it prints
+    scene: Path  # the file that it is made from
+
+    is_begun: ClassVar[bool] = False
+    is_locked: ClassVar[bool] = False
 
     @property
-    def seconds_left(self) -> float | None:
-        """By how long the rest should take."""
-        if self.status != "running" or self.done < 2 or not self.total:
-            return None
-        return self.seconds * (self.total - self.done) / self.done
+    def result(self) -> Path:
+        """What is there once it is done."""
+        return self.out
 
+    def arguments(self, resumes: bool) -> tuple[str, ...]:
+        """Words after `progdf`."""
+        return self.words
 
-class Deliveries:
-    """Children that write what is delivered. `close` it with the window."""
+    def read_progress(self, before: Progress) -> Progress:
+        """How far it is, by the line that it printed last."""
+        line = last_line(self.log)
+        frames = re.search(r"frame (\d+)/(\d+)", line)
+        if frames is None:
+            return Progress(before.share, line)
+        return Progress(int(frames[1]) / int(frames[2]), f"frame {frames[1]} of {frames[2]}")
 
-    def __init__(self) -> None:
-        self.shown: tuple[Delivery, ...] = ()
-        self._numbers = itertools.count(1)
-        self._children: dict[int, Child] = {}
-        self._began: dict[int, float] = {}
-        self._folder = tempfile.TemporaryDirectory(prefix="progdf-deliver-")
+    def lock(self) -> AbstractContextManager[None]:
+        """Nothing: each is one window's own."""
+        return nullcontext()
 
-    @property
-    def folder(self) -> Path:
-        """For files that commands read."""
-        return Path(self._folder.name)
+    def save(self) -> None:
+        """Nothing: it does not go on another day."""
 
-    def start(self, title: str, out: Path, arguments: Sequence[str], scene: Path | None) -> None:
-        """Run a command that writes `out` from a scene.
+    def discard(self) -> None:
+        """Nothing: the command writes all or none."""
 
-        Raises:
-            OSError: it cannot be started.
-        """
-        number = next(self._numbers)
-        self._children[number] = Child(arguments, self.folder / f"{number}.log")
-        self._began[number] = time.monotonic()
-        self.shown = (*self.shown, Delivery(number, title, out, scene=scene))
-
-    def stop(self, number: int) -> None:
-        """Stop one, or take one that failed off the list."""
-        delivery = next((shown for shown in self.shown if shown.number == number), None)
-        if delivery is not None and number in self._children:
-            self._children[number].stop()
-            self._change(replace(delivery, status="stopping"))
-        else:
-            self.shown = tuple(shown for shown in self.shown if shown.number != number)
-
-    def poll(self) -> list[Delivery]:
-        """Look at the children; those that have just ended, well or not."""
-        ended = []
-        for delivery in self.shown:
-            child = self._children.get(delivery.number)
-            if child is None:
-                continue
-            status = child.status
-            if status is None:
-                seconds = int(time.monotonic() - self._began[delivery.number])
-                if seconds != delivery.seconds:  # each look is a frame of the window
-                    note = last_line(child.log)
-                    found = re.search(r"frame (\d+)/(\d+)", note)
-                    done, total = (int(found[1]), int(found[2])) if found else (0, 0)
-                    seen = replace(delivery, done=done, total=total, note=note, seconds=seconds)
-                    self._change(replace(seen, starved=child.starved))
-                continue
-            self._children.pop(delivery.number).close()
-            if status and delivery.status != "stopping":
-                failed = replace(delivery, status="failed", error=child.error() or f"status {status}")
-                ended.append(self._change(failed))
-                continue
-            self.shown = tuple(shown for shown in self.shown if shown.number != delivery.number)
-            ended.append(replace(delivery, status="stopped" if status else "done"))
-        return ended
-
-    @property
-    def busy(self) -> bool:
-        """Whether something is being written."""
-        return bool(self._children)
-
-    def close(self) -> None:
-        """Stop all of it; what is not whole is not kept."""
-        for child in self._children.values():
-            child.stop()
-        for child in self._children.values():
-            child.close()
-        self._children.clear()
-        self._folder.cleanup()
-
-    def _change(self, delivery: Delivery) -> Delivery:
-        self.shown = tuple(delivery if old.number == delivery.number else old for old in self.shown)
-        return delivery
+    def warning(self) -> str:
+        """No warning."""
+        return ""
