@@ -69,7 +69,7 @@ class RunLog:
         self.seconds: dict[str, float] = {}
         self.refits = refits
         self._earlier = 0.0
-        self._progress, self._written = progress, 0.0
+        self._progress, self._written, self._share = progress, 0.0, 0.0
         self._running: dict[str, float] = {}
         self.memory = PeakMemory()
         self._start = time.perf_counter()
@@ -181,8 +181,9 @@ class RunLog:
             return
         self._written = now
         label, begin, end = STAGES[what]
+        self._share = max(self._share, begin + (end - begin) * min(done / max(total, 1), 1.0))
         state = {
-            "share": begin + (end - begin) * min(done / max(total, 1), 1.0),
+            "share": self._share,
             "label": label,
             # that of a field is on another scale
             "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",

@@ -337,8 +337,8 @@ def _read_weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
 def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
     """Name, kind and number of `NAME:KIND=G`."""
     kinds = stacks.SLIDERS[1:]
-    left, equals, number = text.rpartition("=")
-    name, colon, kind = left.rpartition(":")
+    layer, equals, number = text.rpartition("=")
+    name, colon, kind = layer.rpartition(":")
     if not equals or not colon or not name:
         example = gdfs[0].name if gdfs else "NAME"
         raise ProgdfError(f"--gain {text} is not a gain; write NAME:KIND=G, for example {example}:color=0.5")

@@ -135,15 +135,15 @@ def render(argv: Sequence[str]) -> int:
     with _engine(scene, gdfs, options) as engine:
         if swept:
             _render_film(options, swept, view, camera, engine)
-            told = ""
+            comparison = ""
         else:
-            told = _render_still(options, opened, view, camera, engine)
+            comparison = _render_still(options, opened, view, camera, engine)
         drawn_by = engine.draws_with
     each = "each " if options.sheet is not None else ""
     strengths = "" if swept else f": {describe_strengths(view)}"
     print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by}){strengths}")
-    if told:
-        print_line(told)
+    if comparison:
+        print_line(comparison)
     if (
         options.viewpoint.camera is None
         and saved is None
@@ -163,8 +163,8 @@ def _render_film(
 ) -> None:
     """An animation of one slider, or a contact sheet of one or two."""
 
-    def picture(wanted: ViewState) -> film.Pixels:
-        return film.to_pixels(engine.image(wanted, camera=camera))
+    def picture(state: ViewState) -> film.Pixels:
+        return film.to_pixels(engine.image(state, camera=camera))
 
     with atomic_write(options.out) as temporary_file:
         if options.sweep is not None:

@@ -25,21 +25,13 @@ from viewer.state.workspace import SceneFacts
 
 @dataclass(frozen=True)
 class Document:
-    """The scene and its edits, in the order of `LayerState.gdf`.
+    """The scene and its edits, in the order of `LayerState.gdf`."""
 
-    Args:
-        title: the scene's name; "" where nothing is open
-        scene: the original
-        gdfs: its edits
-        path: the scene's file; None where there is none, and so no session can be saved
-        gdf_paths: the edits' files, one for each where there are any
-    """
-
-    title: str
-    scene: Gaussians
-    gdfs: tuple[Gdf, ...] = ()
-    path: Path | None = None
-    gdf_paths: tuple[Path, ...] = ()
+    title: str  # the scene's name; "" where nothing is open
+    scene: Gaussians  # the original
+    gdfs: tuple[Gdf, ...] = ()  # its edits
+    path: Path | None = None  # the scene's file; None where there is none, and so no session can be saved
+    gdf_paths: tuple[Path, ...] = ()  # the edits' files, one for each where there are any
 
     @cached_property
     def found_up(self) -> SceneUp:
@@ -80,11 +72,11 @@ class Document:
 
 def _once(make: Callable[[], Neighborhood]) -> Callable[[], Neighborhood]:
     """Made when it is first asked for, by whichever thread; another one that asks meanwhile waits."""
-    lock, kept = threading.Lock(), cache(make)
+    lock, neighborhood = threading.Lock(), cache(make)
 
     def ask() -> Neighborhood:
         with lock:
-            return kept()
+            return neighborhood()
 
     return ask
 

@@ -79,16 +79,16 @@ class Child:
                 nice = os.getpriority(os.PRIO_PROCESS, 0) + NICE
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
         self.log = log
-        self._asked_at: float | None = None
+        self._stopped_at: float | None = None
         self._starved, self._seen = False, (time.monotonic(), 0.0, 0.0)
 
     @property
     def status(self) -> int | None:
         """The exit status; None while it runs. One that will not stop is killed."""
-        found = self._process.poll()
-        if found is None and self._asked_at is not None and time.monotonic() - self._asked_at > GRACE_S:
+        status = self._process.poll()
+        if status is None and self._stopped_at is not None and time.monotonic() - self._stopped_at > GRACE_S:
             self.kill()
-        return found
+        return status
 
     @property
     def pid(self) -> int:
@@ -134,8 +134,8 @@ class Child:
 
     def stop(self) -> None:
         """Ask it to stop: it saves what it has done."""
-        if self._asked_at is None:
-            self._asked_at = time.monotonic()
+        if self._stopped_at is None:
+            self._stopped_at = time.monotonic()
             if self._process.stdin is not None:
                 with contextlib.suppress(OSError):
                     self._process.stdin.close()

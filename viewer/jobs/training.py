@@ -171,8 +171,8 @@ def with_editor(form: NewEdit, editor: int) -> NewEdit:
 
 def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
     """The form with a picture that was changed; beside those that it has where this is a further one."""
-    kept = [name.strip() for name in form.pictures.split(",") if name.strip()]
-    known = kept if further and form.choice.kind == "pictures" else []
+    names = [name.strip() for name in form.pictures.split(",") if name.strip()]
+    known = names if further and form.choice.kind == "pictures" else []
     names = [*(name for name in known if name != str(path)), str(path)]
     pictures = next(i for i, choice in enumerate(EDITORS) if choice.kind == "pictures")
     region = form.region if known else CHANGED

@@ -30,6 +30,7 @@ def test_the_progress_file_says_how_far_the_whole_run_is(tmp_path: Path) -> None
         ("edit", 3, ""),
         ("optimize", 10, "loss to the edit 0.0123"),
         ("field", 10, "loss 1"),
+        ("even the slider", 5, "strengths"),
     ):
         with log.steps(stage, 10) as advance:
             log._written = 0.0  # each is written
@@ -40,4 +41,5 @@ def test_the_progress_file_says_how_far_the_whole_run_is(tmp_path: Path) -> None
         ("Editing views", 0.17, ""),
         ("Training", 0.64, "0.0123"),
         ("Packing", 0.82, ""),
-    ]
+        ("Evening the slider", 0.82, ""),
+    ], "it never goes back"

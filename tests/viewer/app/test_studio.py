@@ -15,8 +15,8 @@ from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import first_camera
-from viewer.files import small_pictures
 from viewer.files.document import empty
+from viewer.files.user_files import load_thumbnail
 from viewer.jobs import job_queue
 from viewer.jobs.training import SELECTION, TYPED
 from viewer.state import selection
@@ -265,7 +265,7 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
         assert app.main_view.work.view.camera.distance == first_camera(app.document.scene).distance
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
-    assert small_pictures.load(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
+    assert load_thumbnail(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
 
 
 def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(

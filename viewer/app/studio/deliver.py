@@ -11,7 +11,7 @@ from progdf.errors import ProgdfError
 from viewer.app.application import Application, failure_line
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
-from viewer.files.typed_paths import parse_path
+from viewer.files.user_files import parse_path
 from viewer.jobs.delivery import DeliverOptions, Delivery
 from viewer.jobs.job_queue import JobQueue
 from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState

@@ -15,7 +15,7 @@ from progdf.scene import known_ups
 from progdf.scene.up_axis import direction_name
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import first_camera
-from viewer.files import small_pictures
+from viewer.files.user_files import THUMBNAIL_SIZE, keep_thumbnail, load_thumbnail
 from viewer.gl.present import picture_texture
 from viewer.jobs.delivery import Delivery
 from viewer.jobs.job_queue import JobQueue
@@ -37,7 +37,7 @@ class StartActions:
         app: the window
         context: the GL context
         queue: runs the demo's command
-        memory: folder of the program's state; the user's own if None
+        memory: folder of the program's state; the user's path if None
     """
 
     def __init__(
@@ -66,11 +66,11 @@ class StartActions:
         if self._demo is None:
             return None
         scene = self._demo / "scene.ply"
-        own = self._app.document.path
-        if own is not None and own.resolve() != scene.resolve():
+        path = self._app.document.path
+        if path is not None and path.resolve() != scene.resolve():
             self._demo = None  # the person went on to something else
             return None
-        if own is None and scene.is_file():
+        if path is None and scene.is_file():
             self._app.open(scene)
             main_view = self._app.main_view
             view = replace(main_view.work.view, background=SKY)
@@ -91,11 +91,11 @@ class StartActions:
             return
         try:
             seen = ViewState(view.camera, view.layers, view.blend, view.background, compare=Comparison())
-            pixels = to_pixels(engine.image(seen, small_pictures.SIZE))
+            pixels = to_pixels(engine.image(seen, THUMBNAIL_SIZE))
         except ProgdfError:
             return
         for path in known:
-            small_pictures.keep(path, pixels, self._memory)
+            keep_thumbnail(path, pixels, self._memory)
 
     def close(self) -> None:
         """Give back the pictures."""
@@ -116,15 +116,15 @@ class StartActions:
         main_view = self._app.main_view
         if not main_view.at_start:
             return
-        shown = tuple(RecentFile(path, self._texture(path)) for path in main_view.recent)
-        if shown != main_view.recent_files:
-            main_view.recent_files = shown
+        files = tuple(RecentFile(path, self._texture(path)) for path in main_view.recent)
+        if files != main_view.recent_files:
+            main_view.recent_files = files
             main_view.wake()
 
     def _texture(self, path: Path) -> int:
         if path not in self._textures:
             self._textures[path] = None
-            pixels = small_pictures.load(path, self._memory)
+            pixels = load_thumbnail(path, self._memory)
             if pixels is not None:
                 self._textures[path] = picture_texture(self._context, pixels)
         texture = self._textures[path]
@@ -185,8 +185,7 @@ class UpActions:
             self._looked, self._path = True, document.path
             if document.path is None or session is not None:
                 return None
-            found = document.found_up
-            if found.certain or up != found.direction:
+            if document.found_up.certain or up != document.found_up.direction:
                 return None  # it tells, or somebody said
             main_view.up_strip = self._question()
         elif up != before:

@@ -13,7 +13,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.atomic import make_folder
 from progdf.scene.region_spec import check_region
 from viewer.app.application import Application, failure_line
-from viewer.files import regions
+from viewer.files import exports
 from viewer.files.document import Document
 from viewer.jobs import training
 from viewer.jobs.delivery import Delivery
@@ -153,7 +153,7 @@ class JobActions:
         members = selection.members if region is None else region.members
         make_folder(folder)
         path = folder / f"{name}{SUFFIX}"
-        regions.write(NamedRegion(name, path, members, selection.count), total)
+        exports.write_region(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
     def _try(self, act: Callable[[], None]) -> None:
