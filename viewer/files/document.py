@@ -64,10 +64,7 @@ class Document:
 
     def free_name(self, name: str) -> str:
         """An edit's name, with a number where another edit has it."""
-        taken, free, number = {gdf.name for gdf in self.gdfs}, name, 2
-        while free in taken:
-            free, number = f"{name}-{number}", number + 1
-        return free
+        return _free_name(name, self.gdfs)
 
 
 def _once(make: Callable[[], Neighborhood]) -> Callable[[], Neighborhood]:
@@ -118,9 +115,11 @@ def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tup
     for path in paths:
         with all_threads():
             gdf = load_gdf(path, scene, scene_path.name)
-        taken = {other.name for other in gdfs}
-        name, number = gdf.name, 2
-        while name in taken:
-            name, number = f"{gdf.name}-{number}", number + 1
-        gdfs.append(replace(gdf, name=name))
+        gdfs.append(replace(gdf, name=_free_name(gdf.name, gdfs)))
     return tuple(gdfs)
+
+
+def _free_name(name: str, gdfs: Sequence[Gdf]) -> str:
+    taken = {gdf.name for gdf in gdfs}
+    names = (name, *(f"{name}-{number}" for number in range(2, len(taken) + 2)))
+    return next(free for free in names if free not in taken)

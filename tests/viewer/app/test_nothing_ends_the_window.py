@@ -184,7 +184,7 @@ def test_what_the_person_can_mend_is_one_line_without_a_log(
             "a.ply cannot be read or written: No space left on device",
         ),
     ):
-        monkeypatch.setattr(window.training, "poll", raises(error))
+        monkeypatch.setattr(window.jobs, "poll", raises(error))
         turns(window)
         assert (message(window).text, message(window).details) == (line, "")
     assert not (tmp_path / "memory" / LOG).exists()

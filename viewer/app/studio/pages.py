@@ -61,7 +61,8 @@ def draw_start_page(recent: Sequence[RecentFile], ui: UiContext) -> list[str]:
     imgui.pop_style_var()
     wide = min(WIDEST_PX * scale, display.x - 2 * MARGIN_PX * scale)
     cards = max(int((wide + GAP_PX * scale) // ((CARD_PX + GAP_PX) * scale)), 1)
-    tall = (96.0 + DROP_PX + GAP_PX) * scale + (_rows(recent, cards) * _card_height(ui) + 30.0 * scale)
+    rows = -(-len(recent) // cards)
+    tall = (126.0 + DROP_PX + GAP_PX + rows * (0.75 * CARD_PX + 46.0 + ROW_GAP_PX)) * scale
     left = (display.x - wide) / 2
     imgui.set_cursor_pos(imgui.ImVec2(left, max((display.y - tall) / 2.6, MARGIN_PX * scale)))
     imgui.begin_child("middle", imgui.ImVec2(wide, 0.0))
@@ -128,8 +129,7 @@ def _card(file: RecentFile, ui: UiContext) -> bool:
         canvas.add_text(middle, u32(PALETTE.field_hovered), Icon.PICTURE)
     if hovered:
         canvas.add_rect(at, end, u32(PALETTE.accent), rounding, 2.0 * ui.scale)
-    name = file.path.name.removesuffix(SUFFIX) if file.path.name.endswith(SUFFIX) else file.path.name
-    imgui.text(elide(escape_text(name), wide))
+    imgui.text(elide(escape_text(file.path.name.removesuffix(SUFFIX)), wide))
     imgui.push_font(None, SMALL_PX)
     imgui.text_disabled(elide(escape_text(_folder(file.path)), wide))
     imgui.pop_font()
@@ -154,28 +154,17 @@ def _drop_target(wide: float, ui: UiContext) -> None:
     imgui.dummy(imgui.ImVec2(wide, tall))
     x, y, wide, tall = x + scale, y + scale, wide - 2 * scale, tall - 2 * scale
     canvas, ink = imgui.get_window_draw_list(), u32(PALETTE.field_hovered)
-    sides = ((y, wide, True), (y + tall, wide, True), (x, tall, False), (x + wide, tall, False))
-    for start, length, along_x in sides:
+    sides = ((x, y, wide, 1, 0), (x, y + tall, wide, 1, 0), (x, y, tall, 0, 1), (x + wide, y, tall, 0, 1))
+    for left, top, length, dx, dy in sides:
         for i in range(int(length / (2 * dash)) + 1):
             low, high = 2 * i * dash, min((2 * i + 1) * dash, length)
-            ends = (
-                (imgui.ImVec2(x + low, start), imgui.ImVec2(x + high, start))
-                if along_x
-                else (imgui.ImVec2(start, y + low), imgui.ImVec2(start, y + high))
-            )
-            canvas.add_line(*ends, ink, 1.5 * scale)
+            begin = imgui.ImVec2(left + dx * low, top + dy * low)
+            end = imgui.ImVec2(left + dx * high, top + dy * high)
+            canvas.add_line(begin, end, ink, 1.5 * scale)
     text = "Drop a scene or a session anywhere in this window"
     size = imgui.calc_text_size(text)
     at = imgui.ImVec2(round(x + (wide - size.x) / 2), round(y + (tall - size.y) / 2))
     canvas.add_text(at, u32(PALETTE.dim), text)
-
-
-def _rows(recent: Sequence[RecentFile], cards: int) -> int:
-    return -(-len(recent) // cards)
-
-
-def _card_height(ui: UiContext) -> float:
-    return (0.75 * CARD_PX + 46.0 + ROW_GAP_PX) * ui.scale
 
 
 UP_SIZE = (160, 120)
@@ -308,7 +297,10 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
         return path, options if pressed is None else replace(options, alpha=pressed == 1)
     label("Moves", column)
     imgui.set_next_item_width(-1.0)
-    titles, now = [_moves(name) for name in options.can_move], options.can_move.index(options.moves)
+    titles = [f"The slider of {name}, there and back" for name in options.can_move]
+    if options.can_move[0] == "timeline":
+        titles[0] = "The timeline"
+    now = options.can_move.index(options.moves)
     pressed = drop_down("##moves", titles[now], titles, now, ui, "What moves in the film")
     options = options if pressed is None else replace(options, moves=options.can_move[pressed])
     label("Format", column)
@@ -348,7 +340,3 @@ def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> Deliv
     )
     width, height = size if pressed is None else SIZES[pressed]
     return replace(options, width=width, height=height)
-
-
-def _moves(name: str) -> str:
-    return "The timeline" if name == "timeline" else f"The slider of {name}, there and back"

@@ -37,7 +37,7 @@ class StartActions:
         app: the window
         context: the GL context
         queue: runs the demo's command
-        memory: folder of the program's state; the user's path if None
+        memory: folder of the program's state; the user's own if None
     """
 
     def __init__(
@@ -66,11 +66,11 @@ class StartActions:
         if self._demo is None:
             return None
         scene = self._demo / "scene.ply"
-        path = self._app.document.path
-        if path is not None and path.resolve() != scene.resolve():
+        opened = self._app.document.path
+        if opened is not None and opened.resolve() != scene:
             self._demo = None  # the person went on to something else
             return None
-        if path is None and scene.is_file():
+        if opened is None and scene.is_file():
             self._app.open(scene)
             main_view = self._app.main_view
             view = replace(main_view.work.view, background=SKY)
