@@ -15,8 +15,7 @@ from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
 from viewer.camera.named_views import Glide, glide_on
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
-from viewer.jobs.delivery import DeliverOptions
-from viewer.jobs.job_queue import Job
+from viewer.jobs.job_queue import DeliverOptions, Job
 from viewer.jobs.training import NewEdit
 
 from . import history, playback, timeline

@@ -14,8 +14,7 @@ from viewer.app.main_view import MainView
 from viewer.app.studio.pages import RecentFile
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
-from viewer.jobs.delivery import DeliverOptions, Delivery
-from viewer.jobs.job_queue import Job
+from viewer.jobs.job_queue import DeliverOptions, Delivery, Job
 from viewer.jobs.training import TYPED, EditOrder, NewEdit
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context

@@ -18,8 +18,7 @@ from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
 from viewer.jobs import child, job_queue, training
 from viewer.jobs.child import Progress
-from viewer.jobs.delivery import Delivery
-from viewer.jobs.job_queue import LOOK_S, Job, JobQueue
+from viewer.jobs.job_queue import LOOK_S, Delivery, Job, JobQueue
 from viewer.jobs.training import EditOrder, duration
 
 PATIENCE_S = 600.0

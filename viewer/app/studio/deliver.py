@@ -12,8 +12,7 @@ from viewer.app.application import Application, failure_line
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.files.user_files import parse_path
-from viewer.jobs.delivery import DeliverOptions, Delivery
-from viewer.jobs.job_queue import JobQueue
+from viewer.jobs.job_queue import DeliverOptions, Delivery, JobQueue
 from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
 from viewer.state.workspace import Dialog
 

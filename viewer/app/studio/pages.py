@@ -12,7 +12,7 @@ from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import ViewCamera
-from viewer.jobs.delivery import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions
+from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32

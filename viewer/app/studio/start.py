@@ -17,8 +17,7 @@ from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import first_camera
 from viewer.files.user_files import THUMBNAIL_SIZE, keep_thumbnail, load_thumbnail
 from viewer.gl.present import picture_texture
-from viewer.jobs.delivery import Delivery
-from viewer.jobs.job_queue import JobQueue
+from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
 from viewer.state import history, workspace

@@ -16,8 +16,7 @@ from viewer.app.application import Application, failure_line
 from viewer.files import exports
 from viewer.files.document import Document
 from viewer.jobs import training
-from viewer.jobs.delivery import Delivery
-from viewer.jobs.job_queue import Job, JobQueue
+from viewer.jobs.job_queue import Delivery, Job, JobQueue
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
 from viewer.state.selection import NOBODY, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
