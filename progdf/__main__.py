@@ -29,11 +29,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
     "evaluate": ("trainer.cli:evaluate", "measure a run as papers do, or sliders against known courses"),
-    "view": ("viewer.commands.cli:view", "open the window: splats, layers, sliders"),
+    "view": ("viewer.commands.render:view", "open the window: splats, layers, sliders"),
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
     "edit": ("progdf.cli.edit:main", "write a scene again without strays"),
-    "export": ("viewer.commands.cli:export", "write the edited scene as a 3DGS .ply file"),
+    "export": ("viewer.commands.render:export", "write the edited scene as a 3DGS .ply file"),
     "check": (
         "progdf.cli.check:main",
         "report what a scene holds, what had to be repaired and what is stray",

@@ -319,7 +319,7 @@ for package in (progdf, trainer):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
 found["windows"] = sorted({{name.split(".")[0] for name in sys.modules}} & {FORBIDDEN["trainer"]!r})
-import viewer.commands.cli
+import viewer.commands.render
 found["interfaces"] = [name for name in sys.modules if "imgui" in name or name == "glfw"]
 print(json.dumps(found))
 """

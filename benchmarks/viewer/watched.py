@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from viewer.commands.cli import view
+from viewer.commands.render import view
 
 
 def main(arguments: list[str]) -> int:

@@ -101,7 +101,7 @@ def _edit_lines(path: Path) -> Iterator[str]:
 
 
 def _session_lines(path: Path) -> Iterator[str]:
-    session = session_file.read_session(path)
+    session = session_file.read_session(path, session_file.SessionFile)
     yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
     for what, ref in (("scene", session.scene), *(("edit", edit) for edit in session.edits)):
         file = ref.path(path.resolve().parent)

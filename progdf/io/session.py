@@ -21,7 +21,7 @@ import os
 import re
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -73,6 +73,9 @@ class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     snapshots: tuple[dict[str, Any], ...] = ()
 
 
+File = TypeVar("File", bound=SessionFile)
+
+
 def relative_name(path: Path, folder: Path) -> str:
     """A file as a session in `folder` names it: with forward slashes, absolute where the two share no drive.
 
@@ -113,8 +116,8 @@ def write_session(path: Path, session: SessionFile) -> None:
         temporary_file.write_text(text + "\n", encoding="utf-8")
 
 
-def read_session(path: str | os.PathLike[str]) -> SessionFile:
-    """Read it; the files it names are not touched, see `verify_files`.
+def read_session(path: str | os.PathLike[str], kind: type[File]) -> File:
+    """Read it, its state as `kind` has it; the files it names are not touched, see `verify_files`.
 
     Raises:
         ProgdfError: it cannot be read, is no session, of a newer version, or holds what no session holds.
@@ -137,7 +140,7 @@ def read_session(path: str | os.PathLike[str]) -> SessionFile:
             f"{name} is a session of version {version!r:.40}; this progdf reads {VERSION}, update it"
         )
     try:
-        return convert_json(table, SessionFile)
+        return convert_json(table, kind, closed=True)
     except ValueError as error:
         raise ProgdfError(f"{name} is a damaged session ({error}); save it again or update progdf") from None
 

@@ -11,9 +11,9 @@ from progdf.formats.ply import save_ply
 from tests.helpers.demo_scenes import bear
 from viewer.files import document, session
 from viewer.files.session import WindowSession
-from viewer.jobs import run_files
-from viewer.jobs.training_job import EditOrder
-from viewer.jobs.training_queue import TrainingQueue
+from viewer.jobs import training
+from viewer.jobs.job_queue import JobQueue
+from viewer.jobs.training import EditOrder
 from viewer.state.view_state import LayerState, ViewState
 
 EARS = "sphere:0,1.9,0,0.6"
@@ -49,30 +49,30 @@ def commands() -> None:
 
 def jobs() -> None:
     def order(name: str) -> EditOrder:
-        out = run_files.free_run(run_files.edits_folder(Path("bear.ply")), name)
+        out = training.free_run(training.edits_folder(Path("bear.ply")), name)
         return EditOrder(Path("bear.ply"), out, name, EARS, "tint:#3060d0", quick=True, threads=1)
 
     def wait(until: str = "") -> str:
         """What became of the job, or that it does `until`."""
-        while queue.busy:
+        while queue.busy():
             for ended in queue.poll():
                 return ended.status + ended.error
-            if until and any(job.progress.doing == until for job in queue.jobs):
+            if until and any(job.progress.label == until for job in queue.jobs):
                 break
             time.sleep(0.05)
         return until
 
-    queue = TrainingQueue()
+    queue = JobQueue()
     number = queue.add(order("blue"))
-    assert wait("optimize") == "optimize"
+    assert wait("Training") == "Training"
     queue.stop(number)
     assert (said := wait()) == "stopped", said
     queue.resume(number)
     assert (said := wait()) == "done", said
     queue.add(order("red"))
-    assert wait("optimize") == "optimize"
-    assert queue._child is not None
-    queue._child.kill()
+    assert wait("Training") == "Training"
+    (child,) = queue._children.values()
+    child.kill()
     assert wait().startswith("failed")
     queue.close()
 

@@ -40,7 +40,7 @@ from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.sessions import bear_files, saved_session
 from tests.helpers.stacks import recording_of
 from trainer.store.state import StateFolder
-from viewer.files import regions, session, timeline_file
+from viewer.files import exports, session, timeline_file
 from viewer.state.selection import SelectionState, add_region, select
 
 SECONDS, BYTES = 10, 1 << 30
@@ -71,8 +71,8 @@ def use_session(path: Path) -> None:
     opened = session.open_session(path, path.parents[1] / "memory")
     state, total = opened.view.selection, len(opened.document.scene)
     for i, region in enumerate(state.regions):
-        regions.region_file(region, total)
-        state = regions.rename(state, i, f"{region.name} {i}", total)
+        exports.region_file(region, total)
+        state = exports.rename_region(state, i, f"{region.name} {i}", total)
     assert others() == before
 
 

@@ -27,6 +27,22 @@ from .state import Saved
 Advance = Callable[[int, str], None]
 """Steps done so far, and a short word about them (the loss)."""
 
+STAGES = {
+    "edit": ("Editing views", 0.08, 0.38),
+    "even the slider": ("Evening the slider", 0.08, 0.2),
+    "try kinds": ("Choosing what moves", 0.08, 0.2),
+    "move parts": ("Moving parts", 0.38, 0.5),
+    "optimize": ("Training", 0.38, 0.64),
+    "time the slider": ("Timing the slider", 0.64, 0.66),
+    "picture the edit": ("Finishing", 0.66, 0.7),
+    "weigh the members": ("Packing", 0.7, 0.73),
+    "fit the field": ("Packing", 0.73, 0.82),
+    "field": ("Packing", 0.7, 0.82),
+    "measure the edit": ("Measuring", 0.82, 0.96),
+}
+"""The long stages of a run: the label in the window, and the shares of a run's time at which each usually
+begins and ends."""
+
 _EVERY_S = 5.0
 _FILE_EVERY_S = 0.4
 
@@ -41,8 +57,8 @@ class RunLog:
         path: log.txt; what is in it stays
         quiet: the file only
         refits: a later command on a finished run, whose own time counts apart
-        progress: a file for programs that wait for the run: what it does, how many steps of how many are
-            done, the short word, and the run's seconds so far, as JSON, rewritten a few times a second; None
+        progress: a file for programs that wait for the run: the share of its time that has passed, a label of
+            what it does, its loss, and its seconds so far, as JSON, rewritten a few times a second; None
             writes none
     """
 
@@ -52,7 +68,7 @@ class RunLog:
         self.seconds: dict[str, float] = {}
         self.refits = refits
         self._earlier = 0.0
-        self._progress, self._written = progress, 0.0
+        self._progress, self._written, self._share = progress, 0.0, 0.0
         self._running: dict[str, float] = {}
         self.memory = PeakMemory()
         self._start = time.perf_counter()
@@ -107,7 +123,7 @@ class RunLog:
 
     @contextmanager
     def steps(self, what: str, total: int) -> Iterator[Advance]:
-        """A long stage of `total` steps: a bar on a terminal, a line every few seconds elsewhere."""
+        """One of `STAGES` in `total` steps: a bar on a terminal, a line every few seconds elsewhere."""
         if self._bar:
             columns = (
                 SpinnerColumn(),
@@ -163,7 +179,15 @@ class RunLog:
         if self._progress is None or (now - self._written < _FILE_EVERY_S and done < total):
             return
         self._written = now
-        state = {"doing": what, "done": done, "total": total, "note": word, "seconds": self._total()}
+        label, begin, end = STAGES[what]
+        self._share = max(self._share, begin + (end - begin) * min(done / max(total, 1), 1.0))
+        state = {
+            "share": self._share,
+            "label": label,
+            # that of a field is on another scale
+            "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",
+            "seconds": self._total(),
+        }
         with suppress(OSError, ProgdfError), atomic_write(self._progress) as temporary_file:
             temporary_file.write_text(json.dumps(state, ensure_ascii=False), encoding="utf-8")
 

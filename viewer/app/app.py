@@ -23,11 +23,10 @@ from .application import error_details, error_line, log_error
 from .edit_actions import StrayActions
 from .file_actions import FileActions
 from .main_view import MainView
-from .studio.deliver_actions import DeliverActions
-from .studio.preview_actions import PreviewActions
-from .studio.start_actions import StartActions
-from .studio.training_actions import TrainingActions
-from .studio.up_actions import UpActions
+from .studio.deliver import DeliverActions
+from .studio.preview import PreviewActions
+from .studio.start import StartActions, UpActions
+from .studio.training import JobActions
 
 SIZE = (1280, 800)
 SAY_AGAIN_S = 10.0
@@ -104,12 +103,12 @@ class App:
             exports.folder_of(document.path),
         )
         self.file_actions = FileActions(self, session, memory)
-        self.training = TrainingActions(self, memory)
-        self.deliver = DeliverActions(self)
-        self.start = StartActions(self, self.context, self.deliver.deliveries, memory)
+        self.jobs = JobActions(self, memory)
+        self.deliver = DeliverActions(self, self.jobs.queue)
+        self.start = StartActions(self, self.context, self.jobs.queue, memory)
         self.up = UpActions(self, self.context)
         self.preview = PreviewActions(
-            self, self.context, lambda form, folder: self.training.region_spec(form, folder, "preview")
+            self, self.context, lambda form, folder: self.jobs.region_spec(form, folder, "preview")
         )
         self.strays = StrayActions(self)
         self.is_closed = False
@@ -128,7 +127,7 @@ class App:
                 parts.callback(close)
             parts.callback(self.main_view.ui.make_current)
             parts.callback(self.file_actions.release)
-            for part in (self.training, self.strays, self.up, self.preview, self.start, self.deliver):
+            for part in (self.jobs, self.strays, self.up, self.preview, self.start):
                 parts.callback(part.close)
             self._keep_picture()
 
@@ -211,13 +210,13 @@ class App:
     @property
     def _parts(
         self,
-    ) -> tuple[TrainingActions | DeliverActions | StartActions | UpActions | StrayActions, ...]:
-        return self.training, self.deliver, self.start, self.up, self.strays
+    ) -> tuple[JobActions | DeliverActions | StartActions | UpActions | StrayActions, ...]:
+        return self.jobs, self.deliver, self.start, self.up, self.strays
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
         # first: what was chosen, or trained, wakes the main view
-        parts = (self.training, self.preview, self.deliver, self.start, self.strays)
+        parts = (self.jobs, self.preview, self.start, self.strays)
         looks = [self._look(part.poll) for part in parts]
         return (
             self._look(self.file_actions.poll_dialog),
@@ -280,7 +279,7 @@ class App:
         self.main_view.set_engine(engine, facts)
         self.main_view.restart(view, snapshots)
         self.main_view.pictures = exports.folder_of(document.path)
-        for part in (self.training, self.preview, self.up):
+        for part in (self.jobs, self.preview, self.up):
             part.leave_scene()
 
     def _keep_picture(self) -> None:

@@ -18,7 +18,7 @@ from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, section, small, tip, wrapped
 
-from .studio import deliver_fields
+from .studio import pages
 
 WIDTH_PX = 520.0  # at 1×
 _POPUP = "##dialog"
@@ -171,7 +171,7 @@ def _content(
         wrapped(escape_text(dialog.error), PALETTE.error)
     if dialog.options is not None and dialog.kind in ("render_picture", "render_film"):
         kind = dialog.kind.removeprefix("render_")
-        text, options = deliver_fields.draw(kind, dialog.text, dialog.options, ui)
+        text, options = pages.draw_fields(kind, dialog.text, dialog.options, ui)
         dialog = replace(dialog, text=text, options=options)
     if dialog.kind == "open":
         chosen = _recent(recent, bottom, "Down" in pressed, ui)

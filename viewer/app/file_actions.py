@@ -12,12 +12,10 @@ from pathlib import Path
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from viewer.camera.view_camera import first_camera
-from viewer.files import autosave as autosaves
 from viewer.files import document as documents
-from viewer.files import recent, regions, session
-from viewer.files.autosave import SessionAutosave
-from viewer.files.session import WindowSession
-from viewer.files.typed_paths import parse_path, session_file
+from viewer.files import exports, session
+from viewer.files.session import SessionAutosave, WindowSession, session_file
+from viewer.files.user_files import parse_path, read_recent, remember_recent
 from viewer.state import workspace
 from viewer.state.view_state import on_another_scene
 from viewer.state.workspace import Dialog
@@ -122,7 +120,7 @@ class FileActions:
         self._claim_regions(path)
         self._write(path)
         for region in self._app.main_view.work.view.selection.regions:
-            regions.region_file(region, len(self._app.document.scene))
+            exports.region_file(region, len(self._app.document.scene))
         self.session_autosave.drop()
         self.path = path
         main_view = self._app.main_view
@@ -199,13 +197,13 @@ class FileActions:
         self.session_autosave.drop()
         if opened.warning:
             main_view.show_message(opened.warning, error=True)
-        saved = autosaves.session_of(path)
+        saved = session.session_of(path)
         if saved is None:
             self.path = path
             self.offer_autosave()
             return
         main_view.work = replace(main_view.work, saved=None)
-        discarded = autosaves.is_discarded(path)
+        discarded = session.is_discarded(path)
         # what was never saved, or was discarded, never takes the place of a session unasked
         self.path = saved if saved.is_file() and not discarded else None
         if not discarded:
@@ -216,7 +214,7 @@ class FileActions:
         """Ask what becomes of work that was left unsaved the last time, of the latest first."""
         if self._app.document.path is None:
             return
-        found = autosaves.find_autosaves(self._session_name(), numbered=self.path is None)
+        found = session.find_autosaves(self._session_name(), numbered=self.path is None)
         left = [path for path in found if path != self.session_autosave.path and path not in self._put_off]
         if left:
             self._put_off.add(left[0])  # if it is not decided now
@@ -228,7 +226,7 @@ class FileActions:
         self.session_autosave.discard()
 
     def _discard_autosave(self, path: Path) -> None:
-        aside = autosaves.put_aside(path)
+        aside = session.put_aside(path)
         self._app.main_view.show_message(f"Discarded; a copy is kept in {aside.name}")
         self.offer_autosave()
 
@@ -246,7 +244,7 @@ class FileActions:
             raise ProgdfError(f"{opened.title} was not opened from a file; save the scene first")
         folder = (self.path or opened.path or Path()).resolve().parent
         view, total = main_view.work.view, len(opened.scene)
-        kept = regions.keep(view.selection, name, folder, total)
+        kept = exports.keep_region(view.selection, name, folder, total)
         main_view.change(replace(view, selection=kept))
         main_view.show_message(
             f"Saved {kept.regions[-1].path}; train it with --region file:{kept.regions[-1].path.name}"
@@ -254,7 +252,7 @@ class FileActions:
 
     def _rename_region(self, index: str, name: str) -> None:
         view, total = self._app.main_view.work.view, len(self._app.document.scene)
-        renamed = regions.rename(view.selection, int(index), name, total)
+        renamed = exports.rename_region(view.selection, int(index), name, total)
         self._app.main_view.change(replace(view, selection=renamed))
 
     def _claim_regions(self, path: Path) -> None:
@@ -262,8 +260,8 @@ class FileActions:
         main_view, scene = self._app.main_view, self._app.document.path
         view = main_view.work.view
         if scene is not None and view.selection.regions:
-            folders = regions.region_folders(path, scene, self._memory)
-            main_view.change(replace(view, selection=regions.claim(view.selection, folders)))
+            folders = exports.region_folders(path, scene, self._memory)
+            main_view.change(replace(view, selection=exports.claim_regions(view.selection, folders)))
 
     def _write(self, path: Path) -> None:
         session.save(path, self._session())
@@ -325,9 +323,9 @@ class FileActions:
 
     def _autosave_base(self) -> Path:
         """The session's file; where it never had one, a name that nothing has."""
-        return self.path or autosaves.free_session(self._session_name(), self.session_autosave.path)
+        return self.path or session.free_session(self._session_name(), self.session_autosave.path)
 
     def _remember(self, *paths: Path) -> tuple[Path, ...]:
         if not paths:
-            return recent.read(self._memory)
-        return recent.remember(paths, self._memory)
+            return read_recent(self._memory)
+        return remember_recent(paths, self._memory)

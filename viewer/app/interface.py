@@ -22,8 +22,8 @@ from viewer.ui.pointer import PointerContext
 
 from . import bindings, compare_overlay, dialogs, mouse
 from .mouse import MouseTool
-from .studio import up_strip
-from .studio.up_strip import UpStrip
+from .studio import pages
+from .studio.pages import UpStrip
 
 
 def panels(
@@ -58,7 +58,6 @@ def panels(
         work.form if work.form_open else None,
         _form_input(work, facts.count, preview),
         work.jobs,
-        work.deliveries,
         recent,
         work.selected,
         work.search,
@@ -130,8 +129,8 @@ def over_picture(
     bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)
     if strip is not None and work.dialog is None:
-        work = replace(work, requests=(*work.requests, *up_strip.draw(strip, above, ui)))
-        above = replace(above, height=above.height - up_strip.height(strip, area, ui))
+        work = replace(work, requests=(*work.requests, *pages.draw_up_strip(strip, above, ui)))
+        above = replace(above, height=above.height - pages.up_strip_height(strip, area, ui))
     if (line := work.message) is not None:
         clicked, top = overlay.message(line, above, ui)
         free = imgui.ImVec2(free.x, top)

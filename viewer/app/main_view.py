@@ -38,9 +38,8 @@ from . import interface, mouse
 from .canvas import Canvas
 from .mouse import MouseTool
 from .pending_keys import PendingKeys
-from .studio import cover, start_page
-from .studio.cover import Cover
-from .studio.up_strip import UpStrip
+from .studio import pages
+from .studio.pages import Cover, UpStrip
 
 FLIGHT_S = 1 / 60  # between frames while flying
 
@@ -69,7 +68,7 @@ class MainView:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
         self.canvas = Canvas(context, engine, facts.recordings)
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
-        self.recent_files: tuple[start_page.RecentFile, ...] = ()  # those of the start page
+        self.recent_files: tuple[pages.RecentFile, ...] = ()  # those of the start page
         self.up_strip: UpStrip | None = None  # asks which way is up
         self.cover: Cover | None = None  # what lies over the picture
         self.preview_said = ("", False)  # of the picture of a new edit, and whether it failed
@@ -279,12 +278,12 @@ class MainView:
             self._keys = Keys(self._keys.pressed)
         self._keys = self._taps.without(self._keys)
         for action in (*inputs.requested_actions(self._keys), *tapped):
-            if self.at_start and action not in start_page.KEYS:
+            if self.at_start and action not in pages.KEYS:
                 continue
             if not asks or action == "window_picture":  # which shows what is open, and changes nothing
                 self._perform(action)
         if self.at_start:
-            for action in start_page.draw(self.recent_files, self.ui):
+            for action in pages.draw_start_page(self.recent_files, self.ui):
                 self._perform(action)
             return
         if inputs.is_flying(self._keys):
@@ -360,7 +359,7 @@ class MainView:
         original = self._shows_original
         with self._guarded():
             if self.cover is not None and not original:
-                cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
+                pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         said = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(

@@ -11,7 +11,7 @@ from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from viewer.camera.view_camera import from_camera, to_camera
 from viewer.files import exports, timeline_file
-from viewer.jobs.new_edit import with_picture
+from viewer.jobs.training import with_picture
 from viewer.state.playback import Player
 from viewer.state.workspace import with_camera
 

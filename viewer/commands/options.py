@@ -1,105 +1,374 @@
-"""The options of `progdf view`, `render` and `export`; their command lines are made from these."""
+"""The options of `progdf view`, `render` and `export`, and what they name: a scene under its edits."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Protocol
 
+import numpy as np
 import tyro
+from numpy.typing import NDArray
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction
 
+from progdf.cli.info import kind_of
+from progdf.cli.options import parse_options
+from progdf.color.edits import parse_color
+from progdf.errors import ProgdfError
+from progdf.gdf.file import Gdf
+from progdf.io.npy import open_npy
 from progdf.scene.up_axis import UpChoice
+from viewer.camera.up_axis import Vec3, up_of
+from viewer.camera.view_camera import with_up
+from viewer.files import document, session
+from viewer.files.document import Document
+from viewer.state import layers as stacks
+from viewer.state.paint import encode
+from viewer.state.snapshots import SliderSnapshot
+from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
 
 Blend = Literal["normalized", "sum", "over"]
-Settings = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=S"), tyro.conf.UseAppendAction]
-Gains = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME:KIND=G"), tyro.conf.UseAppendAction]
-Paint = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FILE.npy"), tyro.conf.UseAppendAction]
-Solo = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction]
-Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-Edits = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
-Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-
+Against = Literal["original", "recorded"]
 NO_SCENE = Path()
 """What stands for the scene where none is given."""
+SESSION = "--session"
+_BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
+_SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "background")
+
+
+def word(metavar: str | None = None, absent: str | Callable[[str], str] | None = None, **more: Any) -> Any:
+    """How help shows an option: what stands for its value, and what happens without it."""
+    hint = f"(default: {absent})" if isinstance(absent, str) else absent
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, **more)
+
+
+def _switch(default: str) -> str:
+    return f"(default: {'on' if default == 'True' else 'off'})"
+
+
+def _scene(default: str) -> str:
+    return "(required)" if default != str(NO_SCENE) else "(default: a start page)"
+
+
+Switch = Annotated[bool, word(absent=_switch)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class StackOptions:
-    """A scene under a stack of edits: what the three commands have in common."""
+    """A scene under a stack of edits."""
 
-    scene: Scene
+    scene: Annotated[Path, Positional, word("SCENE", _scene)]
     """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
-    gdfs: Edits = ()
+    gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf", "the scene alone")] = ()
     """Edits of this scene, the lowest layer first."""
-    set: Settings = ()
+    set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()
     """Strength of an edit, 0 to 1; repeat it for several edits. An edit that is not named is at 1 in `render`
     and `export`, at 0 in `view`, --sweep and --sheet, and as a session has it."""
-    gain: Gains = ()
+    gain: Annotated[tuple[str, ...], UseAppendAction, word("NAME:KIND=G")] = ()
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
-    solo: Solo = ()
+    solo: Annotated[tuple[str, ...], UseAppendAction, word("NAME")] = ()
     """Show this edit alone. Repeat it for several edits."""
-    paint: Paint = ()
+    paint: Annotated[tuple[str, ...], UseAppendAction, word("NAME=FILE.npy")] = ()
     """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
-    overshoot: bool = False
+    overshoot: Switch = False
     """Overshoot to 1.2: extrapolates past the trained range."""
-    blend: Blend | None = None
-    """How edits that share Gaussians add up; by default the session's rule, else normalized."""
+    blend: Annotated[Blend | None, word("{normalized,sum,over}", "the session's rule, else normalized")] = (
+        None
+    )
+    """How edits that share Gaussians add up."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureOptions(StackOptions):
-    """The stack as a picture shows it."""
+class DrawingOptions:
+    """How the stack is drawn."""
 
     up: UpChoice = "auto"
     """The axis of the scene that is up; auto: as the edits were trained, else from the ground, else −y."""
-    background: str = "white"
+    background: Annotated[str, word("COLOR")] = "white"
     """#rrggbb, white or black."""
-    engine: Annotated[Literal["auto", "gl", "cpu"], tyro.conf.arg(aliases=["--draw"])] = "auto"
+    engine: Annotated[Literal["auto", "gl", "cpu"], word(aliases=["--draw"])] = "auto"
     """What draws: OpenGL or the CPU rasterizer; auto takes OpenGL where a graphics card does the work."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions(PictureOptions):
-    """Open the window: the splats, one slider per edit. Without a scene it opens on a start page."""
+class ViewpointOptions:
+    """From where a picture is taken."""
 
-    scene: Scene = NO_SCENE
-    """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
+    camera: Annotated[str | None, word("FILE[:INDEX]", "the session's, else chosen from the scene")] = None
+    """A camera of cameras.json or transforms.json, the first where no INDEX is given."""
+    orbit: Annotated[str | None, word("AZ,EL[,DISTANCE]", "the session's, else chosen from the scene")] = None
+    """A camera that circles the scene: degrees around it, degrees above it, world units away (fitting)."""
+    frame: Annotated[str | None, word("NAME|all", "what stands in the scene")] = None
+    """What fills the picture: an edit's region, or the whole scene."""
+    size: Annotated[str | None, word("WIDTHxHEIGHT", "the camera's own, or 640x480")] = None
+    """Pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions(PictureOptions):
+class ViewOptions:
+    """Open the window: the splats, one slider per edit. Without a scene it opens on a start page."""
+
+    stack: OmitArgPrefixes[StackOptions] = StackOptions(scene=NO_SCENE)
+    drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
     """Write a picture of a scene under its edits, without a window."""
 
-    out: Out
+    stack: OmitArgPrefixes[StackOptions]
+    out: Annotated[Path, word("FILE", aliases=["-o"])]
     """The picture to write: .png, with --sweep .gif or .mp4; with --timeline also a folder."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="FILE[:INDEX]")] = None
-    """A camera of cameras.json or transforms.json, the first where no INDEX is given."""
-    orbit: Annotated[str | None, tyro.conf.arg(metavar="AZ,EL[,DISTANCE]")] = None
-    """A camera that circles the scene: degrees around it, degrees above it, world units away (fitting)."""
-    frame: Annotated[str | None, tyro.conf.arg(metavar="NAME|all")] = None
-    """What fills the picture: an edit's region, or the whole scene; else what stands in the scene."""
-    size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
-    """Pixels; else the camera's own, or 640x480."""
-    alpha: bool = False
+    viewpoint: OmitArgPrefixes[ViewpointOptions] = ViewpointOptions()
+    drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
+    alpha: Switch = False
     """A transparent background, in a .png."""
-    sweep: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    sweep: Annotated[str | None, word("NAME", "a still picture")] = None
     """Move this edit's slider from 0 to 1 and back: an animation."""
-    sheet: Annotated[str | None, tyro.conf.arg(metavar="NAME[,NAME2]|N")] = None
+    sheet: Annotated[str | None, word("NAME[,NAME2]|N", "one picture")] = None
     """A contact sheet over this edit's slider, a grid over two sliders, or N pictures of the --timeline."""
-    split: Annotated[str | None, tyro.conf.arg(metavar="[X]")] = None
+    split: Annotated[str | None, word("[X]", "the session's comparison, else none")] = None
     """The original beside the edited picture, which begins at this share of the width (0.5)."""
-    difference: Annotated[str | None, tyro.conf.arg(metavar="[AMPLIFY]")] = None
+    difference: Annotated[str | None, word("[AMPLIFY]", "the session's comparison, else none")] = None
     """What differs from the original, amplified (4), with the PSNR."""
-    against: Literal["original", "recorded"] | None = None
+    against: Annotated[Against | None, word("{original,recorded}", "the session's, else the original")] = None
     """What --split and --difference compare with: the original, or what training recorded."""
-    timeline: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
+    timeline: Annotated[Path | None, word("FILE.json", "a still picture")] = None
     """A film of the keys in this file (Ctrl+K in the window), or in the session: .gif, .mp4, or a folder for
     .png frames; with --sheet N a contact sheet of N of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions(StackOptions):
+class ExportOptions:
     """Write a scene under its edits as a 3DGS .ply file."""
 
-    out: Out
+    stack: OmitArgPrefixes[StackOptions]
+    out: Annotated[Path, word("FILE", aliases=["-o"])]
     """The .ply file to write."""
+
+
+class Named(Protocol):
+    """An edit, or the layer that shows one."""
+
+    @property
+    def name(self) -> str:
+        """No two of a stack share one."""
+
+
+@dataclass(frozen=True)
+class OpenStack:
+    """What was opened, and how it shall drawing."""
+
+    document: Document
+    view: ViewState  # of a scene without the camera, which is for the command to choose
+    session: Path | None = None  # the file that holds all this; None for a scene
+    snapshots: tuple[SliderSnapshot, ...] = ()
+    up_option: str = "auto"  # an axis, or "auto"
+    warning: str = ""  # what of the session was not taken as it is
+
+    @property
+    def up(self) -> Vec3:
+        """The direction that is up in the scene."""
+        opened = self.document
+        if self.up_option == "auto":
+            return opened.found_up.direction
+        return up_of(opened.scene, opened.gdfs, self.up_option)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All that was read."""
+        files = (self.document.path, self.session)
+        return (*(path for path in files if path is not None), *self.document.gdf_paths)
+
+    def layer(self, name: str) -> str:
+        """The layer of that name; else of the edit of that name, as a session's layers may be renamed."""
+        named = {self.document.gdfs[layer.gdf].name: layer.name for layer in self.view.layers}
+        return name if name in named.values() else named.get(name, name)
+
+
+def parse(kind: type[Any], argv: Sequence[str], command: str) -> Any:
+    """The options of a command. `--session FILE` is FILE in the scene's place; `--split` and `--difference`
+    without a number get theirs.
+
+    Raises:
+        ProgdfError: an option is missing, unknown or of the wrong kind.
+    """
+    first: list[str] = []
+    words: list[str] = []
+    remaining = iter(argv)
+    for argument in remaining:
+        if argument == SESSION:
+            file = next(remaining, None)
+            if file is None:
+                raise ProgdfError(f"{SESSION} needs a file; write {SESSION} FILE")
+            first.append(file)
+        elif argument.startswith(f"{SESSION}="):
+            first.append(argument.removeprefix(f"{SESSION}="))
+        elif words and words[-1] in _BARE and _is_number(argument):
+            words[-1] += f"={argument}"
+        else:
+            words.append(argument)
+    words = [f"{argument}={_BARE[argument]}" if argument in _BARE else argument for argument in words]
+    return parse_options(kind, [*first, *words], command)
+
+
+def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset: float = 0.0) -> OpenStack:
+    """Open what the options name.
+
+    Args:
+        stack: the scene, or a session, and its edits
+        drawing: up axis and background, of commands that draw
+        unset: the strength of a scene's edits that no --set names
+
+    Raises:
+        ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, options
+            name no edit; or they say what a session says already.
+    """
+    if stack.scene.is_file() and kind_of(stack.scene) == "session":
+        return _open_session(stack, drawing)
+    paths: dict[str, Path] = {}
+    for path in stack.gdfs:  # a session may hold one twice
+        first = paths.setdefault(os.path.realpath(path), path)
+        if first is not path:
+            again = "" if first == path else f", first as {first}"
+            raise ProgdfError(f"{path} was given twice{again}; give each edit once")
+    view = ViewState(blend=stack.blend or "normalized", overshoot=stack.overshoot)
+    if drawing is not None:
+        view = replace(view, background=parse_background(drawing.background))
+    opened = document.load(stack.scene, stack.gdfs)
+    layers = stack_layers(opened.gdfs, stack, unset)
+    return OpenStack(opened, replace(view, layers=layers), up_option=drawing.up if drawing else "auto")
+
+
+def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenStack:
+    """The session with the strengths and the blend rule that were given beside it."""
+    for part in (stack, drawing) if drawing is not None else (stack,):
+        for field in fields(part):
+            if field.name in _SAID_BY_SESSION and getattr(part, field.name) != field.default:
+                what = "an edit was given" if field.name == "gdfs" else f"--{field.name} was given"
+                raise ProgdfError(
+                    f"{what} with the session {stack.scene.name}, which already sets it; leave it out"
+                )
+    saved, up = session.open_session(stack.scene), drawing.up if drawing else "auto"
+    opened = OpenStack(saved.document, saved.view, stack.scene, saved.snapshots, up, saved.warning)
+    settings = [
+        f"{opened.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in stack.set)
+    ]
+    strengths = parse_strengths(saved.view.layers, settings, stacks.largest_strength(saved.view))
+    layers = tuple(replace(l, strength=strengths.get(l.name, l.strength)) for l in saved.view.layers)
+    view = replace(saved.view, layers=layers, blend=stack.blend or saved.view.blend)
+    if up != "auto":  # else the session's own
+        view = replace(view, camera=with_up(view.camera, opened.up))
+    return replace(opened, view=view)
+
+
+def stack_layers(gdfs: Sequence[Gdf], stack: StackOptions, unset: float = 0.0) -> tuple[LayerState, ...]:
+    """One layer per edit, the lowest first, at `unset` unless a `--set` says otherwise.
+
+    Raises:
+        ProgdfError: there is no such edit or kind of gain, or a number is outside its range.
+    """
+    strengths = parse_strengths(gdfs, stack.set, OVERSHOOT if stack.overshoot else 1.0)
+    layers = {g.name: LayerState(i, g.name, strengths.get(g.name, unset)) for i, g in enumerate(gdfs)}
+    for text in stack.gain:
+        name, kind, gain = _parse_gain(text, gdfs)
+        layers[name] = stacks.with_slider_value(layers[name], kind, gain)
+    for name in stack.solo:
+        check_edit(name, gdfs, "--solo")
+        layers[name] = replace(layers[name], solo=True)
+    for text in stack.paint:
+        name, equals, file = text.partition("=")
+        if not equals or not file:
+            raise ProgdfError(f"--paint {text} has no NAME=FILE; write NAME=WEIGHTS.npy")
+        gdf = gdfs[layers[check_edit(name, gdfs, "--paint")].gdf]
+        layers[name] = replace(layers[name], paint=encode(_read_weights(Path(file), gdf)))
+    return tuple(layers.values())
+
+
+def parse_strengths(edits: Sequence[Named], settings: Sequence[str], most: float) -> dict[str, float]:
+    """The strengths that settings `NAME=S` name, from 0 to `most`.
+
+    Raises:
+        ProgdfError: there is no edit NAME, or S is no such number.
+    """
+    strengths = {}
+    for setting in settings:
+        name, equals, text = setting.rpartition("=")
+        if not equals or not name:
+            example = edits[0].name if edits else "NAME"
+            raise ProgdfError(f"--set {setting} is not NAME=S; write, for example, --set {example}=0.7")
+        problem = f"--set {setting}: the strength '{text}' is not a number from 0 to {most:g}"
+        strengths[check_edit(name, edits, "--set")] = parse_number(text, 0.0, most, problem)
+    return strengths
+
+
+def check_edit(name: str, edits: Sequence[Named], option: str) -> str:
+    """`name`, when an edit has it.
+
+    Raises:
+        ProgdfError: none has; the message lists those there are.
+    """
+    if name in {edit.name for edit in edits}:
+        return name
+    if not edits:
+        raise ProgdfError(f"{option} {name}: no .gdf file was given; name one after the scene")
+    names = f"{'is' if len(edits) == 1 else 'are'} {', '.join(edit.name for edit in edits)}"
+    raise ProgdfError(f"{option} {name}: there is no edit of that name; there {names}")
+
+
+def _read_weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
+    """Weights of the members, from a file that has them or those of the whole scene. [M]"""
+    try:
+        weights = open_npy(path, "weights")
+    except ProgdfError as error:
+        raise ProgdfError(f"--paint: {error}") from None
+    members, count = gdf.region.members.numpy(), gdf.scene.count
+    if weights.shape not in ((len(members),), (count,)):
+        shape = list(weights.shape)
+        raise ProgdfError(f"--paint: {path} has shape {shape}, expected [{len(members)}] or [{count}]")
+    if not ((weights >= 0) & (weights <= 1)).all():
+        raise ProgdfError(f"--paint: {path} has a number outside 0 to 1")
+    return np.asarray(weights if len(weights) == len(members) else weights[members], np.float32)
+
+
+def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
+    """Name, kind and number of `NAME:KIND=G`."""
+    kinds = stacks.SLIDERS[1:]
+    layer, equals, number = text.rpartition("=")
+    name, colon, kind = layer.rpartition(":")
+    if not equals or not colon or not name:
+        example = gdfs[0].name if gdfs else "NAME"
+        raise ProgdfError(f"--gain {text} is not a gain; write NAME:KIND=G, for example {example}:color=0.5")
+    check_edit(name, gdfs, "--gain")
+    if kind not in kinds:
+        raise ProgdfError(f"--gain {text}: there is no gain '{kind}'; the gains are {', '.join(kinds)}")
+    problem = f"--gain {text}: the gain '{number}' is not a number from 0 to 1"
+    return name, kind, parse_number(number, 0.0, 1.0, problem)
+
+
+def parse_number(text: str, low: float, high: float, problem: str) -> float:
+    """A number from `low` to `high`; ProgdfError says `problem` where it is none."""
+    number = float(text) if _is_number(text) else math.nan
+    if not low <= number <= high:
+        raise ProgdfError(problem)
+    return number
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def parse_background(text: str) -> Vec3:
+    """The color of `#rrggbb`, "white" or "black", 0..1.
+
+    Raises:
+        ProgdfError: it is no color.
+    """
+    red, green, blue = parse_color({"white": "#ffffff", "black": "#000000"}.get(text.lower(), text)).tolist()
+    return red, green, blue

@@ -1,7 +1,9 @@
-"""The command `progdf render`: pictures, comparisons, contact sheets and films without a window."""
+"""The commands `progdf view` and `export`, and `render`: pictures, comparisons, contact sheets and films."""
 
 from __future__ import annotations
 
+import math
+import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -13,76 +15,141 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
-from progdf.cli.options import parse_options
+from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError, print_line
-from progdf.gaussians import Gaussians
+from progdf.formats.load_report import format_count
+from progdf.formats.ply import save_ply_checked
+from progdf.formats.scene_file import scene_format
+from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
+from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
 from progdf.torch_threads import one_thread
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import (
+    FARTHEST,
+    ViewCamera,
+    bounds_of,
+    first_camera,
+    fit,
+    fit_subject,
+    frame,
+    to_camera,
+)
 from viewer.files import timeline_file
+from viewer.files.document import empty
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.state import recordings, timeline
-from viewer.state.layers import shown_edits
+from viewer.state.layers import shown_edits, visible_layers
+from viewer.state.paint import layer_of
 from viewer.state.snapshots import compare_sides
-from viewer.state.view_state import Comparison, Timeline, ViewState
+from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewState
 
-from . import arguments, opening
-from .arguments import choose_camera
-from .opening import OpenStack
-from .options import RenderOptions
+from .options import (
+    NO_SCENE,
+    ExportOptions,
+    OpenStack,
+    RenderOptions,
+    ViewOptions,
+    ViewpointOptions,
+    check_edit,
+    open_stack,
+    parse,
+    parse_number,
+)
 
+DEFAULT_SIZE = (640, 480)
+LARGEST_SIDE = 16_384
 _SAY_EVERY_S = 0.5
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
 """Options that each say what the picture is; only a timeline goes with a sheet."""
 
 
 @one_thread()
+def view(argv: Sequence[str]) -> int:
+    """`progdf view`: open the window and stay until it is closed."""
+    options: ViewOptions = parse(ViewOptions, argv, "progdf view")
+    has_scene = options.stack.scene != NO_SCENE
+    opened = open_stack(options.stack, options.drawing) if has_scene else OpenStack(empty(), ViewState())
+    from viewer.app.app import run  # imgui and glfw, which render and export do without
+
+    state = opened.view if opened.session is not None else replace(opened.view, grid=True)
+    if opened.session is None and has_scene:
+        state = replace(state, camera=first_camera(opened.document.scene, up=opened.up))
+    return run(
+        opened.document,
+        state,
+        session=opened.session,
+        snapshots=opened.snapshots,
+        draw=options.drawing.engine,
+        warning=opened.warning,
+    )
+
+
+def export(argv: Sequence[str]) -> int:
+    """`progdf export`: the edited scene as a .ply that any viewer opens."""
+    options: ExportOptions = parse(ExportOptions, argv, "progdf export")
+    out = options.out
+    if out.suffix.lower() != ".ply":
+        raise ProgdfError(f"{out} is not a .ply file; give the edited scene a name that ends in .ply")
+    opened = open_stack(options.stack, unset=1.0)
+    check_not_an_input(out, opened.files)
+    document, states = opened.document, visible_layers(opened.view)
+    layers = [layer_of(document.gdfs[s.gdf], s.strength, s.gains, s.paint) for s in states]
+    edited = compose_layers(document.scene, layers, opened.view.blend)
+    save_ply_checked(out, edited)
+    far = ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO else ""
+    strengths = describe_strengths(opened.view)
+    print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; read back and compared")
+    if document.path is not None and (kind := scene_format(document.path)) != "ply":
+        print_line(f"{document.title} is a .{kind}, this is a plain .ply")
+    return 0
+
+
+@one_thread()
 def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
-    options = parse_options(
-        RenderOptions, arguments.join_arguments(opening.drop_option_name(argv)), "progdf render"
-    )
+    options: RenderOptions = parse(RenderOptions, argv, "progdf render")
     _check_output(options)
-    size = None if options.size is None else arguments.parse_size(options.size)
     one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
-    found = opening.open_stack(options, unset=0.0 if one_moves else 1.0)
-    check_not_an_input(options.out, found.files)
-    scene, gdfs, view = found.document.scene, found.document.gdfs, found.view
+    opened = open_stack(options.stack, options.drawing, 0.0 if one_moves else 1.0)
+    check_not_an_input(options.out, opened.files)
+    scene, gdfs, view = opened.document.scene, opened.document.gdfs, opened.view
     view = replace(view, compare=_comparison(options, view.compare))
     if options.alpha and (view.compare.mode != "off" or one_moves or options.timeline is not None):
         raise ProgdfError("--alpha goes with a single picture; leave out comparisons, sheets and films")
-    saved = None if found.session is None else view.camera
-    camera = choose_camera(options, scene, gdfs, size, saved, found.up)
+    saved = None if opened.session is None else view.camera
+    camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up)
     if options.timeline is not None:
-        keys, count = _keys(options, found), _count(options.sheet)
+        keys, count = _keys(options, opened), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
             print_line(timeline_film.write(options.out, keys, view, camera, engine, count, _say_frames()))
         return 0
-    swept = _swept_layers(options, found)
+    swept = _swept_layers(options, opened)
     with _engine(scene, gdfs, options) as engine:
         if swept:
             _render_film(options, swept, view, camera, engine)
-            told = ""
+            comparison = ""
         else:
-            told = _render_still(options, found, view, camera, engine)
+            comparison = _render_still(options, opened, view, camera, engine)
         drawn_by = engine.draws_with
     each = "each " if options.sheet is not None else ""
-    strengths = "" if swept else f": {arguments.describe_strengths(view)}"
+    strengths = "" if swept else f": {describe_strengths(view)}"
     print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by}){strengths}")
-    if told:
-        print_line(told)
+    if comparison:
+        print_line(comparison)
     if (
-        options.camera is None
+        options.viewpoint.camera is None
         and saved is None
-        and options.up == "auto"
-        and not found.document.found_up.certain
+        and options.drawing.up == "auto"
+        and not opened.document.found_up.certain
     ):
-        print_line(f"up is {found.document.found_up.reason}")
+        print_line(f"up is {opened.document.found_up.reason}")
     if view.layers and not swept and not any(layer.strength for layer in view.layers):
         print_line(
             f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit"
@@ -95,8 +162,8 @@ def _render_film(
 ) -> None:
     """An animation of one slider, or a contact sheet of one or two."""
 
-    def picture(wanted: ViewState) -> film.Pixels:
-        return film.to_pixels(engine.image(wanted, camera=camera))
+    def picture(state: ViewState) -> film.Pixels:
+        return film.to_pixels(engine.image(state, camera=camera))
 
     with atomic_write(options.out) as temporary_file:
         if options.sweep is not None:
@@ -110,29 +177,29 @@ def _render_film(
 
 
 def _render_still(
-    options: RenderOptions, found: OpenStack, view: ViewState, camera: Camera, engine: ViewEngine
+    options: RenderOptions, opened: OpenStack, view: ViewState, camera: Camera, engine: ViewEngine
 ) -> str:
     """One picture, compared as `view` asks; gives what to say about the comparison."""
-    origin = found.document.scene.origin
+    origin = opened.document.scene.origin
     if options.alpha:
         picture = Image.fromarray(transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
-            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin, found.up))
+            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin, opened.up))
         return ""
-    where = found.document.recordings()
+    where = opened.document.recordings()
     missing = recordings.obstacle(where)
     if view.compare.mode != "off" and view.compare.against == "recorded" and missing:
         raise ProgdfError(
             f"there is nothing recorded to compare with: {missing}; give the .gdf in its run folder"
         )
     comparer = Comparer(engine, engine.ctx, where)
-    comparer.sides = compare_sides(found.snapshots, view)
+    comparer.sides = compare_sides(opened.snapshots, view)
     view = comparer.sides.right if comparer.sides else view
     try:
         image = comparer.image(view, camera=camera)
         # a comparison is no view that could be edited and trained on
         single = view.compare.mode == "off"
-        carried = camera_chunk(camera, shown_edits(view), origin, found.up) if single else None
+        carried = camera_chunk(camera, shown_edits(view), origin, opened.up) if single else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)
@@ -150,28 +217,34 @@ def _render_still(
 
 def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
     """What was asked for; else what the session shows."""
-    asked = arguments.parse_comparison(options.split, options.difference)
-    asked = saved if asked.mode == "off" else asked
+    compare = saved
+    if options.split is not None:
+        problem = f"--split must be between 0 and 1, got {options.split}"
+        compare = Comparison("split", divider=parse_number(options.split, 0.0, 1.0, problem))
+    elif options.difference is not None:
+        amplify = options.difference
+        problem = f"--difference must be between 1 and {MOST_AMPLIFIED:g}, got {amplify}"
+        compare = Comparison("difference", amplify=parse_number(amplify, 1.0, MOST_AMPLIFIED, problem))
     if options.against is None:
-        return asked
-    if asked.mode == "off":
+        return compare
+    if compare.mode == "off":
         raise ProgdfError(f"--against {options.against} needs a comparison; add --split or --difference")
-    return replace(asked, against=options.against)
+    return replace(compare, against=options.against)
 
 
-def _keys(options: RenderOptions, found: OpenStack) -> Timeline:
+def _keys(options: RenderOptions, opened: OpenStack) -> Timeline:
     """The timeline that was asked for: of a file of its own, or of the session."""
-    assert options.timeline is not None
-    own = found.session is not None and options.timeline.exists() and options.timeline.samefile(found.session)
-    keys = (
-        found.view.timeline
-        if own
-        else timeline_file.load(options.timeline, found.view.layers, found.document.scene.origin)
-    )
-    if own and not keys.keys:
-        raise ProgdfError(f"{options.timeline} has no keys on its timeline; set some with K in the window")
-    if timeline.camera_at(keys, 0) is not None and (options.camera or options.orbit or options.frame):
-        raise ProgdfError(f"{options.timeline} moves the camera; leave out --camera, --orbit and --frame")
+    path, saved = options.timeline, opened.session
+    assert path is not None
+    if saved is not None and path.exists() and path.samefile(saved):
+        keys = opened.view.timeline
+        if not keys.keys:
+            raise ProgdfError(f"{path} has no keys on its timeline; set some with K in the window")
+    else:
+        keys = timeline_file.load(path, opened.view.layers, opened.document.scene.origin)
+    seen = options.viewpoint
+    if timeline.camera_at(keys, 0) is not None and (seen.camera or seen.orbit or seen.frame):
+        raise ProgdfError(f"{path} moves the camera; leave out --camera, --orbit and --frame")
     return keys
 
 
@@ -185,13 +258,13 @@ def _count(sheet: str | None) -> int:
     return int(sheet)
 
 
-def _swept_layers(options: RenderOptions, found: OpenStack) -> list[str]:
+def _swept_layers(options: RenderOptions, opened: OpenStack) -> list[str]:
     """Names of the layers whose sliders move in the picture: none, one or two."""
     if options.sweep is not None:
-        return [_check_visible(found.layer(options.sweep), found.view, "--sweep")]
+        return [_check_visible(opened.layer(options.sweep), opened.view, "--sweep")]
     if options.sheet is None:
         return []
-    names = [_check_visible(found.layer(name), found.view, "--sheet") for name in options.sheet.split(",")]
+    names = [_check_visible(opened.layer(name), opened.view, "--sheet") for name in options.sheet.split(",")]
     if len(names) > 2 or len(set(names)) < len(names):
         raise ProgdfError(f"--sheet {options.sheet} does not name one or two different edits; name those")
     return names
@@ -199,7 +272,7 @@ def _swept_layers(options: RenderOptions, found: OpenStack) -> list[str]:
 
 def _check_visible(name: str, view: ViewState, option: str) -> str:
     """`name`, when there is such an edit, and neither another that is alone nor its group at 0 hides it."""
-    arguments.known_edit(name, view.layers, option)
+    check_edit(name, view.layers, option)
     group = next(layer.group for layer in view.layers if layer.name == name)
     if any(known.name == group and not known.strength for known in view.groups):
         raise ProgdfError(f"{option} {name}: its group {group} is at 0, so nothing would change; raise that")
@@ -213,13 +286,13 @@ def _check_visible(name: str, view: ViewState, option: str) -> str:
 def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> Iterator[ViewEngine]:
     """An engine for pictures without a window; "auto" does without OpenGL where there is none."""
     ctx = None
-    if options.engine != "cpu":
+    if options.drawing.engine != "cpu":
         try:
             ctx = headless_context()
         except ProgdfError:
-            if options.engine == "gl":
+            if options.drawing.engine == "gl":
                 raise
-    engine = ViewEngine(ctx, scene, gdfs, options.engine)
+    engine = ViewEngine(ctx, scene, gdfs, options.drawing.engine)
     try:
         yield engine
     finally:
@@ -273,3 +346,114 @@ def unmix(black: NDArray[np.float32], white: NDArray[np.float32]) -> NDArray[np.
     color = np.clip(black / np.maximum(alpha, 1e-6), 0.0, 1.0)
     rgba: NDArray[np.uint8] = np.round(255.0 * np.concatenate([color, alpha], axis=-1)).astype(np.uint8)
     return rgba
+
+
+def describe_strengths(view: ViewState) -> str:
+    """The layers that take part, each with its strength."""
+    return ", ".join(f"{layer.name} {layer.strength:g}" for layer in visible_layers(view)) or "no edits"
+
+
+def choose_camera(
+    viewpoint: ViewpointOptions,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    saved: ViewCamera | None,
+    up: Vec3 | None = None,
+) -> Camera:
+    """The camera that was asked for; that of the session (`saved`); or one that frames the scene.
+
+    Args:
+        viewpoint: what was asked for
+        scene: the original
+        gdfs: its edits, which --frame may name
+        saved: of a session
+        up: unit vector that is up in the scene; None finds it
+
+    Raises:
+        ProgdfError: options that contradict each other or name nothing.
+    """
+    size = None if viewpoint.size is None else parse_size(viewpoint.size)
+    if viewpoint.camera is not None and viewpoint.orbit is not None:
+        raise ProgdfError("--camera and --orbit cannot be combined; give only one of them")
+    if viewpoint.camera is not None:
+        if viewpoint.frame is not None:
+            raise ProgdfError("--camera and --frame cannot be combined; give only one of them")
+        camera = read_camera(viewpoint.camera, scene.origin)
+        return camera if size is None else fit_camera(camera, size)
+    width, height = size or DEFAULT_SIZE
+    aspect = width / height
+    view = saved or first_camera(scene, aspect=aspect, up=up)
+    if viewpoint.orbit is not None:
+        view = parse_orbit(viewpoint.orbit, view)
+    if viewpoint.frame is not None or (viewpoint.orbit is not None and saved is None):
+        view = _frame_on(view, viewpoint.frame, scene, gdfs, aspect)
+        if viewpoint.orbit is not None:  # a distance that was said holds
+            view = parse_orbit(viewpoint.orbit, view)
+    return to_camera(view, width, height)
+
+
+def _frame_on(
+    view: ViewCamera, name: str | None, scene: Gaussians, gdfs: Sequence[Gdf], aspect: float
+) -> ViewCamera:
+    """The same direction, filled by what --frame names."""
+    if name is None:
+        return fit_subject(view, scene, aspect)
+    if name == "all" and name not in [gdf.name for gdf in gdfs]:
+        return frame(view, bounds_of(scene), aspect)
+    check_edit(name, gdfs, "--frame")
+    (members,) = (gdf.region.members for gdf in gdfs if gdf.name == name)
+    return fit(view, scene[members], aspect)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of `WxH`, pixels.
+
+    Raises:
+        ProgdfError: it is no size, or one that no picture should have.
+    """
+    width, cross, height = text.lower().partition("x")
+    if not cross or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in (width, height)):
+        raise ProgdfError(f"--size {text} is not a size; write it as WIDTHxHEIGHT, for example 640x480")
+    size = int(width), int(height)
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise ProgdfError(f"--size {text} cannot be drawn; each side may be 1 to {LARGEST_SIDE} pixels")
+    return size
+
+
+def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
+    """The camera of `AZIMUTH,ELEVATION[,DISTANCE]`: degrees, degrees above the horizon, world units.
+
+    Args:
+        text: what was typed
+        framed: shows the scene; gives the pivot, the up axis, and the distance where none is said
+
+    Raises:
+        ProgdfError: it is not two or three finite numbers, or the camera cannot stand there.
+    """
+    right = "write AZIMUTH,ELEVATION or AZIMUTH,ELEVATION,DISTANCE, for example --orbit 30,15"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ProgdfError(f"--orbit {text} is not a list of numbers; {right}") from None
+    if len(numbers) not in (2, 3) or not all(math.isfinite(number) for number in numbers):
+        raise ProgdfError(f"--orbit {text} is not two or three numbers; {right}")
+    if not -90 <= numbers[1] <= 90:
+        raise ProgdfError(
+            f"--orbit {text}: the elevation must be between -90 and 90 degrees, got {numbers[1]:g}"
+        )
+    distance = numbers[2] if len(numbers) == 3 else framed.distance
+    if not 0 < distance <= FARTHEST:
+        raise ProgdfError(
+            f"--orbit {text}: the distance must be above 0 and at most {FARTHEST:g}, got {distance:g}"
+        )
+    return replace(framed, azimuth=numbers[0], elevation=numbers[1], distance=distance)
+
+
+def fit_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view in another size, undistorted: the same height of the scene, the sides cut or widened."""
+    width, height = size
+    scale = height / camera.height
+    K = camera.K * scale
+    K[2, 2] = 1.0
+    K[0, 2] = width / 2 + (camera.K[0, 2] - camera.width / 2) * scale
+    return replace(camera, K=K, width=width, height=height)

@@ -25,21 +25,13 @@ from viewer.state.workspace import SceneFacts
 
 @dataclass(frozen=True)
 class Document:
-    """The scene and its edits, in the order of `LayerState.gdf`.
+    """The scene and its edits, in the order of `LayerState.gdf`."""
 
-    Args:
-        title: the scene's name; "" where nothing is open
-        scene: the original
-        gdfs: its edits
-        path: the scene's file; None where there is none, and so no session can be saved
-        gdf_paths: the edits' files, one for each where there are any
-    """
-
-    title: str
-    scene: Gaussians
-    gdfs: tuple[Gdf, ...] = ()
-    path: Path | None = None
-    gdf_paths: tuple[Path, ...] = ()
+    title: str  # the scene's name; "" where nothing is open
+    scene: Gaussians  # the original
+    gdfs: tuple[Gdf, ...] = ()  # its edits
+    path: Path | None = None  # the scene's file; None where there is none, and so no session can be saved
+    gdf_paths: tuple[Path, ...] = ()  # the edits' files, one for each where there are any
 
     @cached_property
     def found_up(self) -> SceneUp:
@@ -72,19 +64,16 @@ class Document:
 
     def free_name(self, name: str) -> str:
         """An edit's name, with a number where another edit has it."""
-        taken, free, number = {gdf.name for gdf in self.gdfs}, name, 2
-        while free in taken:
-            free, number = f"{name}-{number}", number + 1
-        return free
+        return _free_name(name, self.gdfs)
 
 
 def _once(make: Callable[[], Neighborhood]) -> Callable[[], Neighborhood]:
     """Made when it is first asked for, by whichever thread; another one that asks meanwhile waits."""
-    lock, kept = threading.Lock(), cache(make)
+    lock, neighborhood = threading.Lock(), cache(make)
 
     def ask() -> Neighborhood:
         with lock:
-            return kept()
+            return neighborhood()
 
     return ask
 
@@ -126,9 +115,11 @@ def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tup
     for path in paths:
         with all_threads():
             gdf = load_gdf(path, scene, scene_path.name)
-        taken = {other.name for other in gdfs}
-        name, number = gdf.name, 2
-        while name in taken:
-            name, number = f"{gdf.name}-{number}", number + 1
-        gdfs.append(replace(gdf, name=name))
+        gdfs.append(replace(gdf, name=_free_name(gdf.name, gdfs)))
     return tuple(gdfs)
+
+
+def _free_name(name: str, gdfs: Sequence[Gdf]) -> str:
+    taken = {gdf.name for gdf in gdfs}
+    names = (name, *(f"{name}-{number}" for number in range(2, len(taken) + 2)))
+    return next(free for free in names if free not in taken)

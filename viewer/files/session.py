@@ -1,17 +1,21 @@
-"""Sessions: the window's state in a file (see progdf/io/session.py), and back from it."""
+"""Sessions: the window's state in a file, and back from it; beside it the autosave of unsaved work.
+
+- bear.session.json: the session, a `WindowFile`; for a scene that never had one, the name it would get
+- bear.autosave.session.json: its unsaved work; -2, -3 … where others wait for somebody to decide about them
+- bear.discarded.session.json: work that was discarded, the last `MOST_DISCARDED`
+"""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import msgspec
-
 from progdf.errors import ProgdfError, escape_text
-from progdf.io.json_values import convert_json, plain
+from progdf.io.atomic import replace_file
 from progdf.io.session import (
     SUFFIX,
     SessionFile,
@@ -29,10 +33,17 @@ from viewer.state.selection import check as check_selection
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 
-from . import document, regions, timeline_file
+from . import document, exports, timeline_file
 from .document import Document
 
 _log = logging.getLogger(__name__)
+
+
+AUTOSAVE_S = 20.0
+"""Seconds from a change to its autosave."""
+
+MOST_DISCARDED = 3
+_KINDS = "autosave", "discarded"
 
 
 @dataclass(frozen=True)
@@ -45,11 +56,21 @@ class WindowSession:
     warning: str = ""  # what of the file was not taken as it is, in one line
 
 
-class _State(msgspec.Struct):
-    """What the file holds of the window."""
+class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
+    """The file's schema: the scene and the edits as references, and the state of the window as it is."""
 
-    view: ViewState
-    snapshots: tuple[SliderSnapshot, ...]
+    view: ViewState = ViewState()  # type: ignore[assignment]
+    snapshots: tuple[SliderSnapshot, ...] = ()  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Every value is one that the window could have made."""
+        timeline_file.check(self.view.timeline, "view.timeline.keys")
+        stacks = {"view": self.view.layers}
+        stacks |= {f"snapshots[{i}].edit": kept.edit.layers for i, kept in enumerate(self.snapshots)}
+        for where, layers in stacks.items():
+            for i, layer in enumerate(layers):
+                if not 0 <= layer.gdf < len(self.edits):
+                    raise ValueError(f"{where}.layers[{i}].gdf is {layer.gdf} of {len(self.edits)} edits")
 
 
 def save(path: Path, session: WindowSession) -> None:
@@ -65,13 +86,9 @@ def save(path: Path, session: WindowSession) -> None:
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
     folder = path.parent
-    state = SessionFile(
-        reference(scene, folder),
-        tuple(reference(gdf, folder) for gdf in session.document.gdf_paths),
-        plain(_with_region_paths(view, lambda region: Path(relative_name(region, folder)))),
-        tuple(plain(snapshot) for snapshot in snapshots),
-    )
-    write_session(path, state)
+    view = _with_region_paths(view, lambda region: Path(relative_name(region, folder)))
+    edits = tuple(reference(gdf, folder) for gdf in session.document.gdf_paths)
+    write_session(path, WindowFile(reference(scene, folder), edits, view, snapshots))
 
 
 def open_session(path: Path, memory: Path | None = None) -> WindowSession:
@@ -85,18 +102,17 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
         ProgdfError: it is no session, damaged or of a newer version; or a file it names is missing, broken or
             not the one it was saved with.
     """
-    file = read_session(path)
-    view, snapshots = _states(path.name, file)
+    file = read_session(path, WindowFile)
     scene, gdfs = verify_files(path, file)
     opened = document.load(scene, gdfs)
     x, y, z = opened.scene.origin
-    view, snapshots = _move(view, snapshots, (-x, -y, -z))
+    view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     check_selection(view.selection, len(opened.scene))
     named, folder = view.selection.regions, path.resolve().parent
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
-    for layer in (*view.layers, *(layer for kept in snapshots for layer in kept.edit.layers)):
+    for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
-    claimed = regions.claim(view.selection, regions.region_folders(path, scene, memory))
+    claimed = exports.claim_regions(view.selection, exports.region_folders(path, scene, memory))
     foreign = [
         f"{old.name:.60} ({str(old.path)[:80]})"
         for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)
@@ -124,7 +140,7 @@ def _move(
     view: ViewState, snapshots: tuple[SliderSnapshot, ...], by: Vec3
 ) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
     """The same for a scene that lies elsewhere: a session has its cameras in the world."""
-    moved = tuple(replace(kept, camera=move_camera(kept.camera, by)) for kept in snapshots)
+    moved = tuple(replace(snapshot, camera=move_camera(snapshot.camera, by)) for snapshot in snapshots)
     timeline = timeline_file.move_keys(view.timeline, by)
     return replace(view, camera=move_camera(view.camera, by), timeline=timeline), moved
 
@@ -143,7 +159,7 @@ def default_path(opened: Document) -> Path:
 def prune(session: WindowSession) -> WindowSession:
     """Without the edits that no layer shows any more, in the view or in a snapshot."""
     view, snapshots = session.view, session.snapshots
-    stacks = (view.layers, *(kept.edit.layers for kept in snapshots))
+    stacks = (view.layers, *(s.edit.layers for s in snapshots))
     used = sorted({layer.gdf for layers in stacks for layer in layers})
     places = {gdf: i for i, gdf in enumerate(used)}
 
@@ -169,23 +185,143 @@ def prune(session: WindowSession) -> WindowSession:
             timeline=replace(view.timeline, keys=keys),
             unfolded=tuple(places[gdf] for gdf in view.unfolded if gdf in places),
         ),
-        tuple(
-            replace(kept, edit=replace(kept.edit, layers=renumber(kept.edit.layers))) for kept in snapshots
-        ),
+        tuple(replace(s, edit=replace(s.edit, layers=renumber(s.edit.layers))) for s in snapshots),
     )
 
 
-def _states(name: str, file: SessionFile) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
-    """The state of a session, every value of it one that the window could have made."""
+def session_file(path: Path) -> Path:
+    """A path as a session's file is called.
+
+    Raises:
+        ProgdfError: it has no name.
+    """
+    if not path.name:
+        raise ProgdfError(f"{path} is a folder; add the name of the session")
+    return path if path.suffix == ".json" else path.with_name(path.name + SUFFIX)
+
+
+class SessionAutosave:
+    """The autosave of one window, which never writes over another's."""
+
+    def __init__(self) -> None:
+        self.path: Path | None = None
+        """Its file; None before there is one."""
+        self._due: float | None = None
+        self._work: object = None  # what the file holds
+
+    def wait(
+        self, now: float, work: object, beside: Callable[[], Path], save: Callable[[Path], None]
+    ) -> float:
+        """Write unsaved work once it is old enough; 0 where it was written, or is already.
+
+        Args:
+            now: seconds of any clock that does not go back
+            work: the work
+            beside: gives the session's file
+            save: writes the work into a file; what it raises is the caller's
+
+        Returns:
+            Seconds until it is time.
+        """
+        if work == self._work:
+            self._due = None
+            return 0.0
+        if self._due is None:
+            self._due = now + AUTOSAVE_S
+        if now < self._due:
+            return self._due - now
+        self.write(work, beside, save)
+        return 0.0
+
+    def write(self, work: object, beside: Callable[[], Path], save: Callable[[Path], None]) -> Path:
+        """Write it at once; the file. Arguments as of `wait`."""
+        self._due, self._work = None, work
+        if self.path is None:
+            self.path = next(path for path in _numbered_paths(beside(), "autosave") if not path.exists())
+        save(self.path)
+        return self.path
+
+    def stop(self) -> None:
+        """There is nothing unsaved."""
+        self._due = None
+
+    def continue_from(self, path: Path) -> None:
+        """The work of an autosave was opened: the file is this window's from now on."""
+        self.path, self._due, self._work = path, None, None
+
+    def drop(self) -> None:
+        """Delete the file: its work is saved."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+        self.path, self._due, self._work = None, None, None
+
+    def discard(self) -> Path | None:
+        """Put the file aside; where it went, None where there is none."""
+        path, self.path, self._due, self._work = self.path, None, None, None
+        return put_aside(path) if path is not None and path.exists() else None
+
+
+def session_of(path: Path) -> Path | None:
+    """The session whose work an autosave, or discarded work, holds; None where `path` is neither."""
+    match = re.fullmatch(rf"(.+)\.({'|'.join(_KINDS)})(-\d+)?{re.escape(SUFFIX)}", path.name)
+    return path.with_name(match[1] + SUFFIX) if match else None
+
+
+def is_discarded(path: Path) -> bool:
+    """Whether it is work that was discarded, by its name."""
+    return ".discarded" in path.name and session_of(path) is not None
+
+
+def find_autosaves(session: Path, numbered: bool = False) -> tuple[Path, ...]:
+    """Autosaves that lie beside a session, the latest first.
+
+    Args:
+        session: its file, which need not exist
+        numbered: also those of NAME-2, NAME-3 …, as sessions of one scene are called
+    """
+    pattern = re.escape(stem(session)) + (r"(-\d+)?" if numbered else "")
+    pattern += rf"\.autosave(-\d+)?{re.escape(SUFFIX)}"
     try:
-        found = convert_json({"view": file.view, "snapshots": list(file.snapshots)}, _State, closed=True)
-        timeline_file.check(found.view.timeline, "view.timeline.keys")
-        stacks = {"view": found.view.layers}
-        stacks |= {f"snapshots[{i}].edit": kept.edit.layers for i, kept in enumerate(found.snapshots)}
-        for where, layers in stacks.items():
-            for i, layer in enumerate(layers):
-                if not 0 <= layer.gdf < len(file.edits):
-                    raise ValueError(f"{where}.layers[{i}].gdf is {layer.gdf} of {len(file.edits)} edits")
-    except ValueError as error:
-        raise ProgdfError(f"{name} cannot be opened: {error}; save it again, or update progdf") from None
-    return found.view, found.snapshots
+        paths = [path for path in session.parent.iterdir() if re.fullmatch(pattern, path.name)]
+        return tuple(sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True))
+    except OSError:
+        return ()
+
+
+def put_aside(path: Path) -> Path:
+    """An autosave as discarded work, in the place of the oldest where there are `MOST_DISCARDED`.
+
+    Raises:
+        OSError: it cannot be moved.
+    """
+    session = session_of(path) or path
+    names = [
+        name for name, _ in zip(_numbered_paths(session, "discarded"), range(MOST_DISCARDED), strict=False)
+    ]
+    free = [name for name in names if not name.exists()]
+    to = free[0] if free else min(names, key=lambda name: name.stat().st_mtime)
+    replace_file(path, to)
+    os.utime(to)  # the age that counts is since when it is discarded
+    return to
+
+
+def free_session(path: Path, autosave: Path | None) -> Path:
+    """`path`, with a number where such a session exists, or unsaved work of it that is not `autosave`."""
+
+    def taken(session: Path) -> bool:
+        return session.exists() or any(other != autosave for other in find_autosaves(session))
+
+    return next(session for session in _numbered_paths(path) if not taken(session))
+
+
+def stem(session: Path) -> str:
+    """A session's name without its endings."""
+    return session.name.removesuffix(SUFFIX) if session.name.endswith(SUFFIX) else session.stem
+
+
+def _numbered_paths(session: Path, kind: str = "") -> Iterator[Path]:
+    """NAME, NAME-2, NAME-3 …; with a kind NAME.kind, NAME.kind-2 …"""
+    name, number = stem(session) + f".{kind}" * bool(kind), 1
+    while True:
+        yield session.with_name(name + f"-{number}" * (number > 1) + SUFFIX)
+        number += 1

@@ -55,23 +55,23 @@ class TimelineFile(msgspec.Struct, frozen=True):
     ping_pong: bool = False
 
 
-def move_keys(shown: Timeline, by: Vec3) -> Timeline:
+def move_keys(timeline: Timeline, by: Vec3) -> Timeline:
     """The same film of a scene that lies elsewhere; see `move_camera`."""
     return replace(
-        shown,
+        timeline,
         keys=tuple(
             replace(key, camera=None if key.camera is None else move_camera(key.camera, by))
-            for key in shown.keys
+            for key in timeline.keys
         ),
     )
 
 
-def save(path: Path, shown: Timeline, layers: Sequence[LayerState], origin: Origin = ZERO) -> None:
+def save(path: Path, timeline: Timeline, layers: Sequence[LayerState], origin: Origin = ZERO) -> None:
     """Write a timeline, its cameras in the world, whole or not at all.
 
     Args:
         path: where to
-        shown: what to write; strengths of edits that are no longer open are left out
+        timeline: what to write; strengths of edits that are no longer open are left out
         layers: give the edits their names
         origin: of the scene, which the cameras are relative to
 
@@ -79,15 +79,15 @@ def save(path: Path, shown: Timeline, layers: Sequence[LayerState], origin: Orig
         ProgdfError: the folder does not exist.
         OSError: it cannot be written.
     """
-    shown = move_keys(shown, origin)
+    timeline = move_keys(timeline, origin)
     names = {layer.gdf: layer.name for layer in layers}
     keys = tuple(
         FileKey(
             key.frame, {names[gdf]: s for gdf, s in key.strengths if gdf in names}, key.camera, key.easing
         )
-        for key in shown.keys
+        for key in timeline.keys
     )
-    file = TimelineFile(VERSION, keys, shown.length, shown.fps, shown.ping_pong)
+    file = TimelineFile(VERSION, keys, timeline.length, timeline.fps, timeline.ping_pong)
     with atomic_write(path) as temporary_file:
         temporary_file.write_text(json.dumps(plain(file), indent=2) + "\n", encoding="utf-8")
 
@@ -110,26 +110,26 @@ def load(path: Path, layers: Sequence[LayerState], origin: Origin = ZERO) -> Tim
         raise ProgdfError(f"{path} is a timeline of version {value[MARK]!r}; this progdf reads {VERSION}")
     try:
         file = convert_json(value, TimelineFile, closed=True)
-        found = _of_layers(file, layers)
-        check(found, "keys")
+        timeline = _of_layers(file, layers)
+        check(timeline, "keys")
     except ValueError as error:
         raise ProgdfError(f"{path} cannot be read: {error}; correct it, or write it again") from None
     x, y, z = origin
-    return move_keys(found, (-x, -y, -z))
+    return move_keys(timeline, (-x, -y, -z))
 
 
-def check(found: Timeline, where: str) -> None:
+def check(timeline: Timeline, where: str) -> None:
     """Whether the keys fit each other and the length.
 
     Raises:
         ValueError: they do not; the message names the key.
     """
-    for i, key in enumerate(found.keys):
-        if key.frame > found.length:
-            raise ValueError(f"{where}[{i}].frame is {key.frame}, outside 0 to the length, {found.length}")
+    for i, key in enumerate(timeline.keys):
+        if key.frame > timeline.length:
+            raise ValueError(f"{where}[{i}].frame is {key.frame}, outside 0 to the length, {timeline.length}")
         if key.camera is not None and not any(key.camera.up):
             raise ValueError(f"{where}[{i}].camera has an up axis without a direction")
-    if any(before.frame >= after.frame for before, after in pairwise(found.keys)):
+    if any(before.frame >= after.frame for before, after in pairwise(timeline.keys)):
         raise ValueError(f"{where} has two keys at one frame, or not in their order")
 
 

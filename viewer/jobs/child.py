@@ -16,8 +16,11 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
+
+from msgspec import Meta
 
 GRACE_S = 8.0
 """After which a child that was asked to stop is killed: it may be saving its state."""
@@ -30,6 +33,16 @@ STARVED_S = 5.0
 """Between two looks at whether a child gets the processor."""
 
 _TALKS = "--talks"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a command is; the trainer writes it to RUN/state/progress.json."""
+
+    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # of its whole time
+    label: str = ""  # what it does, "" while it starts
+    loss: str = ""  # of the training, "" where there is none
+    seconds: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0  # that were spent on a run, in all its sessions
 
 
 class Child:
@@ -66,16 +79,16 @@ class Child:
                 nice = os.getpriority(os.PRIO_PROCESS, 0) + NICE
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
         self.log = log
-        self._asked_at: float | None = None
+        self._stopped_at: float | None = None
         self._starved, self._seen = False, (time.monotonic(), 0.0, 0.0)
 
     @property
     def status(self) -> int | None:
         """The exit status; None while it runs. One that will not stop is killed."""
-        found = self._process.poll()
-        if found is None and self._asked_at is not None and time.monotonic() - self._asked_at > GRACE_S:
+        status = self._process.poll()
+        if status is None and self._stopped_at is not None and time.monotonic() - self._stopped_at > GRACE_S:
             self.kill()
-        return found
+        return status
 
     @property
     def pid(self) -> int:
@@ -121,8 +134,8 @@ class Child:
 
     def stop(self) -> None:
         """Ask it to stop: it saves what it has done."""
-        if self._asked_at is None:
-            self._asked_at = time.monotonic()
+        if self._stopped_at is None:
+            self._stopped_at = time.monotonic()
             if self._process.stdin is not None:
                 with contextlib.suppress(OSError):
                     self._process.stdin.close()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.jobs.new_edit import (
+from viewer.jobs.training import (
     ALL,
     BEST_STYLES,
     CHANGED,

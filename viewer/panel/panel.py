@@ -11,9 +11,8 @@ from imgui_bundle import imgui
 from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import ViewCamera
-from viewer.jobs.delivery import Delivery
-from viewer.jobs.new_edit import NewEdit
-from viewer.jobs.training_job import TrainingJob
+from viewer.jobs.job_queue import Job
+from viewer.jobs.training import NewEdit
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState, cards_shown
 from viewer.state.workspace import Pointed
@@ -74,8 +73,7 @@ class PanelInput:
         unrecorded: why there is nothing recorded to compare with, "" where there is
         form: of a new edit; None while it is closed
         form_input: what that form shows
-        jobs: what is being trained
-        deliveries: what is being exported and rendered
+        jobs: what is being trained, exported and rendered
         recent: files opened before, the last one first
         selected, search, searching: as in `Cards`
         snapshot_slider: between two snapshots
@@ -95,8 +93,7 @@ class PanelInput:
     unrecorded: str = ""
     form: NewEdit | None = None
     form_input: FormInput = FormInput()
-    jobs: Sequence[TrainingJob] = ()
-    deliveries: Sequence[Delivery] = ()
+    jobs: Sequence[Job] = ()
     recent: Sequence[Path] = ()
     selected: frozenset[int] = frozenset()
     search: str = ""
@@ -161,7 +158,6 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         form, asked = new_edit_form.draw(form, shown.form_input, ui)
         actions += [asked] if asked else []
     actions += training_cards.draw(shown.jobs, ui)
-    actions += training_cards.draw_deliveries(shown.deliveries, ui)
     cards = layer_card.Cards(
         shown.rows,
         shown.focus,
@@ -173,7 +169,7 @@ def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
         shown.search,
         shown.searching,
     )
-    expected = bool(shown.jobs or shown.deliveries) or form is not None
+    expected = bool(shown.jobs) or form is not None
     drawn = layer_cards.draw(state, cards, ui, expected)
     state, focus = drawn.state, drawn.focus
     actions += drawn.actions

@@ -1,4 +1,4 @@
-"""Runs of the trainer in the panel: a card each, with its progress, and what can be done with it."""
+"""Jobs in the panel, training and deliveries: a card each, with its progress and buttons."""
 
 from __future__ import annotations
 
@@ -7,51 +7,25 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.jobs.delivery import Delivery
-from viewer.jobs.training_job import TrainingJob, duration
+from viewer.jobs.job_queue import Job
+from viewer.jobs.training import EditOrder, duration
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import card, elide, menu, right_edge, small, small_toggle, tip
 
 BAR_PX = 5.0
 STARVED = "Waits for the processor"
 _MENU = "menu of a training"
+_UNWRITTEN = "Nothing is written"
 
 
-def draw(jobs: Sequence[TrainingJob], ui: UiContext) -> list[str]:
-    """One card a run, the next one at the bottom; the actions that were asked for."""
+def draw(jobs: Sequence[Job], ui: UiContext) -> list[str]:
+    """One card a job, the next one at the bottom; the actions that were asked for."""
     actions: list[str] = []
     for job in jobs:
         if job.status != "done" or job.warning:
             imgui.push_id(job.number)
             actions += _card(_job_row(job), job.number, ui)
             imgui.pop_id()
-    return actions
-
-
-def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
-    """The same for what is being exported and rendered."""
-    actions: list[str] = []
-    for delivery in deliveries:
-        share = delivery.done / delivery.total if delivery.total else 0.0
-        left = delivery.seconds_left
-        said = (
-            [f"frame {delivery.done} of {delivery.total}"]
-            if delivery.total
-            else [delivery.note or "Starting"]
-        )
-        said += [f"{duration(left)} left"] if left is not None else []
-        said = [STARVED] if delivery.starved else said
-        said = [f"For {delivery.elsewhere}", *said] if delivery.elsewhere else said
-        failed = delivery.status == "failed"
-        line = (
-            delivery.error if failed else "Stopping" if delivery.status == "stopping" else "  ·  ".join(said)
-        )
-        stop = ("Close", "stop_delivery", "") if failed else ("Stop", "stop_delivery", "Nothing is written")
-        word = "Failed" if failed else f"{100 * share:.0f} %" if share else ""
-        imgui.push_id(f"delivery {delivery.number}")
-        row = _Row(delivery.title, str(delivery.out), word, share, line, failed, not failed, (stop,))
-        actions += _card(row, delivery.number, ui)
-        imgui.pop_id()
     return actions
 
 
@@ -70,9 +44,11 @@ class _Row:
     menu: tuple[tuple[str, str, bool], ...] = ()
 
 
-def _job_row(job: TrainingJob) -> _Row:
-    order, failed = job.order, job.status == "failed" or bool(job.warning)
-    about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
+def _job_row(job: Job) -> _Row:
+    task, failed = job.task, job.status == "failed" or bool(job.warning)
+    about = str(task.out)
+    if isinstance(task, EditOrder):
+        about = f"{task.name}\n{task.editor} on {task.region}\n{task.out}"
     said = (
         (job.error or job.warning)
         if failed
@@ -80,8 +56,8 @@ def _job_row(job: TrainingJob) -> _Row:
     )
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
-    row = _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
-    return row if job.status == "queued" else replace(row, menu=items)
+    row = _Row(task.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
+    return replace(row, menu=items) if isinstance(task, EditOrder) and job.status != "queued" else row
 
 
 def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
@@ -98,7 +74,7 @@ def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
         return [f"{action}:{number}" for action in actions]
 
 
-def _status(job: TrainingJob) -> str:
+def _status(job: Job) -> str:
     match job.status:
         case "running":
             return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
@@ -173,38 +149,44 @@ def _menu(row: _Row, ui: UiContext) -> list[str]:
     return actions
 
 
-def _said(job: TrainingJob) -> str:
+def _said(job: Job) -> str:
     progress = job.progress
     match job.status:
         case "running" if job.starved:
             return STARVED
         case "running":
             left = job.seconds_left
-            finding = not progress.doing and job.order.region == "changed"
-            words = ["Finding what changed" if finding else progress.said]
+            finds = isinstance(job.task, EditOrder) and job.task.region == "changed"
+            starting = "Finding what changed" if finds else "Starting"
+            words = [progress.label or starting]
             words += [f"{duration(left)} left"] if left is not None else []
-            words += [f"loss {progress.loss}"] if progress.loss and progress.doing == "optimize" else []
+            words += [f"loss {progress.loss}"] if progress.loss else []
             return "  ·  ".join(words)
         case "queued":
             return "Waits for the one before"
         case "stopping":
-            return "Saving what is done"
+            return "Saving what is done" if isinstance(job.task, EditOrder) else _UNWRITTEN
         case "elsewhere":
             return "Trains in another window"
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
 
 
-def _buttons(job: TrainingJob) -> tuple[tuple[str, str, str], ...]:
+def _buttons(job: Job) -> tuple[tuple[str, str, str], ...]:
     """Text, action and help."""
+    trains = isinstance(job.task, EditOrder)
     match job.status:
         case "running":
-            return (("Stop", "stop_run", "Stop; it can be resumed, also another day"),)
+            return (
+                ("Stop", "stop_run", "Stop; it can be resumed, also another day" if trains else _UNWRITTEN),
+            )
         case "queued":
             return (("Cancel", "stop_run", "Take it off the queue"),)
         case "stopped":
             return (("Resume", "resume_run", "Go on where it was stopped"),)
-        case "failed":
+        case "failed" if trains:
             return (("Retry", "resume_run", "Try again"),)
+        case "failed":
+            return (("Close", "close_run", ""),)
         case "done":
             return (("Close", "close_run", "Takes the card away; the edit stays"),)
     return ()

@@ -15,7 +15,7 @@ from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.named_views import look_at_view
 from viewer.camera.view_camera import FARTHEST
-from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED
+from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED
 from viewer.state import comparison as compare
 from viewer.state import history, layer_selection, paint, playback, selection, snapshots
 from viewer.state import layers as stack

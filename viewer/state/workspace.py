@@ -15,9 +15,8 @@ from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask
 from viewer.camera.named_views import Glide, glide_on
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
-from viewer.jobs.delivery import DeliverOptions, Delivery
-from viewer.jobs.new_edit import NewEdit
-from viewer.jobs.training_job import TrainingJob
+from viewer.jobs.job_queue import DeliverOptions, Job
+from viewer.jobs.training import NewEdit
 
 from . import history, playback, timeline
 from .history import Edit, History
@@ -34,8 +33,17 @@ UNSAVED = "• "
 REQUESTS = (
     *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
-    *("train", "stop_run", "resume_run", "ask_discard", "discard_run", "run_log", "stop_and_quit"),
-    *("export", "render_picture", "render_film", "deliver", "stop_delivery", "drop_and_quit"),
+    *(
+        "train",
+        "stop_run",
+        "resume_run",
+        "ask_discard",
+        "discard_run",
+        "close_run",
+        "run_log",
+        "stop_and_quit",
+    ),
+    *("export", "render_picture", "render_film", "deliver", "drop_and_quit"),
     *("about", "demo"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
     *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up", "hide_strays"),
@@ -145,8 +153,7 @@ class Workspace:
         form: of a new edit, as it was last left
         form_open: whether it is shown
         form_opening: it was opened and has no keyboard yet
-        jobs: what is being trained, or waits for that, as the window last looked
-        deliveries: what is being exported and rendered
+        jobs: what is being trained, exported and rendered, or waits for that, as the window last looked
         before: the original is shown, until its key is tapped again or a slider moves
         glide: the camera on its way to a view that was asked for, or None
     """
@@ -173,8 +180,7 @@ class Workspace:
     form: NewEdit = NewEdit()
     form_open: bool = False
     form_opening: bool = False
-    jobs: tuple[TrainingJob, ...] = ()
-    deliveries: tuple[Delivery, ...] = ()
+    jobs: tuple[Job, ...] = ()
     before: bool = False
     glide: Glide | None = None
 

@@ -20,7 +20,7 @@ from progdf.io.atomic import atomic_write, is_temporary
 from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.io.npy import open_npy
-from progdf.io.session import read_session, sha256
+from progdf.io.session import SessionFile, read_session, sha256
 from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.refused import refusal
 
@@ -143,8 +143,12 @@ def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) ->
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == ["new.txt", "old.txt"]
 
 
+def read_session_file(path: Path) -> SessionFile:
+    return read_session(path, SessionFile)
+
+
 @pytest.mark.parametrize(
-    "read", [load_scene, load_gdf, kind_of, load_cameras, open_npy, open_picture, read_session, sha256]
+    "read", [load_scene, load_gdf, kind_of, load_cameras, open_npy, open_picture, read_session_file, sha256]
 )
 def test_a_pipe_that_is_read_from_is_refused_and_not_waited_for(
     read: Callable[[Path], object], tmp_path: Path

@@ -10,7 +10,7 @@ from progdf.cli.info import main as info
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import DEEPEST, decode_json
-from progdf.io.session import read_session
+from progdf.io.session import SessionFile, read_session
 from tests.helpers.hostile import JSON_TEXTS
 from trainer.store.state import StateFolder
 from viewer.files import timeline_file
@@ -47,7 +47,7 @@ def test_ordinary_values_come_as_they_are() -> None:
 def test_every_reader_refuses_it_in_one_line(frame: str, content: str, tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(frame % content)
-    readers = [lambda: info([str(path)]), lambda: load_cameras(path), lambda: read_session(path)]
+    readers = [lambda: info([str(path)]), lambda: load_cameras(path), lambda: read_session(path, SessionFile)]
     for read in [*readers, lambda: timeline_file.load(path, ())]:
         with pytest.raises(ProgdfError) as refused:
             read()

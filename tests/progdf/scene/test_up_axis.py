@@ -26,8 +26,7 @@ from tests.helpers.stacks import bear_stack
 from trainer.setup.resolution import ViewSettings
 from trainer.setup.training_setup import make_training_setup
 from viewer.camera.view_camera import first_camera
-from viewer.commands import opening
-from viewer.commands.options import RenderOptions
+from viewer.commands.options import RenderOptions, open_stack
 from viewer.files import session
 
 MINUS_Y = [0.0, -1.0, 0.0]
@@ -151,7 +150,8 @@ def test_a_saved_up_axis_comes_back_and_nonsense_does_not() -> None:
 
 
 def test_an_axis_may_begin_with_a_minus_on_the_command_line() -> None:
-    assert parse_options(RenderOptions, ["a.ply", "--up", "-z", "-o", "b.png"], "progdf render").up == "-z"
+    words = ["a.ply", "--up", "-z", "-o", "b.png"]
+    assert parse_options(RenderOptions, words, "progdf render").drawing.up == "-z"
 
 
 def test_check_prints_boxes_to_paste_and_the_up_axis(
@@ -181,7 +181,7 @@ def test_check_prints_boxes_to_paste_and_the_up_axis(
 
 def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:
     options = parse_options(RenderOptions, [*arguments, "-o", str(tmp_path / "p.png")], "progdf render")
-    found = opening.open_stack(options)
+    found = open_stack(options.stack, options.drawing)
     return found.up if found.session is None else found.view.camera.up
 
 
@@ -199,7 +199,7 @@ def test_a_session_keeps_the_up_axis_and_up_changes_it(tmp_path: Path) -> None:
     stack = bear_stack(2000)
     scene, _, _ = stack.save(tmp_path)
     options = parse_options(RenderOptions, [str(scene), "-o", "p.png"], "progdf render")
-    found = opening.open_stack(options)
+    found = open_stack(options.stack, options.drawing)
     view = replace(found.view, camera=first_camera(found.document.scene, up=(0.0, 0.0, 1.0)))
     session.save(tmp_path / "a.session.json", session.WindowSession(found.document, view))
     assert upright(tmp_path, str(tmp_path / "a.session.json")) == (0.0, 0.0, 1.0)

@@ -18,7 +18,8 @@ from tests.helpers.sessions import bear_files, full_view, opened_document, saved
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
-from viewer.files import autosave, exports, recent, session
+from viewer.files import exports, session
+from viewer.files.user_files import read_recent, remember_recent
 from viewer.state import workspace
 from viewer.state.workspace import Dialog
 
@@ -58,22 +59,26 @@ def test_the_recent_files_are_scenes_and_sessions_the_last_twelve(tmp_path: Path
     (tmp_path / "memory" / "recent.txt").write_text(
         "".join(f"{file}\n" for file in others)
     )  # of an older version
-    assert recent.read(tmp_path / "memory") == ()
+    assert read_recent(tmp_path / "memory") == ()
     for file in (*files, *others):
-        recent.remember([file], tmp_path / "memory")
-    assert recent.read(tmp_path / "memory") == tuple(files[:-13:-1])
+        remember_recent([file], tmp_path / "memory")
+    assert read_recent(tmp_path / "memory") == tuple(files[:-13:-1])
 
 
 def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("a.ply", "b.session.json", "c.ply")]
     for file in files:
         file.touch()
-    recent.remember(files[:2], tmp_path / "memory")
-    assert recent.remember([files[2], files[0]], tmp_path / "memory") == (files[0], files[2], files[1])
+    remember_recent(files[:2], tmp_path / "memory")
+    assert remember_recent([files[2], files[0]], tmp_path / "memory") == (
+        files[0],
+        files[2],
+        files[1],
+    )
     files[2].unlink()
-    assert recent.read(tmp_path / "memory") == (files[0], files[1])
+    assert read_recent(tmp_path / "memory") == (files[0], files[1])
     (tmp_path / "blocked").touch()
-    assert recent.remember([files[0]], tmp_path / "blocked") == (files[0],), "no place for it is no error"
+    assert remember_recent([files[0]], tmp_path / "blocked") == (files[0],), "no place for it is no error"
 
 
 @pytest.mark.gl
@@ -143,10 +148,10 @@ def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
     assert window.file_actions.autosave(0.0) is None, "nothing to lose"
     press(window, "Shift+Left")
     waits = window.file_actions.autosave(10.0)
-    assert waits == autosave.AUTOSAVE_S
+    assert waits == session.AUTOSAVE_S
     beside = folder / "bear.autosave.session.json"
     assert not beside.exists()
-    assert window.file_actions.autosave(10.0 + autosave.AUTOSAVE_S) is None
+    assert window.file_actions.autosave(10.0 + session.AUTOSAVE_S) is None
     assert session.open_session(beside).view.layers == window.main_view.work.view.layers
     assert window.file_actions.autosave(99.0) is None, "the same again is not written again"
     window.file_actions.save(folder / "bear.session.json")
@@ -171,7 +176,7 @@ def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.Ap
 def left_over(window: application.App, folder: Path) -> Path:
     """An autosave of the present work as a crash leaves it: the window knows nothing of it."""
     window.file_actions.autosave(0.0)
-    window.file_actions.autosave(autosave.AUTOSAVE_S)
+    window.file_actions.autosave(session.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
     kept = beside.read_bytes()
     window.file_actions.handle("discard")
@@ -193,7 +198,7 @@ def test_a_new_sessions_autosave_never_takes_the_place_of_one_that_was_left(
     assert beside not in window.main_view.recent
     press(window, "Escape", "Shift+Left")
     window.file_actions.autosave(100.0)
-    window.file_actions.autosave(100.0 + autosave.AUTOSAVE_S)
+    window.file_actions.autosave(100.0 + session.AUTOSAVE_S)
     assert beside.read_bytes() == kept
     own = [path for path in folder.glob("*.autosave*") if path != beside]
     assert [session.open_session(path).view.layers for path in own] == [window.main_view.work.view.layers]
@@ -209,20 +214,20 @@ def test_discarded_work_stays_under_another_name_the_last_three(
     window: application.App, folder: Path
 ) -> None:
     strengths = []
-    for _ in range(autosave.MOST_DISCARDED + 2):
+    for _ in range(session.MOST_DISCARDED + 2):
         press(window, "Shift+Left")
         left_over_now = folder / "bear.autosave.session.json"
         window.file_actions.autosave(0.0)
-        window.file_actions.autosave(autosave.AUTOSAVE_S)
+        window.file_actions.autosave(session.AUTOSAVE_S)
         strengths.append(window.main_view.work.view.layers[-1].strength)
         window.file_actions.offer_autosave()
         assert window.main_view.work.dialog is None, "its own autosave is nothing that was left"
         window.file_actions.handle(f"discard_autosave:{left_over_now}")
-        window.file_actions.session_autosave = autosave.SessionAutosave()
+        window.file_actions.session_autosave = session.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
-    assert len(kept) == autosave.MOST_DISCARDED
+    assert len(kept) == session.MOST_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
-    assert sorted(found) == sorted(strengths[-autosave.MOST_DISCARDED :])
+    assert sorted(found) == sorted(strengths[-session.MOST_DISCARDED :])
     window.file_actions.handle("discard")
     window.open(kept[-1])
     assert window.file_actions.path is None, "saving it asks where"

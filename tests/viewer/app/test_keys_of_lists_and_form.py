@@ -12,8 +12,8 @@ from imgui_bundle import imgui
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera import controls, inputs
 from viewer.camera.inputs import Keys, Press
-from viewer.jobs.delivery import DeliverOptions
-from viewer.jobs.new_edit import EDITORS
+from viewer.jobs.job_queue import DeliverOptions
+from viewer.jobs.training import EDITORS
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
 

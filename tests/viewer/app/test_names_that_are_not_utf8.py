@@ -13,7 +13,7 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.files import document as documents
-from viewer.files import recent
+from viewer.files import user_files
 
 pytestmark = pytest.mark.gl
 
@@ -34,7 +34,7 @@ def test_the_title_and_the_recent_files_are_shown_and_the_file_is_found_again(
 ) -> None:
     assert opened.document.title == "b\\udce4r.ply"
     press(opened, "Ctrl+O")
-    assert opened.main_view.recent == (opened.document.path,) == recent.read(tmp_path / "memory")
+    assert opened.main_view.recent == (opened.document.path,) == user_files.read_recent(tmp_path / "memory")
 
 
 def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: application.App) -> None:

@@ -105,7 +105,7 @@ def test_no_action_ends_the_window(
 
 
 def test_no_request_ends_the_window(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
-    for part in (window.training, window.deliver, window.start, window.up, window.file_actions):
+    for part in (window.jobs, window.deliver, window.start, window.up, window.file_actions):
         monkeypatch.setattr(part, "handle", raises(BrokenError("in a request")))
     monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
     monkeypatch.setattr(window.window, "toggle_full_screen", raises(BrokenError("in a request")))
@@ -164,7 +164,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_panel_and_undo(
     assert window.main_view.work.view.layers[-1].strength == 0.5
 
 
-@pytest.mark.parametrize("part", ["training", "preview", "deliver", "start", "up"])
+@pytest.mark.parametrize("part", ["jobs", "preview", "start", "up"])
 def test_no_job_ends_the_window_and_it_is_looked_at_again(
     window: application.App, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +184,7 @@ def test_what_the_person_can_mend_is_one_line_without_a_log(
             "a.ply cannot be read or written: No space left on device",
         ),
     ):
-        monkeypatch.setattr(window.training, "poll", raises(error))
+        monkeypatch.setattr(window.jobs, "poll", raises(error))
         turns(window)
         assert (message(window).text, message(window).details) == (line, "")
     assert not (tmp_path / "memory" / LOG).exists()

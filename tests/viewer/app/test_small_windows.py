@@ -11,7 +11,7 @@ from imgui_bundle import imgui
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera import view_camera as turntable
 from viewer.camera.view_camera import ViewCamera
-from viewer.files import recent
+from viewer.files import user_files
 from viewer.files.document import Document
 from viewer.panel import panel, timeline_bar
 from viewer.state import workspace
@@ -35,7 +35,7 @@ def test_every_question_lies_within_the_window_with_many_recent_files(
 ) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
-        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(recent.MOST))
+        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MOST_RECENT))
         hand.main_view.ask(
             Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
         )

@@ -15,10 +15,10 @@ from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import first_camera
-from viewer.files import small_pictures
 from viewer.files.document import empty
-from viewer.jobs import delivery, run_files, training_queue
-from viewer.jobs.new_edit import SELECTION, TYPED
+from viewer.files.user_files import load_thumbnail
+from viewer.jobs import job_queue
+from viewer.jobs.training import SELECTION, TYPED
 from viewer.state import selection
 from viewer.state.view_state import ViewState
 
@@ -32,6 +32,7 @@ class Trainer:
     ended: int | None = None
     line = ""
     edit: Path | None = None
+    starved = False
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
         type(self).said = arguments
@@ -58,8 +59,7 @@ class Trainer:
 @pytest.fixture
 def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[application.App]:
     folder = bear_files(tmp_path)
-    monkeypatch.setattr(training_queue, "Child", Trainer)
-    monkeypatch.setattr(delivery, "Child", Trainer)
+    monkeypatch.setattr(job_queue, "Child", Trainer)
     Trainer.ended, Trainer.line, Trainer.edit = None, "", folder / "edits" / "scarf.gdf"
     with null_app(replace(opened_document(folder), gdfs=(), gdf_paths=()), first_view(bear()), folder) as app:
         app.main_view.work = replace(
@@ -86,7 +86,7 @@ def test_an_edit_is_trained_and_comes_as_a_layer_at_full_strength(window: applic
     request(window, "train")
     assert not window.main_view.work.form_open
     (job,) = window.main_view.work.jobs
-    assert (job.status, job.order.name) == ("running", "blue")
+    assert (job.status, job.task.name) == ("running", "blue")
     assert "--editor=recolor:#3061d1" in Trainer.said
     Trainer.ended = 0
     turn(window)
@@ -142,10 +142,10 @@ def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
 def test_a_training_is_discarded_only_after_a_question(window: application.App) -> None:
     request(window, "train")
     (job,) = window.main_view.work.jobs
-    state = job.order.out / "state"
+    state = job.task.out / "state"
     state.mkdir(parents=True)
     (state / "run.json").touch()
-    (state / "progress.json").write_text('{"doing": "optimize", "done": 1, "total": 2, "seconds": 2280}')
+    (state / "progress.json").write_text('{"share": 0.5, "label": "Training", "seconds": 2280}')
     request(window, f"stop_run:{job.number}")
     turn(window)
     assert window.main_view.work.jobs[0].status == "stopped"
@@ -160,17 +160,17 @@ def test_a_training_is_discarded_only_after_a_question(window: application.App) 
     press(window, "D")
     turn(window)
     assert window.main_view.work.jobs == ()
-    assert not job.order.out.exists()
+    assert not job.task.out.exists()
 
 
 def test_what_trains_in_another_window_stays_its_own(window: application.App) -> None:
     request(window, "train")
     (job,) = window.main_view.work.jobs
-    (job.order.out / "state").mkdir(parents=True)
-    (job.order.out / "state" / "run.json").touch()
+    (job.task.out / "state").mkdir(parents=True)
+    (job.task.out / "state" / "run.json").touch()
     request(window, f"stop_run:{job.number}")
     turn(window)
-    with run_files.hold_run(job.order):
+    with job.task.lock():
         for asked in ("resume_run", "discard_run"):
             request(window, f"{asked}:{job.number}")
             told = window.main_view.work.message
@@ -178,10 +178,10 @@ def test_what_trains_in_another_window_stays_its_own(window: application.App) ->
                 assert told is not None
                 assert told.text == "blue trains in another window; stop it there first"
             assert window.main_view.work.jobs[0].status == "elsewhere"
-    assert (job.order.out / "state" / "run.json").is_file()
-    (job.order.out / "state" / "run.json").unlink()
-    job.order.gdf.touch()
-    window.training.queue._look_at = 0.0
+    assert (job.task.out / "state" / "run.json").is_file()
+    (job.task.out / "state" / "run.json").unlink()
+    job.task.result.touch()
+    window.jobs.queue._look_at = 0.0
     turn(window)
     assert (window.main_view.work.jobs, window.main_view.work.view.layers) == ((), ())
     assert window.main_view.work.message is not None
@@ -208,12 +208,13 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     assert asked.text == str(tmp_path / "bear_edited.ply")
     press(window, "Enter")
     assert window.main_view.work.dialog is None
+    turn(window)
     assert Trainer.said[0] == "export"
-    assert Trainer.said[-1] == f"--out={tmp_path / 'bear_edited.ply'}"
-    assert [shown.status for shown in window.main_view.work.deliveries] == ["running"]
+    assert Trainer.said[1] == f"--out={tmp_path / 'bear_edited.ply'}"
+    assert [job.status for job in window.main_view.work.jobs] == ["running"]
     Trainer.ended = 0
     turn(window)
-    assert window.main_view.work.deliveries == ()
+    assert window.main_view.work.jobs == ()
     Trainer.ended = None
     press(window, "Ctrl+P")
     (tmp_path / "bear_edited.png").touch()
@@ -223,6 +224,7 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     assert asked.error == "bear_edited.png exists; give another name, or press again to replace it"
     press(window, "Enter")
     assert window.main_view.work.dialog is None
+    turn(window)
     assert Trainer.said[0] == "render"
     press(window, "Ctrl+Shift+P")
     assert window.main_view.work.message is not None
@@ -263,7 +265,7 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
         assert app.main_view.work.view.camera.distance == first_camera(app.document.scene).distance
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
-    assert small_pictures.load(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
+    assert load_thumbnail(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
 
 
 def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
@@ -274,16 +276,14 @@ def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
     press(window, "Ctrl+E", "Enter")
     window.open(tmp_path / "half.ply")
     turn(window)
-    (job,), (delivery,) = window.main_view.work.jobs, window.main_view.work.deliveries
+    job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere, delivery.elsewhere) == ("running", "bear.ply", "bear.ply")
     Trainer.ended, Trainer.line = 2, "the disk is full"
     turn(window)
     turn(window)
-    assert (window.main_view.work.jobs, window.main_view.work.deliveries) == ((), ()), (
-        "what failed is the scene's"
-    )
+    assert window.main_view.work.jobs == (), "what failed is the scene's"
     window.open(tmp_path / "bear.ply")
     turn(window)
-    (job,), (delivery,) = window.main_view.work.jobs, window.main_view.work.deliveries
+    job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere) == ("failed", "")
     assert (delivery.status, delivery.elsewhere) == ("failed", "")

@@ -11,11 +11,11 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
-from viewer.app.studio.start_page import RecentFile
+from viewer.app.studio.pages import RecentFile
 from viewer.files.document import empty
-from viewer.jobs.delivery import DeliverOptions, Delivery
-from viewer.jobs.new_edit import TYPED, NewEdit
-from viewer.jobs.training_job import EditOrder, Progress, TrainingJob
+from viewer.jobs.child import Progress
+from viewer.jobs.job_queue import DeliverOptions, Delivery, Job
+from viewer.jobs.training import TYPED, EditOrder, NewEdit
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context
 from viewer.state.view_state import ViewState
@@ -66,19 +66,22 @@ def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
 
 def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
-    running = TrainingJob(1, order, "running", Progress(0.45, "optimize", "0.0114"), 20.0)
+    running = Job(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     line = "region 'sphere:99,99,99,1' holds no Gaussian"
     jobs = (
         running,
-        TrainingJob(2, replace(order, name="gold")),
-        TrainingJob(3, replace(order, name="night"), "stopped", Progress(0.6)),
-        TrainingJob(4, replace(order, name="dusk"), "elsewhere", Progress(0.3)),
-        replace(running, number=5, order=replace(order, name="frost"), starved=True),
-        TrainingJob(6, replace(order, name="nowhere"), "failed", error=line),
+        Job(2, replace(order, name="gold")),
+        Job(3, replace(order, name="night"), "stopped", Progress(0.6)),
+        Job(4, replace(order, name="dusk"), "elsewhere", Progress(0.3)),
+        replace(running, number=5, task=replace(order, name="frost"), starved=True),
+        Job(6, replace(order, name="nowhere"), "failed", error=line),
     )
-    film = Delivery(1, "Rendering film.mp4", Path("/scenes/film.mp4"), done=30, total=96, seconds=10.0)
+    film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
+    frames = Progress(30 / 96, "frame 30 of 96")
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
-        hand.main_view.work = replace(hand.main_view.work, jobs=jobs, deliveries=(film,))
+        hand.main_view.work = replace(
+            hand.main_view.work, jobs=(*jobs, Job(7, film, "running", frames, 10.0))
+        )
         hand.settle()
         hand.frame(3)
         screenshot("ui_training", hand.image()[:, 700:])
@@ -94,10 +97,10 @@ def test_the_question_about_a_film(screenshot: Compare) -> None:
 
 def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
-    running = TrainingJob(1, order, "running", Progress(0.45, "optimize", "0.0114"), 20.0)
+    running = Job(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
 
-        def asked(job: TrainingJob, x: float, y: float) -> tuple[str, ...]:
+        def asked(job: Job, x: float, y: float) -> tuple[str, ...]:
             hand.main_view.work = replace(hand.main_view.work, jobs=(job,))
             hand.settle()
             hand.click(x, y)

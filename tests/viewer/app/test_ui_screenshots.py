@@ -12,7 +12,7 @@ from imgui_bundle import imgui
 
 from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app.studio.up_strip import UpChoice, UpStrip
+from viewer.app.studio.pages import UpChoice, UpStrip
 from viewer.camera.inputs import Keys
 from viewer.panel import panel
 from viewer.render.timings import FrameTimings

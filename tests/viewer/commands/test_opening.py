@@ -254,3 +254,12 @@ def test_a_session_without_keys_cannot_be_filmed(here: Path, capsys: pytest.Capt
     saved(here, replace(full_view(), timeline=Timeline()))
     assert run("render", "work.session.json", "--timeline", "work.session.json", "-o", "a.gif") == 2
     assert "has no keys on its timeline" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["view", "render", "export"])
+def test_help_says_what_happens_without_an_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert [trace for trace in ("None", "False", "(default: )", "STR", "PATH") if trace in text] == []
+    assert "--set NAME=S" in text

@@ -22,7 +22,8 @@ from progdf.io.cameras import camera_in_picture, load_cameras, read_camera, save
 from progdf.rasterize import render
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import ViewCamera
-from viewer.commands.arguments import fit_camera, layers_of, parse_orbit
+from viewer.commands.options import StackOptions, stack_layers
+from viewer.commands.render import fit_camera, parse_orbit
 from viewer.files.document import load_edits
 from viewer.pictures import film
 
@@ -300,7 +301,8 @@ def test_a_second_edit_of_the_same_name_gets_a_number(stack: Stack, tmp_path: Pa
         save_gdf(tmp_path / file, stack.gdfs[0])
     gdfs = load_edits([tmp_path / "a.gdf", tmp_path / "b.gdf"], stack.scene, Path("bear.ply"))
     assert [gdf.name for gdf in gdfs] == ["scarf", "scarf-2"]
-    assert [layer.strength for layer in layers_of(gdfs, ["scarf-2=0.5"])] == [0.0, 0.5]
+    half = StackOptions(scene=Path("bear.ply"), set=("scarf-2=0.5",))
+    assert [layer.strength for layer in stack_layers(gdfs, half)] == [0.0, 0.5]
 
 
 def test_the_last_camera_is_minus_one(folder: Path, stack: Stack) -> None:

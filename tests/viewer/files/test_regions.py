@@ -14,7 +14,7 @@ from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
-from viewer.files import regions, session
+from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.selection import SelectionState
@@ -29,7 +29,7 @@ def chosen() -> SelectionState:
 
 
 def test_a_region_that_is_kept_is_one_that_progdf_trains(chosen: SelectionState, tmp_path: Path) -> None:
-    kept = regions.keep(chosen, "jacket", tmp_path, TOTAL)
+    kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
     assert [(region.name, region.count) for region in kept.regions] == [("jacket", MASK.sum())]
     found = parse_region(f"file:{tmp_path}/jacket.region.npy", bear().scene)
     assert found.members.tolist() == np.flatnonzero(MASK).tolist()
@@ -38,7 +38,9 @@ def test_a_region_that_is_kept_is_one_that_progdf_trains(chosen: SelectionState,
 
 def test_no_region_takes_the_place_of_another_file(chosen: SelectionState, tmp_path: Path) -> None:
     (tmp_path / "jacket.region.npy").write_bytes(b"somebody else's")
-    kept = regions.keep(regions.keep(chosen, "jacket", tmp_path, TOTAL), "jacket", tmp_path, TOTAL)
+    kept = exports.keep_region(
+        exports.keep_region(chosen, "jacket", tmp_path, TOTAL), "jacket", tmp_path, TOTAL
+    )
     assert [region.name for region in kept.regions] == ["jacket-2", "jacket-3"]
     assert (tmp_path / "jacket.region.npy").read_bytes() == b"somebody else's"
 
@@ -46,20 +48,20 @@ def test_no_region_takes_the_place_of_another_file(chosen: SelectionState, tmp_p
 def test_a_renamed_region_takes_its_file_along_and_is_written_again_after_undo(
     chosen: SelectionState, tmp_path: Path
 ) -> None:
-    kept = regions.keep(chosen, "jacket", tmp_path, TOTAL)
-    renamed = regions.rename(kept, 0, "coat", TOTAL)
+    kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
+    renamed = exports.rename_region(kept, 0, "coat", TOTAL)
     assert [path.name for path in tmp_path.iterdir()] == ["coat.region.npy"]
     assert (renamed.regions[0].name, renamed.regions[0].path) == ("coat", tmp_path / "coat.region.npy")
-    assert regions.rename(renamed, 0, "coat", TOTAL) == renamed
-    assert regions.region_file(kept.regions[0], TOTAL).exists(), "the state before knows what was in it"
+    assert exports.rename_region(renamed, 0, "coat", TOTAL) == renamed
+    assert exports.region_file(kept.regions[0], TOTAL).exists(), "the state before knows what was in it"
     assert np.load(kept.regions[0].path).tolist() == np.flatnonzero(MASK).tolist()
 
 
 def test_nothing_selected_and_no_folder_are_one_line(chosen: SelectionState, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="nothing is selected"):
-        regions.keep(SelectionState(), "jacket", tmp_path, TOTAL)
+        exports.keep_region(SelectionState(), "jacket", tmp_path, TOTAL)
     with pytest.raises(ProgdfError, match="does not exist"):
-        regions.keep(chosen, "jacket", tmp_path / "gone", TOTAL)
+        exports.keep_region(chosen, "jacket", tmp_path / "gone", TOTAL)
 
 
 def foreign_session(folder: Path, *paths: str) -> Path:
@@ -125,8 +127,8 @@ def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folde
     state = opened.view.selection
     assert f"region r0 (../victim.txt) and {len(paths) - 1} more named no" in opened.warning
     for i, region in enumerate(state.regions):
-        regions.region_file(region, TOTAL)
-        state = regions.rename(state, i, f"renamed {i}", TOTAL)
+        exports.region_file(region, TOTAL)
+        state = exports.rename_region(state, i, f"renamed {i}", TOTAL)
     after = contents(outside)
     made = {name: after.pop(name) for name in set(after) - set(before)}
     assert after == before
@@ -145,9 +147,9 @@ def test_files_of_a_sessions_own_folders_stay_with_their_regions(tmp_path: Path)
 
 
 def test_a_rename_leaves_a_file_that_holds_other_rows(chosen: SelectionState, tmp_path: Path) -> None:
-    kept = regions.keep(chosen, "jacket", tmp_path, TOTAL)
+    kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
     np.save(tmp_path / "jacket.region.npy", np.arange(3))
-    regions.rename(kept, 0, "coat", TOTAL)
+    exports.rename_region(kept, 0, "coat", TOTAL)
     assert np.load(tmp_path / "jacket.region.npy").tolist() == [0, 1, 2]
 
 

@@ -16,7 +16,7 @@ from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.io.json_values import plain
-from progdf.io.session import read_session, sha256
+from progdf.io.session import SessionFile, read_session, sha256
 from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session, spoilt
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
@@ -173,7 +173,7 @@ def test_what_no_window_wrote_is_refused_in_one_line(
 def test_what_is_no_session_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "odd.session.json").write_bytes(content)
     with pytest.raises(ProgdfError) as refused:
-        read_session(tmp_path / "odd.session.json")
+        read_session(tmp_path / "odd.session.json", SessionFile)
     assert "\n" not in str(refused.value)
 
 

@@ -20,7 +20,7 @@ from progdf.gaussians import ATTRIBUTES
 from tests.helpers.stacks import Stack, bear_stack
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import eye, to_camera
-from viewer.commands.layer_arguments import stack_of
+from viewer.commands.options import StackOptions, stack_layers
 from viewer.panel import layer_details as layer_fold
 from viewer.panel import panel
 from viewer.panel.strength_slider import parse_strength
@@ -374,19 +374,19 @@ def test_export_and_render_take_gains_solo_and_overshoot(
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"gains": ["scarf=0.5"]}, "write NAME:KIND=G, for example scarf:color=0.5"),
-        ({"gains": ["scarf:shine=0.5"]}, "the gains are geometry, opacity, color"),
-        ({"gains": ["scarf:color=2"]}, "the gain '2' is not a number from 0 to 1"),
-        ({"gains": ["scarf:color=nan"]}, "not a number from 0 to 1"),
-        ({"gains": ["hat:color=1"]}, "there is no edit of that name"),
+        ({"gain": ["scarf=0.5"]}, "write NAME:KIND=G, for example scarf:color=0.5"),
+        ({"gain": ["scarf:shine=0.5"]}, "the gains are geometry, opacity, color"),
+        ({"gain": ["scarf:color=2"]}, "the gain '2' is not a number from 0 to 1"),
+        ({"gain": ["scarf:color=nan"]}, "not a number from 0 to 1"),
+        ({"gain": ["hat:color=1"]}, "there is no edit of that name"),
         ({"solo": ["hat"]}, "--solo hat: there is no edit of that name"),
-        ({"settings": ["scarf=1.1"]}, "not a number from 0 to 1"),
-        ({"settings": ["scarf=1.3"], "overshoot": True}, "not a number from 0 to 1.2"),
+        ({"set": ["scarf=1.1"]}, "not a number from 0 to 1"),
+        ({"set": ["scarf=1.3"], "overshoot": True}, "not a number from 0 to 1.2"),
     ],
 )
 def test_a_slip_in_naming_layers_is_one_clear_line(options: dict[str, object], told: str) -> None:
     with pytest.raises(ProgdfError, match=told) as error:
-        stack_of(bear().gdfs, **{"settings": [], **options})  # type: ignore[arg-type]
+        stack_layers(bear().gdfs, StackOptions(scene=Path("bear.ply"), **options))  # type: ignore[arg-type]
     assert "\n" not in str(error.value)
 
 

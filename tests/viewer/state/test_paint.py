@@ -18,7 +18,7 @@ from progdf.scene.selection import Surface
 from tests.helpers.hostile import NPY_HEADERS, npy
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
-from viewer.commands.layer_arguments import stack_of
+from viewer.commands.options import StackOptions, stack_layers
 from viewer.state import paint
 from viewer.state.paint import Stroke, near_mean
 from viewer.state.view_state import LARGEST_PX, Brush
@@ -278,6 +278,10 @@ def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
     assert hand.main_view.work.past.past[0].edit.layers[0].paint == paint.FULL
 
 
+def painted(text: str) -> StackOptions:
+    return StackOptions(scene=Path("bear.ply"), paint=(text,))
+
+
 def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) -> None:
     gdf = bear().gdfs[0]
     of_scene = np.linspace(0, 1, len(bear().scene), dtype=np.float32)
@@ -285,7 +289,7 @@ def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) 
     for name, array in (("scene", of_scene), ("region", of_region)):
         np.save(tmp_path / f"{name}.npy", array)
     layers = [
-        stack_of(bear().gdfs, [], paint=[f"scarf={tmp_path / name}.npy"])[0] for name in ("scene", "region")
+        stack_layers(bear().gdfs, painted(f"scarf={tmp_path / name}.npy"))[0] for name in ("scene", "region")
     ]
     assert layers[0] == layers[1]
     assert layers[0].paint == paint.encode(of_region)
@@ -299,10 +303,10 @@ def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) 
         (f"scarf={tmp_path / 'large.npy'}", "outside 0 to 1"),
     ):
         with pytest.raises(ProgdfError, match=told):
-            stack_of(bear().gdfs, [], paint=[text])
+            stack_layers(bear().gdfs, painted(text))
 
 
 def test_a_hostile_header_of_weights_is_one_line(tmp_path: Path) -> None:
     npy(tmp_path / "deep.npy", NPY_HEADERS["a deep literal"])
     with pytest.raises(ProgdfError, match=r"--paint: .* is not a readable \.npy file of weights"):
-        stack_of(bear().gdfs, [], paint=[f"scarf={tmp_path / 'deep.npy'}"])
+        stack_layers(bear().gdfs, painted(f"scarf={tmp_path / 'deep.npy'}"))

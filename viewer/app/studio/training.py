@@ -1,4 +1,4 @@
-"""New edits in the window: the form starts a run, its card follows it, the finished edit becomes a layer."""
+"""New edits in the window: the form queues a run, cards follow all jobs, the edit becomes a layer."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from progdf.gdf.file import Gdf
 from progdf.io.atomic import make_folder
 from progdf.scene.regions import check_region
 from viewer.app.application import Application, failure_line
-from viewer.files import regions
+from viewer.files import exports
 from viewer.files.document import Document
-from viewer.jobs import run_files
-from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED, NewEdit
-from viewer.jobs.training_job import EditOrder, TrainingJob, duration
-from viewer.jobs.training_queue import TrainingQueue, spare_threads
+from viewer.jobs import training
+from viewer.jobs.job_queue import Delivery, Job, JobQueue
+from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
 from viewer.state.selection import NOBODY, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog
@@ -44,8 +43,8 @@ class StudioApplication(Application, Protocol):
         """Draw another document from now on, with what is being trained on top."""
 
 
-class TrainingActions:
-    """Trains what the form asks for. `close` it with the window.
+class JobActions:
+    """Trains what the form asks for, and follows all jobs. `close` it with the window.
 
     Args:
         app: the window
@@ -54,12 +53,12 @@ class TrainingActions:
 
     def __init__(self, app: StudioApplication, memory: Path | None = None) -> None:
         self._app, self._memory = app, memory
-        self.queue = TrainingQueue()
-        self._looked = False  # for what was stopped of the scene
+        self.queue = JobQueue()
         self._scene: Path | None = None
+        self._followed = False  # its runs that were stopped are in the queue
         self._live: Path | None = None  # the recording on screen
         self._live_due = 0.0
-        self._leaves = False
+        self._quits: type | None = None  # once no such task is busy
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
@@ -78,30 +77,37 @@ class TrainingActions:
             case "close_run":
                 self.queue.dismiss(int(argument))
             case "run_log":
-                self._show_log(int(argument))
-            case "quit" if self.queue.busy and not self._leaves:
-                self._app.main_view.ask(Dialog("training", self._running_name()))
-            case "stop_and_quit":
-                self._stop_and_quit()
+                if (job := self.queue.job(int(argument))) is not None:
+                    self._app.main_view.ask(Dialog("log", str(job.task.log)))
+            case "quit" if self._quits is None and (job := self.queue.busy(EditOrder) or self.queue.busy()):
+                kind = "training" if isinstance(job.task, EditOrder) else "delivery"
+                self._app.main_view.ask(Dialog(kind, job.task.name))
+            case "stop_and_quit" | "drop_and_quit":
+                self._quits = EditOrder if name == "stop_and_quit" else Delivery
+                for job in self.queue.jobs:
+                    if isinstance(job.task, self._quits):
+                        self.queue.stop(job.number)
+                if self._quits is EditOrder:
+                    self._app.main_view.show_message("Saving what is trained so far …")
             case _:
                 return False
         self._publish()
         return True
 
     def poll(self) -> float | None:
-        """Look at the runs; seconds until the next look, None for ever."""
+        """Look at the jobs; seconds until the next look, None for ever."""
         self._follow_document()
         for job in self.queue.poll():
-            self._ended(job)
+            self._end(job)
         self._show_live(time.monotonic())
         self._publish()
-        if self._leaves and not self.queue.busy:
-            self._leaves = False
+        if self._quits is not None and not self.queue.busy(self._quits):
+            self._quits = None
             self._app.main_view.request("quit")
         return self.queue.next_poll()
 
     def close(self) -> None:
-        """Stop what is trained."""
+        """Stop what runs."""
         self.queue.close()
 
     def _train(self) -> None:
@@ -117,21 +123,15 @@ class TrainingActions:
         scene = self._app.document.path
         if scene is None:
             raise ProgdfError("the scene has no file yet; open one first")
-        folder = run_files.edits_folder(scene, self._memory)
-        out = run_files.free_run(folder, form.layer_name)
-        region = self.region_spec(form, out.parent, out.name)
-        order = EditOrder(scene.resolve(), out, out.name, region, form.spec, form.quick, spare_threads())
-        self.queue.add(order)
-        if form.region == SELECTION:
-            self._keep_selection(out)
-
-    def _keep_selection(self, out: Path) -> None:
-        """The selection becomes a region of its own, so that its tint does not hide what is trained."""
-        main_view = self._app.main_view
-        view = main_view.work.view
-        name = free_name(view.selection, out.name)
-        kept = add_region(view.selection, name, out.with_name(f"{out.name}{SUFFIX}"))
-        main_view.change(replace(view, selection=replace(kept, members=NOBODY, count=0)))
+        out = training.free_run(training.edits_folder(scene, self._memory), form.layer_name)
+        region, threads = self.region_spec(form, out.parent, out.name), training.spare_threads()
+        self.queue.add(EditOrder(scene.resolve(), out, out.name, region, form.spec, form.quick, threads))
+        if form.region == SELECTION:  # it becomes a region: its highlight would hide what is trained
+            main_view = self._app.main_view
+            view = main_view.work.view
+            name, path = free_name(view.selection, out.name), out.with_name(f"{out.name}{SUFFIX}")
+            selection = replace(add_region(view.selection, name, path), members=NOBODY, count=0)
+            main_view.change(replace(view, selection=selection))
 
     def region_spec(self, form: NewEdit, folder: Path, name: str) -> str:
         """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
@@ -146,13 +146,13 @@ class TrainingActions:
             check_region(spec, {kind: lambda _: None for kind in _KINDS})
             return spec
         selection, total = self._app.main_view.work.view.selection, len(self._app.document.scene)
-        kept = {region.name: region for region in selection.regions}.get(form.region)
-        if form.region != SELECTION and kept is None:
+        region = {region.name: region for region in selection.regions}.get(form.region)
+        if form.region != SELECTION and region is None:
             raise ProgdfError(f"there is no region {form.region} any more; choose another one")
-        members = selection.members if kept is None else kept.members
+        members = selection.members if region is None else region.members
         make_folder(folder)
         path = folder / f"{name}{SUFFIX}"
-        regions.write(NamedRegion(name, path, members, selection.count), total)
+        exports.write_region(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
     def _try(self, act: Callable[[], None]) -> None:
@@ -163,92 +163,76 @@ class TrainingActions:
     def _ask_discard(self, number: int) -> None:
         """What was trained cannot be brought back: ask. What has not begun is no loss."""
         job = self.queue.job(number)
-        if job is not None and run_files.is_begun(job.order.out):
-            spent = run_files.read_progress(job.order, job.progress).seconds
-            self._app.main_view.ask(Dialog("discard_run", duration(spent), str(number)))
+        if job is not None and job.task.is_begun:
+            spent = job.task.read_progress(job.progress).seconds
+            self._app.main_view.ask(Dialog("discard_run", training.duration(spent), str(number)))
         else:
             self._try(lambda: self.queue.discard(number))
 
-    def _ended(self, job: TrainingJob) -> None:
-        """A run is over: its edit comes on top, or its card says why not."""
-        comes = job.status == "done" and self._scene == job.order.scene
-        if not comes:  # else it takes the place of what is shown
-            self._take_live_away()
-        main_view = self._app.main_view
-        if job.status == "failed":
-            main_view.show_message(f"{job.order.name} was not trained: {job.error}", error=True)
-        if job.status == "elsewhere" and job.order.gdf.is_file():
-            main_view.show_message(f"{job.order.name} was trained in another window: {job.order.gdf}")
-        if job.status != "done":
-            return
-        if not job.warning:
+    def _end(self, job: Job) -> None:
+        """A job has ended: a new edit comes on top, else a line says what became of it."""
+        task, main_view = job.task, self._app.main_view
+        if job.status == "done" and not job.warning:
             self.queue.dismiss(job.number)
-        if comes:
+        if isinstance(task, Delivery):
+            if job.status == "failed":
+                main_view.show_message(f"{task.name}: {job.error}", error=True)
+            elif job.status == "done":
+                main_view.show_message(f"Wrote {task.out}")
+            return
+        if job.status == "done" and self._scene == task.scene:  # it takes the place of its recordings
             self._live = None
-            self._app.open(job.order.gdf)
-            main_view.show_message(f"{job.order.name} is trained; drag its slider")
-        else:
-            main_view.show_message(f"{job.order.name} is trained: {job.order.gdf}")
+            self._app.open(task.result)
+            main_view.show_message(f"{task.name} is trained; drag its slider")
+            return
+        if self._live is not None:
+            self._live = None
+            self._app.show(self._app.document)
+        if job.status == "done":
+            main_view.show_message(f"{task.name} is trained: {task.result}")
+        elif job.status == "failed":
+            main_view.show_message(f"{task.name} was not trained: {job.error}", error=True)
+        elif job.status == "elsewhere" and task.result.is_file():
+            main_view.show_message(f"{task.name} was trained in another window: {task.result}")
 
     def leave_scene(self) -> None:
         """There is another scene; what is trained for this one goes on, and its card says for which."""
-        self._looked, self._live = False, None
+        self._followed, self._live = False, None
 
     def _follow_document(self) -> None:
         """Runs of the scene that were stopped another day come back."""
-        if self._looked:
+        if self._followed:
             return
         path = self._app.document.path
-        self._looked, self._scene = True, path.resolve() if path is not None else None
+        self._followed, self._scene = True, path.resolve() if path is not None else None
         if (scene := self._scene) is not None:
-            for order in run_files.stopped_orders(run_files.edits_folder(scene, self._memory), scene):
+            for order in training.stopped_orders(training.edits_folder(scene, self._memory), scene):
                 self.queue.add_stopped(order)
 
     def _show_live(self, now: float) -> None:
         """The newest recording of the run, as far as showing it costs next to nothing."""
-        job = next((job for job in self.queue.jobs if job.status == "running"), None)
-        if job is None or job.order.scene != self._scene or now < self._live_due:
+        orders = (job.task for job in self.queue.jobs if job.status == "running")
+        order = next((task for task in orders if isinstance(task, EditOrder)), None)
+        if order is None or order.scene != self._scene or now < self._live_due:
             return
-        recording = run_files.newest_recording(job.order)
+        recording = order.newest_recording()
         if recording is None or recording == self._live:
             return
-        begun = time.monotonic()
-        edit = run_files.recorded_edit(job.order, recording, self._app.document.scene)
-        if edit is not None:
-            document = self._app.document
+        begun, document = time.monotonic(), self._app.document
+        if (edit := order.recorded_edit(recording, document.scene)) is not None:
             layer = LayerState(len(document.gdfs), f"{edit.name} (training)", 1.0)
             self._app.show(document, (edit,), (layer,))
             self._live = recording
         cost = time.monotonic() - begun
         self._live_due = now + max(LIVE_EVERY_S, cost / LIVE_SHARE)
 
-    def _take_live_away(self) -> None:
-        if self._live is not None:
-            self._live = None
-            self._app.show(self._app.document)
-
-    def _show_log(self, number: int) -> None:
-        job = self.queue.job(number)
-        if job is not None:
-            self._app.main_view.ask(Dialog("log", str(run_files.log_of(job.order))))
-
-    def _running_name(self) -> str:
-        return next((job.order.name for job in self.queue.jobs if job.status == "running"), "")
-
-    def _stop_and_quit(self) -> None:
-        """Leave once what runs has saved what it has done; what waits is forgotten."""
-        self._leaves = True
-        for job in self.queue.jobs:
-            self.queue.stop(job.number)
-        self._app.main_view.show_message("Saving what is trained so far …")
-
     def _publish(self) -> None:
-        """The panel shows the runs of this scene, and of others those that go on."""
+        """The panel shows the jobs of this scene, and of others those that go on."""
         main_view = self._app.main_view
         jobs = tuple(
-            job if job.order.scene == self._scene else replace(job, elsewhere=job.order.scene.name)
+            replace(job, elsewhere="" if job.task.scene == self._scene else job.task.scene.name)
             for job in self.queue.jobs
-            if job.order.scene == self._scene or job.status in ("queued", "running", "stopping")
+            if job.task.scene == self._scene or job.busy
         )
         if jobs != main_view.work.jobs:
             main_view.work = replace(main_view.work, jobs=jobs)

@@ -1,10 +1,11 @@
-"""Runs in turn: real children on a tiny scene, and what becomes of those that fail or are stopped."""
+"""Jobs in turn: real children on a tiny scene, and what becomes of those that fail or are stopped."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,10 @@ from progdf.gdf.file import load_gdf
 from progdf.io.locks import LOCK, LockedError, hold_lock
 from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
-from viewer.jobs import child, run_files, training_queue
-from viewer.jobs.training_job import EditOrder, TrainingJob
-from viewer.jobs.training_queue import LOOK_S, TrainingQueue
+from viewer.jobs import child, job_queue, training
+from viewer.jobs.child import Progress
+from viewer.jobs.job_queue import LOOK_S, Delivery, Job, JobQueue
+from viewer.jobs.training import EditOrder, duration
 
 PATIENCE_S = 600.0
 EARS = "sphere:0,1.9,0,0.6"
@@ -38,7 +40,8 @@ class Waiting:
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self.status: int | None = None
         out = Path(next(word for word in arguments if word.startswith("--out=")).removeprefix("--out="))
-        begin(out)
+        if arguments[0] == "train":
+            begin(out)
 
     def stop(self) -> None:
         self.status = 130
@@ -56,22 +59,22 @@ def begin(out: Path) -> None:
 @pytest.fixture
 def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
     """A run that was stopped; children do nothing, and each look is at all of it."""
-    monkeypatch.setattr(training_queue, "Child", Waiting)
-    monkeypatch.setattr(training_queue, "LOOK_S", 0.0)
+    monkeypatch.setattr(job_queue, "Child", Waiting)
+    monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
     asked = order(scene, "blue")
-    run_files.keep_order(asked)
+    asked.save()
     begin(asked.out)
     return asked
 
 
-def window(stopped: EditOrder) -> TrainingQueue:
+def window(stopped: EditOrder) -> JobQueue:
     """The queue of a window on its scene."""
-    queue = TrainingQueue()
+    queue = JobQueue()
     queue.add_stopped(stopped)
     return queue
 
 
-def status(queue: TrainingQueue) -> str:
+def status(queue: JobQueue) -> str:
     (job,) = queue.jobs
     return job.status
 
@@ -83,28 +86,28 @@ def scene(tmp_path: Path) -> Path:
 
 
 def order(scene: Path, name: str, region: str = "all") -> EditOrder:
-    out = run_files.free_run(run_files.edits_folder(scene), name)
+    out = training.free_run(training.edits_folder(scene), name)
     return EditOrder(scene, out, name, region, "tint:#3060d0", quick=True, threads=1)
 
 
-def wait(queue: TrainingQueue, until: str = "") -> list[TrainingJob]:
+def wait(queue: JobQueue, until: str = "") -> list[Job]:
     """What has ended once nothing is busy, or one job says that it does `until`."""
     ended, begun = [], time.monotonic()
-    while queue.busy and time.monotonic() - begun < PATIENCE_S:
+    while queue.busy() and time.monotonic() - begun < PATIENCE_S:
         ended += queue.poll()
-        if until and any(job.progress.doing == until for job in queue.jobs):
+        if until and any(job.progress.label == until for job in queue.jobs):
             break
         time.sleep(0.05)
     return ended
 
 
 def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    queue = TrainingQueue()
+    queue = JobQueue()
     queue.add(order(scene, "nowhere", "sphere:99,99,99,1"))
     number = queue.add(order(scene, "blue", EARS))
     queue.poll()
     assert [job.status for job in queue.jobs] == ["running", "queued"]
-    shown, begun = Count(monkeypatch, TrainingQueue, "_change"), time.monotonic()
+    shown, begun = Count(monkeypatch, JobQueue, "_change"), time.monotonic()
     failed, done = wait(queue)
     # the training would have half of the processor otherwise: each change is drawn
     assert shown.calls <= (time.monotonic() - begun) / LOOK_S + 4, "its card changes once a second"
@@ -112,23 +115,23 @@ def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: 
     assert failed.error.startswith("region 'sphere:99,99,99,1' holds no Gaussian")
     assert done.number == number
     assert done.status == "done"
-    assert load_gdf(done.order.gdf).name == "blue"
+    assert load_gdf(done.task.result).name == "blue"
     queue.discard(failed.number)
-    assert not failed.order.out.with_name("nowhere.train.json").exists()
+    assert not failed.task.out.with_name("nowhere.train.json").exists()
     queue.close()
 
 
 @pytest.mark.slow
 def test_a_run_that_is_stopped_goes_on_another_day(scene: Path) -> None:
-    queue = TrainingQueue()
+    queue = JobQueue()
     number = queue.add(order(scene, "blue"))
-    wait(queue, until="edit")
+    wait(queue, until="Editing views")
     queue.stop(number)
     (stopped,) = wait(queue)
     queue.close()
     assert stopped.status == "stopped"
-    later = TrainingQueue()
-    (found,) = run_files.stopped_orders(stopped.order.out.parent, scene)
+    later = JobQueue()
+    (found,) = training.stopped_orders(stopped.task.out.parent, scene)
     later.add_stopped(found)
     later.add_stopped(found)
     assert [job.status for job in later.jobs] == ["stopped"]
@@ -140,14 +143,14 @@ def test_a_run_that_is_stopped_goes_on_another_day(scene: Path) -> None:
 
 
 def test_closing_leaves_no_child_and_forgets_what_waits(scene: Path) -> None:
-    queue = TrainingQueue()
+    queue = JobQueue()
     queue.add(order(scene, "blue"))
     waiting = order(scene, "red")
     queue.add(waiting)
     queue.poll()
     queue.close()
     assert not waiting.out.with_name("red.train.json").exists()
-    found = run_files.stopped_orders(waiting.out.parent, scene)
+    found = training.stopped_orders(waiting.out.parent, scene)
     assert all(order.out != waiting.out for order in found), "it had not begun"
 
 
@@ -161,7 +164,7 @@ def test_what_one_window_trains_another_shows_and_leaves_alone(stopped: EditOrde
     for act in (second.resume, second.discard, second.stop):
         act(1)
     second.poll()
-    assert (status(second), second.busy) == ("elsewhere", False)
+    assert (status(second), second.busy()) == ("elsewhere", None)
     first.poll()
     assert status(first) == "running"
     first.stop(1)
@@ -182,7 +185,7 @@ def test_a_card_that_does_not_know_it_yet_says_that_another_window_trains(stoppe
         with suppress(LockedError):
             act(1)
         assert status(second) == "elsewhere"
-        assert run_files.is_begun(stopped.out)
+        assert stopped.is_begun
     first.close()
     second.poll()
     assert status(second) == "stopped"
@@ -199,7 +202,7 @@ def test_a_run_that_a_command_trains_is_left_alone(stopped: EditOrder) -> None:
 
 
 def test_two_windows_never_write_one_log(stopped: EditOrder, scene: Path) -> None:
-    first, second = TrainingQueue(), TrainingQueue()
+    first, second = JobQueue(), JobQueue()
     asked = order(scene, "red")
     first.add(asked)
     with pytest.raises(LockedError):
@@ -209,12 +212,12 @@ def test_two_windows_never_write_one_log(stopped: EditOrder, scene: Path) -> Non
 
 
 def test_what_another_window_has_finished_leaves_the_list(stopped: EditOrder) -> None:
-    queue = TrainingQueue()
+    queue = JobQueue()
     with hold_lock(stopped.out / LOCK):
         queue.add_stopped(stopped)
         assert queue.poll() == []
     (stopped.out / "state" / "run.json").unlink()
-    stopped.gdf.touch()
+    stopped.result.touch()
     (told,) = queue.poll()
     assert told.status == "elsewhere"
     assert (queue.jobs, queue.next_poll()) == ((), None)
@@ -225,11 +228,11 @@ def test_a_run_that_waits_to_go_on_is_kept_when_it_is_taken_off_the_queue(stoppe
     queue.resume(1)
     queue.stop(1)
     assert status(queue) == "stopped"
-    assert run_files.is_begun(stopped.out)
+    assert stopped.is_begun
     queue.resume(1)
     queue.close()
-    assert run_files.is_begun(stopped.out)
-    assert not run_files.is_held(stopped), "closing lets go of it"
+    assert stopped.is_begun
+    assert not stopped.is_locked, "closing lets go of it"
 
 
 def test_a_run_without_a_processor_says_so(stopped: EditOrder, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,9 +254,41 @@ def test_a_run_that_cannot_be_started_fails_in_one_line(
     def refuse(arguments: Sequence[str], log: Path) -> None:
         raise ValueError("embedded null byte")
 
-    monkeypatch.setattr(training_queue, "Child", refuse)
+    monkeypatch.setattr(job_queue, "Child", refuse)
     queue = window(stopped)
     queue.resume(1)
     (failed,) = queue.poll()
-    assert (failed.status, failed.error) == ("failed", "training cannot start: embedded null byte")
-    assert not run_files.is_held(stopped)
+    assert (failed.status, failed.error) == ("failed", "the command cannot start: embedded null byte")
+    assert not stopped.is_locked
+
+
+def test_deliveries_go_on_beside_a_training_and_leave_nothing_when_they_are_stopped(
+    stopped: EditOrder, tmp_path: Path
+) -> None:
+    queue = window(stopped)
+    queue.resume(1)
+    out, log = tmp_path / "film.mp4", tmp_path / "film.log"
+    queue.add(Delivery("Rendering film.mp4", out, ("render", f"--out={out}"), log, stopped.scene))
+    queue.poll()
+    assert [job.status for job in queue.jobs] == ["running", "running"]
+    log.write_text("frame 3/12\n")
+    queue.poll()
+    assert queue.jobs[1].progress == Progress(0.25, "frame 3 of 12")
+    queue.stop(2)
+    assert [(job.number, job.status) for job in queue.poll()] == [(2, "stopped")]
+    assert [job.number for job in queue.jobs] == [1]
+    queue.close()
+    assert not queue.folder.exists()
+
+
+def test_time_left_is_said_once_something_is_done() -> None:
+    order = EditOrder(Path("a.ply"), Path("out"), "a", "all", "night")
+    half = replace(Job(1, order, "running"), progress=Progress(0.5), seconds=20.0)
+    assert half.seconds_left == 20.0
+    resumed = replace(half, began_at=0.4)
+    assert abs((resumed.seconds_left or 0.0) - 100.0) < 1e-6
+    assert replace(half, status="stopped").seconds_left is None
+
+
+def test_durations_are_read_at_a_glance() -> None:
+    assert [duration(s) for s in (0.2, 75.0, 200.0, 5400.0)] == ["1 s", "75 s", "3 min", "1 h 30 min"]

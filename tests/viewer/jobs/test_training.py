@@ -1,0 +1,259 @@
+"""The form of a new edit as data, and the files of its run while it trains."""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.region import Region
+from tests.helpers.ui_rig import bear
+from trainer.cli import train_options
+from trainer.editors import CHECKS, EDITORS
+from trainer.editors.style import STYLES as TRAINED_STYLES
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import RunFolder
+from viewer.jobs import training
+from viewer.jobs.child import Progress
+from viewer.jobs.training import (
+    ALL,
+    CHANGED,
+    STYLES,
+    TYPED,
+    EditOrder,
+    NewEdit,
+    missing_package,
+    with_editor,
+    with_picture,
+)
+from viewer.jobs.training import EDITORS as CHOICES
+
+KINDS = [choice.kind for choice in CHOICES]
+
+
+def order(folder: Path, name: str = "blue") -> EditOrder:
+    scene = folder / "bear.ply"
+    scene.touch()
+    home = training.edits_folder(scene, folder / "memory")
+    return EditOrder(scene.resolve(), training.free_run(home, name), name, "all", "recolor:#3060d0")
+
+
+def test_runs_lie_beside_their_scene_or_where_the_user_may_write(tmp_path: Path) -> None:
+    scene = tmp_path / "there" / "bear.ply"
+    scene.parent.mkdir()
+    scene.touch()
+    assert training.edits_folder(scene, tmp_path / "memory") == scene.parent / "bear.edits"
+    scene.parent.chmod(0o555)
+    try:
+        elsewhere = training.edits_folder(scene, tmp_path / "memory")
+    finally:
+        scene.parent.chmod(0o755)
+    assert elsewhere.parent == tmp_path / "memory" / "edits"
+    assert elsewhere.name.startswith("bear-")
+
+
+def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    asked.save()
+    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [], "it has not begun"
+    (asked.out / "state").mkdir(parents=True)
+    (asked.out / "state" / "run.json").write_text("{}")
+    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [asked]
+    assert [*training.stopped_orders(asked.out.parent, tmp_path / "other.ply")] == []
+    assert order(tmp_path).out.name == "blue-2", "its name is taken"
+    asked.discard()
+    assert [*asked.out.parent.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        b'{"scene": "a.ply", "na',
+        b"\xff\xfe{}",
+        b'{"label": "\xff", "share": 0.5}',
+        b'{"scene": "\xff", "name": "", "region": "", "editor": "", "quick": true}',
+        b"[" * 100_000,
+        b'{"a":' * 100_000,
+        b"1" * 5000,
+        b"null",
+        b'{"label": 1, "share": 1e400}',
+        b'{"label": "Training", "share": 0.5, "seconds": -1}',
+        b'{"scene": "\\ud800", "label": "\\ud800", "share": 1.5}',
+        b" " * (1 << 21),
+        None,
+    ],
+    ids=lambda content: "a folder" if content is None else ascii(content[:20]),
+)
+def test_a_damaged_file_of_a_run_is_passed_over(tmp_path: Path, damaged: bytes | None) -> None:
+    asked, good = order(tmp_path), order(tmp_path, "gold")
+    for kept in (asked, good):
+        kept.save()
+        (kept.out / "state").mkdir(parents=True)
+        (kept.out / "state" / "run.json").write_text("{}")
+    told = asked.out.with_name("blue.train.json"), asked.out / "state" / "progress.json"
+    told[0].unlink()
+    for path in told:
+        if damaged is None:
+            path.mkdir()
+        else:
+            path.write_bytes(damaged)
+    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [good]
+    assert asked.read_progress(Progress(0.1)) == Progress(0.1)
+
+
+def test_a_run_whose_files_are_pipes_is_not_waited_for(tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    (asked.out / "state").mkdir(parents=True)
+    (asked.out / "state" / "run.json").write_text("{}")
+    for path in (asked.out.with_name("blue.train.json"), asked.out / "state" / "progress.json"):
+        os.mkfifo(path)
+    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == []
+    assert asked.read_progress(Progress(0.1)) == Progress(0.1)
+
+
+def test_what_cannot_be_removed_is_whole_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = order(tmp_path)
+    asked.save()
+    (asked.out / "state").mkdir(parents=True)
+    (asked.out / "state" / "run.json").write_text("{}")
+
+    def refuse(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(ProgdfError, match=r"cannot be removed \(Permission"):
+            asked.discard()
+    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [asked]
+    elsewhere = tmp_path / "elsewhere"
+    (asked.out / "state").rename(elsewhere)
+    (asked.out / "state").symlink_to(elsewhere)
+    with pytest.raises(ProgdfError, match="behind a link"):
+        asked.discard()
+    assert (elsewhere / "run.json").is_file()
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", "...", "link"])
+def test_no_order_of_a_stranger_makes_another_folder_a_run(name: str, tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    asked.save()
+    edits, other = asked.out.parent, tmp_path / "other"
+    for folder in (tmp_path, edits, other):
+        (folder / "state").mkdir(parents=True)
+        (folder / "state" / "run.json").write_text("{}")
+    (edits / "link").symlink_to(other)
+    edits.joinpath("blue.train.json").rename(edits / f"{name}.train.json")
+    assert [*training.stopped_orders(edits, asked.scene)] == []
+
+
+def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
+    asked = order(tmp_path)
+    asked.out.mkdir(parents=True)
+    asked.result.touch()
+    asked.discard()
+    assert asked.result.exists()
+
+
+def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_path: Path) -> None:
+    asked, scene = order(tmp_path), bear().scene
+    folder = RunFolder(asked.out)
+    assert asked.read_progress(Progress(0.1)) == Progress(0.1)
+    assert asked.newest_recording() is None
+    folder.state.path.mkdir(parents=True)
+    log = RunLog(folder.log, quiet=True, progress=folder.progress)
+    with log.steps("optimize", 10) as advance:
+        advance(10, "loss to the edit 0.5")
+    log.close()
+    told = asked.read_progress(Progress())
+    assert (told.share, told.label, told.loss) == (0.64, "Training", "0.5")
+    assert told.seconds > 0.0, "for the question whether to discard it"
+    later = Progress(0.9, "Packing", "", 1e6)
+    assert asked.read_progress(later) == Progress(0.9, "Training", "0.5", 1e6), "never back"
+    members = torch.tensor([1, 5])
+    region = Region("blue", members, torch.zeros(len(scene)).index_fill(0, members, 1.0))
+    folder.state.save("region", {"members": region.members, "score": region.score}, {"name": "blue"})
+    offsets = torch.zeros(2, 14)
+    offsets[:, -3:] = 0.25
+    for index in range(2):
+        folder.state.save("recordings", {"offsets": (offsets * index).half()}, {}, index)
+    newest = asked.newest_recording()
+    assert newest is not None
+    assert newest.name.startswith("000001")
+    edit = asked.recorded_edit(newest, scene)
+    assert edit is not None
+    assert torch.equal(edit.field.offsets(1.0), offsets)
+    assert asked.recorded_edit(newest, scene[:10]) is None, "another scene"
+
+
+def form(kind: str, **changes: Any) -> NewEdit:
+    return replace(NewEdit(editor=KINDS.index(kind)), **changes)
+
+
+def test_every_editor_of_the_form_is_one_of_the_trainer() -> None:
+    assert set(KINDS) <= set(EDITORS)
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind not in ("instruct", "folder", "pictures", "style")]
+)
+def test_what_the_form_asks_for_is_what_the_trainer_takes(kind: str) -> None:
+    word, _, what = form(kind).spec.partition(":")
+    assert word == kind
+    CHECKS[kind](what)
+    CHECKS[kind](form(kind, amount=0.98, through_hues=True).spec.partition(":")[2])
+
+
+def test_the_trainer_has_as_many_paintings_as_the_form() -> None:
+    assert TRAINED_STYLES == STYLES
+
+
+def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
+    assert "Type what" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
+    assert "folder" in form("folder").obstacle
+    assert form("folder", folder="edited").obstacle == ""
+    assert "pictures" in form("pictures").obstacle
+    assert form("pictures", pictures="/a.png, /b.png").spec == "pictures:/a.png,/b.png"
+    assert "region" in form("recolor", region=TYPED).obstacle
+    unknown = replace(CHOICES[0], package="no_such_package_at_all", extra="more")
+    assert missing_package(unknown) == "Recolor needs more: pip install progdf-studio[more]"
+
+
+def test_changed_pictures_find_their_own_region() -> None:
+    found = with_editor(NewEdit(), KINDS.index("pictures"))
+    assert found.region == CHANGED
+    assert with_editor(found, 0).region == ALL
+    assert with_editor(NewEdit(region="hands"), KINDS.index("pictures")).region == "hands"
+
+
+def test_a_dropped_picture_is_ready_to_train_and_a_further_one_comes_beside_it() -> None:
+    first = with_picture(form("recolor", region="hands", pictures="old.png"), Path("a/helmet.png"), True)
+    assert (first.spec, first.region) == (f"pictures:{Path.cwd()}/a/helmet.png", CHANGED)
+    assert first.layer_name == "helmet"
+    second = with_picture(replace(first, region="hands"), Path("b.png"), True)
+    assert (second.pictures, second.region) == ("a/helmet.png, b.png", "hands")
+    assert with_picture(second, Path("b.png"), True).pictures == second.pictures
+    assert with_picture(second, Path("c.png"), False).pictures == "c.png"
+
+
+def test_a_name_is_one_that_a_file_can_have() -> None:
+    assert form("recolor").layer_name == "recolor"
+    assert form("recolor", region="hands").layer_name == "hands recolor"
+    assert form("night", name=" ../a\\b ").layer_name == "-a-b"
+    assert form("style", style=7).layer_name == "style 7"
+
+
+def test_an_order_is_a_command_line_that_the_trainer_reads_back() -> None:
+    order = EditOrder(Path("a b.ply"), Path("out/-x"), "-x", "all-sphere:0,0,0,1", "night:0.70", True, 1)
+    options = train_options(order.arguments(resumes=True)[1:])
+    assert (options.scene, options.out, options.name) == (order.scene, order.out, order.name)
+    assert (options.region, options.editor) == (order.region, order.editor)
+    assert options.quick
+    assert options.resume
+    assert options.threads == 1

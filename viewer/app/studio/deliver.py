@@ -1,0 +1,121 @@
+"""Exports, pictures and films: the question where to, and the command that writes the file."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from progdf import __version__
+from progdf.errors import ProgdfError
+from viewer.app.application import Application, failure_line
+from viewer.files import exports, session
+from viewer.files.session import WindowSession
+from viewer.files.user_files import parse_path
+from viewer.jobs.job_queue import DeliverOptions, Delivery, JobQueue
+from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
+from viewer.state.workspace import Dialog
+
+SUFFIXES = {"export": ".ply", "render_picture": ".png", "render_film": ".mp4"}
+"""Questions, and how the names of their files end."""
+
+
+class DeliverActions:
+    """Asks where to, and queues the commands.
+
+    Args:
+        app: the window
+        queue: runs them
+    """
+
+    def __init__(self, app: Application, queue: JobQueue) -> None:
+        self._app, self._queue = app, queue
+        self._options: dict[str, DeliverOptions] = {}  # the last of each kind, for the next
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of ours."""
+        name, _, argument = request.partition(":")
+        main_view = self._app.main_view
+        dialog = main_view.work.dialog
+        if name in SUFFIXES:
+            if error := failure_line(lambda: self._ask(name)):
+                main_view.show_message(error, error=True)
+        elif name == "deliver" and dialog is not None:  # what is wrong stands in the question
+            error = failure_line(lambda: self._start(argument, dialog))
+            main_view.work = replace(main_view.work, dialog=replace(dialog, error=error) if error else None)
+            main_view.wake()
+        elif name == "about":
+            main_view.ask(Dialog("about", f"ProGDF Studio {__version__}, Python {sys.version.split()[0]}"))
+        else:
+            return False
+        return True
+
+    def _ask(self, name: str) -> None:
+        path, main_view = self._app.document.path, self._app.main_view
+        if path is None:
+            raise ProgdfError("there is no scene yet; open one first")
+        view, focus = main_view.work.view, main_view.work.focus
+        options = self._options.get(name, DeliverOptions())
+        if name == "render_film":
+            keys = ("timeline",) if len(view.timeline.keys) > 1 else ()
+            moving = (*keys, *(layer.name for layer in reversed(view.layers)))
+            if not moving:
+                raise ProgdfError(
+                    "there is nothing to move yet; make an edit, or set keys on the timeline (K)"
+                )
+            moves = moving[0] if keys or focus is None else view.layers[focus].name
+            options = self._options.get(name, DeliverOptions(width=1280, height=720))
+            fps = view.timeline.fps if keys else options.fps
+            options = replace(options, moves=moves, can_move=moving, fps=fps)
+        suffix = options.format if name == "render_film" else SUFFIXES[name]
+        out, number = exports.folder_of(path) / f"{path.stem}_edited{suffix}", 2
+        free, written = out, self._written()
+        while free.exists() or free in written:
+            free, number = out.with_stem(f"{out.stem}-{number}"), number + 1
+        main_view.ask(Dialog(name, str(free), options=options))
+
+    def _start(self, kind: str, dialog: Dialog) -> None:
+        out, options = parse_path(dialog.text).resolve(), dialog.options or DeliverOptions()
+        suffix = options.format if kind == "render_film" else SUFFIXES[kind]
+        if suffix and out.suffix.lower() != suffix:
+            out = out.with_name(out.name + suffix)
+        if not out.parent.is_dir():
+            raise ProgdfError(f"the folder {out.parent} does not exist; create it first")
+        if out in self._written():
+            raise ProgdfError(f"{out.name} is being written already; choose another name")
+        exists = f"{out.name} exists; give another name, or press again to replace it"
+        if out.exists() and dialog.error != exists:
+            raise ProgdfError(exists)
+        document, view = self._app.document, replace(self._app.main_view.work.view, compare=Comparison())
+        if kind == "render_film" and options.moves != "timeline":
+            view = _slider_film(view, options)
+        elif kind == "render_film":
+            view = replace(view, timeline=replace(view.timeline, fps=options.fps))
+        number = len(list(self._queue.folder.iterdir()))
+        stack = self._queue.folder / f"stack{number}.session.json"
+        session.save(stack, WindowSession(document, view))
+        size = f"--size={options.width}x{options.height}"
+        words = {
+            "export": ["export", f"--out={out}"],
+            "render_picture": ["render", f"--out={out}", size, *["--alpha"] * options.alpha],
+            "render_film": ["render", f"--out={out}", size, f"--timeline={stack}"],
+        }[kind]
+        title = f"{'Exporting' if kind == 'export' else 'Rendering'} {out.name}"
+        assert document.path is not None
+        self._queue.add(
+            Delivery(title, out, (*words, str(stack)), stack.with_suffix(".log"), document.path.resolve())
+        )
+        self._options[kind] = options
+
+    def _written(self) -> set[Path]:
+        """What is being written just now."""
+        return {job.task.out for job in self._queue.jobs if job.busy}
+
+
+def _slider_film(view: ViewState, options: DeliverOptions) -> ViewState:
+    """The view with a timeline on which one layer's slider goes there and back."""
+    gdf = next(layer.gdf for layer in view.layers if layer.name == options.moves)
+    length = max(round(options.fps * options.seconds / 2), 1)
+    still = tuple((layer.gdf, layer.strength) for layer in view.layers if layer.gdf != gdf)
+    keys = tuple(Keyframe(frame, ((gdf, s), *still)) for frame, s in ((0, 0.0), (length, 1.0)))
+    return replace(view, timeline=Timeline(keys, length, options.fps, ping_pong=True))

