@@ -12,10 +12,11 @@ import msgspec
 import tyro
 
 from progdf.errors import ProgdfError
+from progdf.field.baked import BakedField
 from progdf.formats.load_report import file_size, format_count, group_digits
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO
-from progdf.gdf.header import GdfHead, read_head
+from progdf.gdf.file import read_gdf
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
@@ -83,16 +84,17 @@ def _scene_lines(path: Path) -> Iterator[str]:
 
 
 def _edit_lines(path: Path) -> Iterator[str]:
-    gdf = read_head(path)
-    members, count = gdf.members, gdf.scene.count
-    yield f"{path.name}: the edit '{gdf.name}', {file_size(gdf.size)}"
+    gdf = read_gdf(path)
+    size, members, count = path.stat().st_size, len(gdf.region), gdf.scene.count
+    yield f"{path.name}: the edit '{gdf.name}', {file_size(size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
     yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-    yield f"region: {gdf.region}, {format_count(members)} ({members / max(1, count):.1%})"
-    whole = f"{gdf.size / max(1, members):.4g} with the header"
-    sizes = f"{gdf.bytes_per_member:.4g} bytes per Gaussian, {whole}"
-    yield f"field: {gdf.field.kind}, {sizes}, {_describe_field(gdf)}"
+    yield f"region: {gdf.region.name}, {format_count(members)} ({members / max(1, count):.1%})"
+    sizes = (
+        f"{gdf.field.bytes_per_member:.4g} bytes per Gaussian, {size / max(1, members):.4g} with the header"
+    )
+    yield f"field: {gdf.field.kind}, {sizes}, {_describe_field(gdf.field)}"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
@@ -135,17 +137,22 @@ class _Timeline(msgspec.Struct):
     keys: list[_Key] = []
 
 
-def _describe_field(gdf: GdfHead) -> str:
+def _describe_field(field: BakedField) -> str:
     """What a field is made of."""
+    form = field.origin
+    ranks = {name: len(bases.residual_basis) for name, bases in field.attributes.items()}
     # the first is the offset at strength 1 as it was recorded, see `AttributeBases.end_offset`
-    bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
-    network = gdf.field.network
-    if network is None:
-        return f"{gdf.knots} knots; bases: {bases or 'none, nothing moves'}"
-    error = ", ".join(f"{name} {value:.4g}" for name, value in network.bake_error.items())
+    bases = ", ".join(
+        f"{name} 1 exact + {rank} fitted" for name, rank in (form.plan.ranks if form else ranks).items()
+    )
+    if form is None:
+        return f"{len(field.knots)} knots; bases: {bases or 'none, nothing moves'}"
+    network = form.network
+    error = ", ".join(f"{name} {value:.4g}" for name, value in (form.error or {}).items())
     return (
-        f"{group_digits(gdf.parameters)} numbers in {network.shape.layers} layers of "
-        f"{network.shape.width}; baked at {gdf.knots} knots with bases: {bases}; baking costs: {error}"
+        f"{group_digits(network.parameters)} numbers in {network.shape.layers} layers of "
+        f"{network.shape.width}; baked at {len(form.plan.knots)} knots with bases: {bases}; "
+        f"baking costs: {error}"
     )
 
 

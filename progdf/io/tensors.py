@@ -43,17 +43,14 @@ def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], 
 
 
 def write_tensors(
-    path: Path,
-    tensors: Mapping[str, Tensor],
-    metadata: Mapping[str, str | msgspec.Raw],
-    checksum: bool = False,
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str], checksum: bool = False
 ) -> None:
     """Write a safetensors file.
 
     Args:
         path: where to; see `atomic.atomic_write` for a file that is whole or absent
         tensors: by name, of the types in the table above; on the CPU
-        metadata: texts, or JSON as it is, by name
+        metadata: texts by name
         checksum: add one of everything, which `read_tensors` compares
 
     Raises:
@@ -62,13 +59,14 @@ def write_tensors(
     """
     if checksum:
         metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
+    text = msgspec.json.encode(dict(sorted(metadata.items()))).decode()
+    path.write_bytes(tensor_bytes(tensors, text))
+
+
+def tensor_bytes(tensors: Mapping[str, Tensor], text: str) -> bytes:
+    """A safetensors file of CPU tensors, with one JSON text as its metadata."""
     arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
-    path.write_bytes(save(arrays, pack_metadata(metadata)))
-
-
-def pack_metadata(metadata: Mapping[str, str | msgspec.Raw]) -> dict[str, str]:
-    """Texts, or JSON as it is, by name, as the one text that a file's metadata have."""
-    return {METADATA: msgspec.json.encode(dict(sorted(metadata.items()))).decode()}
+    return save(arrays, {METADATA: text})
 
 
 def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Tensor], dict[str, str]]:
