@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from progdf.errors import ProgdfError
-from progdf.field.bake import rows_hash
+from progdf.field.bake import bake_form, rows_hash
 from progdf.field.baked import BakedField
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
 from progdf.io.atomic import atomic_write, read_file
@@ -166,7 +166,7 @@ def load_gdf(
             f"{name} was made for another scene: {scene_name} has its Gaussians, but they look different"
         )
     try:
-        baked = gdf.field.origin.bake(rows)
+        baked = bake_form(gdf.field.origin, rows)
         _check_reach(baked)
         return replace(gdf, field=baked)
     except (ValueError, RuntimeError) as error:

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.bake import BakePlan, NeuralForm
-from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.baked import AttributeBases, BakedField, BakePlan, NeuralForm
 from progdf.field.neural import NeuralField, NeuralShape
 from progdf.gaussians import ATTRIBUTES
 from progdf.io.json_values import convert_json, decode_json

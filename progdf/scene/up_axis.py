@@ -6,20 +6,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import cameras_beside
 
 from . import known_ups
 from .bounds import drop_background, front_direction, long_axes, normals_of, scene_sphere
-
-if TYPE_CHECKING:
-    from progdf.camera import Camera
 
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 UpChoice = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]

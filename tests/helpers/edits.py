@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, fit_separable
-from progdf.field.rendered import Render
+from progdf.field.choose import Render
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.region import Region

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.field.remap import identity_remap
+from progdf.field.baked import identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.formats.load_report import file_size, format_count
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.evaluate import sample_strengths
-from progdf.field.remap import SliderRemap
+from progdf.field.baked import SliderRemap
+from progdf.field.choose import sample_strengths
 from progdf.field.trajectory import Trajectory
 from progdf.formats.load_report import format_count, group_digits
 from progdf.gaussians import Gaussians
