@@ -18,8 +18,9 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, normalize_quats
+from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians
 from progdf.io.atomic import atomic_write
+from progdf.quaternions import normalize_quats
 
 from .load_report import LoadReport
 from .ply_file import ANTIALIASED_COMMENT, PlyFile, read_header

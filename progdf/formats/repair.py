@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.gaussians import ZERO, Gaussians, Origin, normalize_quats
+from progdf.gaussians import ZERO, Gaussians, Origin
+from progdf.quaternions import normalize_quats
 
 LARGEST_MEAN = 1e18
 LARGEST_LOG_SCALE = 40.0

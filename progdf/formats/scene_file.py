@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 
+from progdf import sh
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import read_file
@@ -126,16 +127,13 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
 def rotate_about_x(scene: Gaussians) -> Gaussians:
     """The scene after half a turn about x: y up and z towards the viewer become y down and z away from it."""
     turn = torch.tensor([1.0, -1.0, -1.0])
-    degree = scene.sh_degree
-    # a basis function of order m changes its sign with y for m < 0, and with z for l + m odd
-    signs = [(-1.0) ** (l + m + (m < 0)) for l in range(1, degree + 1) for m in range(-l, l + 1)]
     x, y, z = scene.origin
     return replace(
         scene,
         means=scene.means * turn,
         origin=(x, 0.0 - y, 0.0 - z),
         quats=scene.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
-        shN=scene.shN * torch.tensor(signs)[:, None],
+        shN=sh.rotate_about_x(scene.shN),
     )
 
 

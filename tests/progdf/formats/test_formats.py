@@ -24,8 +24,8 @@ from progdf.formats import scene_file as formats
 from progdf.formats.ply import load_ply
 from progdf.formats.scene_file import load_scene, load_scene_with_report, rotate_about_x, scene_format
 from progdf.gaussians import Gaussians
+from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
-from progdf.rasterize.reference import rotation_matrices
 from progdf.sh import rgb_to_sh0, shade
 from tests.helpers.refused import refusal
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
