@@ -35,11 +35,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
     "edit": ("progdf.cli.edit:main", "write a scene again without strays"),
     "export": ("viewer.commands.cli:export", "write the edited scene as a 3DGS .ply file"),
-    "check": (
-        "progdf.cli.check:main",
-        "report what a scene holds, what had to be repaired and what is stray",
-    ),
-    "info": ("progdf.cli.info:main", "tell what a scene or a .gdf holds, with its error report"),
+    "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
 HIDDEN = {"preview": "trainer.preview:serve"}
 """Commands that the window runs, and nobody types."""

@@ -107,7 +107,9 @@ def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> T
     if not degree:
         return change
     count = (degree + 1) ** 2 - 1
-    matrices = torch.cat([_wigner_change(degree, chunk) for chunk in torch.split(quats.detach(), _CHUNK)]).to(shN)
+    matrices = torch.cat([_wigner_change(degree, chunk) for chunk in torch.split(quats.detach(), _CHUNK)]).to(
+        shN
+    )
     matrices = matrices if part is None else matrices[part]
     return torch.cat([matrices @ shN[:, :count], change[:, count:]], dim=1)
 

@@ -20,7 +20,7 @@ from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import clean, find_strays, picture_difference
 from progdf.terminal import print_line
 
-from .options import parse_options
+from .options import absent_option, parse_options
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class EditOptions:
         clean: leave out floaters, needles, giants and what is too transparent to be drawn
     """
 
-    scene: Annotated[Path, tyro.conf.Positional]
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply")]
-    clean: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
 
 
 def main(argv: Sequence[str]) -> int:

@@ -6,13 +6,18 @@ import contextlib
 import io
 import re
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
 from progdf.errors import ProgdfError
 
 _Options = TypeVar("_Options")
+
+
+def absent_option(metavar: str | None, absent: str = "") -> Any:
+    """How help shows an option that may be left out: its value's name, and what happens then."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {absent})" if absent else "")
 
 
 def parse_options(

@@ -61,7 +61,7 @@ def test_a_comment_says_that_a_scene_is_antialiased(tmp_path: Path, comment: byt
 
 def test_check_says_it_and_never_shows_a_comment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = with_comment(tmp_path / "scene.ply", b"antialiased 1\ncomment \x1b]0;pwned\x07")
-    assert main(["check", str(path)]) == 0
+    assert main(["info", str(path)]) == 0
     said = capsys.readouterr().out
     assert "trained anti-aliased (mip), and drawn so" in said
     assert "\x1b" not in said

@@ -131,7 +131,7 @@ def test_an_unpacked_sog_opens_by_its_folder_and_by_its_table(tmp_path: Path) ->
         scene, report = load_scene_with_report(path)
         assert torch.equal(scene.means, expected.means)
         assert report.file == "robot"
-    assert main(["check", str(folder)]) == 0
+    assert main(["info", str(folder)]) == 0
 
 
 def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
